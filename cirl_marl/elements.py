@@ -1,0 +1,186 @@
+"""The parts of a network definition: nodes, arcs, controls, services and settings, as frozen data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Role(StrEnum):
+    """What a node is to the circular economy."""
+
+    NONRENEWABLE_RESERVOIR = "nonrenewable_reservoir"
+    TECHNOSPHERE = "technosphere"
+    LANDFILL = "landfill"
+    INCINERATOR = "incinerator"
+    ENVIRONMENT = "environment"
+
+
+class Law(StrEnum):
+    """How much an arc carries."""
+
+    DONOR = "donor"
+    RECIPIENT = "recipient"
+    CONTROLLED = "controlled"
+    EXOGENOUS = "exogenous"
+
+
+class ControlKind(StrEnum):
+    """What an agent sets: a factor on flows (``rate``, a valve) or the flow itself (``flow``)."""
+
+    RATE = "rate"
+    FLOW = "flow"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Control:
+    """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high].
+
+    Attributes:
+        kind: ``rate`` (dimensionless factor) or ``flow`` (mass/time).
+        low: value at action -1.
+        high: value at action +1.
+        neutral: value while nobody acts on the compartment.
+    """
+
+    kind: ControlKind
+    low: float
+    high: float
+    neutral: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Node:
+    """A compartment that stores material.
+
+    Attributes:
+        id: unique among nodes and arcs.
+        role: decides which flows count as finite-time sustainable.
+        initial: (low, high) of the initial stock, drawn uniformly, mass.
+        set_point: stock aimed at, mass; None if it has none.
+        scale: reference stock for observations and rewards, mass.
+        control: ``rate`` scales every outflow, ``flow`` sets the one controlled outflow; None if it cannot act.
+    """
+
+    id: str
+    role: Role = Role.TECHNOSPHERE
+    initial: tuple[float, float] = (0.0, 0.0)
+    set_point: float | None = None
+    scale: float = 1.0
+    control: Control | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arc:
+    """A compartment that moves material from ``donor`` to ``recipient``.
+
+    Attributes:
+        id: unique among nodes and arcs.
+        donor: id of the node that gives.
+        recipient: id of the node that receives.
+        law: ``donor`` f = a·x_donor, ``recipient`` f = a·x_recipient, ``controlled`` f = u, ``exogenous`` f = e(t).
+        rate: a, 1/time (donor and recipient laws).
+        flow: e, mass/time (exogenous law); with ``times`` the values of a step function, else a single value.
+        times: starts of the steps of an exogenous series, time; empty for a constant.
+        set_point: mean flow aimed at, mass/time; None if it has none.
+        scale: reference flow for observations and rewards, mass/time.
+        pollutant: whether material that enters an environment here is a pollutant.
+        control: actuator; None if it cannot act.
+    """
+
+    id: str
+    donor: str
+    recipient: str
+    law: Law = Law.DONOR
+    rate: float = 0.0
+    flow: tuple[float, ...] = (0.0,)
+    times: tuple[float, ...] = ()
+    set_point: float | None = None
+    scale: float = 1.0
+    pollutant: bool = True
+    control: Control | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Service:
+    """What the network is there for: a stock or flow to be kept within a band.
+
+    The level is 1 inside ``[low, high]``, ``q/low`` below it and ``high/q`` above it; the shortfall is 1 - level.
+
+    Attributes:
+        id: name of the service.
+        provider: compartment that owes it; the shortfall enters its local reward.
+        quantity: ``stock`` of a node, ``outflow`` of a node (sum of its outflows), or ``flow`` of an arc.
+        low: lower end of the band, mass or mass/time.
+        high: upper end of the band.
+        weight: factor of the shortfall in the local reward.
+    """
+
+    id: str
+    provider: str
+    quantity: str
+    low: float
+    high: float = math.inf
+    weight: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Episode:
+    """Time and solver of an episode.
+
+    Attributes:
+        control_interval: h, time between two decisions.
+        horizon: decisions per episode.
+        solver: ``exact`` (physical mode: zero-order-hold solution, stocks stay non-negative) or ``euler``
+            (the explicit step of the published environments; stocks may become negative).
+        solver_step: step of the Euler solver, time; a whole fraction of ``control_interval``.
+    """
+
+    control_interval: float = 1.0
+    horizon: int = 50
+    solver: str = "exact"
+    solver_step: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Objective:
+    """How circularity and rewards are read off the network.
+
+    Attributes:
+        reference_interval: Δ of λ = −(m_fb + Δ·ṁ_fc), time.
+        net_zero: ``signed`` counts over-removal from the environment as positive; ``abs`` penalises it like emission.
+        reward: default reward mode of the environments.
+        circularity_scale: reference |λ|, mass.
+        circularity_weight: weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local.
+        tracked: compartments whose distance to the set-point enters their local reward; empty means every
+            compartment with a set-point.
+    """
+
+    reference_interval: float = 1.0
+    net_zero: str = "signed"
+    reward: str = "mixed"
+    circularity_scale: float = 1.0
+    circularity_weight: float = 0.5
+    tracked: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """What agents see by default.
+
+    Attributes:
+        mode: ``local``, ``neighbours``, ``full``, or ``stocks`` (the stocks of ``nodes`` in that order).
+        nodes: ids of the observed nodes in mode ``stocks``.
+    """
+
+    mode: str = "local"
+    nodes: tuple[str, ...] = ()
+
+
+SOLVERS = ("exact", "euler")
+NET_ZERO = ("signed", "abs")
+REWARDS = ("local", "circularity", "mixed", "difference", "local_sum")
+OBSERVE = ("local", "neighbours", "full", "stocks")
+QUANTITIES = ("stock", "outflow", "flow")
+SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})

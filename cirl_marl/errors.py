@@ -1,0 +1,53 @@
+"""Errors that users meet. Each message names the object, the value and the nearest valid choice."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+
+class CirlError(ValueError):
+    """Base of every error that this library raises about its input."""
+
+
+class NetworkError(CirlError):
+    """A network that cannot be simulated; ``problems`` lists every fault found."""
+
+    def __init__(self, subject: str, problems: Sequence[str]) -> None:
+        """Join the ``problems`` of ``subject`` into one message."""
+        self.subject = subject
+        self.problems = tuple(problems)
+        super().__init__("\n".join(f"{subject}: {problem}" for problem in problems))
+
+
+class DefinitionError(NetworkError):
+    """A definition file that cannot be read; ``problems`` lists every mistake found."""
+
+
+class ControlError(CirlError):
+    """An action, control or initial state that the environment cannot take."""
+
+
+class RecipeError(CirlError):
+    """A learner recipe that cannot be used."""
+
+
+class RunError(CirlError):
+    """A run directory that is missing, incomplete or belongs to something else."""
+
+
+class LearnerError(RuntimeError):
+    """A learner failed while training; names its agent and the joint step."""
+
+
+def unknown(kind: str, name: object, known: Iterable[object]) -> str:
+    """Say that ``name`` is no ``kind``, with the nearest match and all options.
+
+    >>> unknown("law", "donnor", ["donor", "recipient"])
+    "unknown law 'donnor'. Did you mean 'donor'? Known: donor, recipient."
+    """
+    options = [str(option) for option in known]
+    match = difflib.get_close_matches(str(name), options, n=1, cutoff=0.5)
+    hint = f" Did you mean '{match[0]}'?" if match else ""
+    shown = ", ".join(options[:30]) + (f", … ({len(options)} in all)" if len(options) > 30 else "")
+    return f"unknown {kind} '{name}'.{hint} Known: {shown or 'none'}."

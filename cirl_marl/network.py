@@ -1,0 +1,200 @@
+"""The thermodynamical material network: compartments, flow laws, roles and the circularity they imply.
+
+A network is a digraph of compartments that handle one target material. A *node* holds a stock ``x_i``; an *arc*
+``k: i → j`` carries a flow ``f_k``. Only the network moves mass::
+
+    dx/dt = S f,    S[i, k] = -1 if i donates to arc k, +1 if i receives from it
+
+so mass is conserved by construction. Circularity is derived from the roles of the nodes and is never written by hand
+(Zocco et al., CiRL, Definition 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.elements import SINKS, Arc, Episode, Node, Objective, Observation, Role, Service
+from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.validate import problems
+
+if TYPE_CHECKING:
+    import networkx
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network:
+    """A thermodynamical material network under one scenario.
+
+    Attributes:
+        name: name in the catalogue, or of the definition file.
+        nodes: compartments with a stock, in the order of every stock array.
+        arcs: compartments with a flow, in the order of every flow array.
+        services: what the network owes its users.
+        episode: time and solver.
+        objective: circularity and rewards.
+        observation: default observation.
+        acting: compartments that act by default; empty means every compartment with a control.
+        mass_unit: unit of stocks.
+        time_unit: unit of time.
+        title: one line for tables.
+        scenario_name: the scenario that this network describes.
+        scenarios: the other scenarios of the same definition, by name.
+    """
+
+    name: str
+    nodes: tuple[Node, ...]
+    arcs: tuple[Arc, ...]
+    services: tuple[Service, ...] = ()
+    episode: Episode = Episode()
+    objective: Objective = Objective()
+    observation: Observation = Observation()
+    acting: tuple[str, ...] = ()
+    mass_unit: str = "kg"
+    time_unit: str = "day"
+    title: str = ""
+    scenario_name: str = "default"
+    scenarios: Mapping[str, Network] = field(default_factory=dict, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Refuse a network that cannot be simulated, naming every fault."""
+        found = list(problems(self))
+        if found:
+            raise NetworkError(f"network '{self.name}'", found)
+
+    def scenario(self, name: str | None) -> Network:
+        """Return this network under scenario ``name`` (None: as it is).
+
+        Raises:
+            CirlError: if the definition has no such scenario.
+        """
+        if name is None or name == self.scenario_name:
+            return self
+        if name not in self.scenarios:
+            known = sorted({self.scenario_name, *self.scenarios})
+            raise CirlError(f"network '{self.name}': {unknown('scenario', name, known)}")
+        return self.scenarios[name]
+
+    def with_options(self, **groups: Mapping[str, object]) -> Network:
+        """Return a copy with fields of ``episode``, ``objective`` or ``observation`` replaced.
+
+        >>> from cirl_marl import load_network
+        >>> load_network("copper_net").with_options(episode={"horizon": 3}).episode.horizon
+        3
+        """
+        changes = {
+            group: replace(getattr(self, group), **dict(values))  # type: ignore[type-var]
+            for group, values in groups.items()
+        }
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+    @cached_property
+    def compartments(self) -> Mapping[str, Node | Arc]:
+        """Every compartment by id, nodes first."""
+        return MappingProxyType({c.id: c for c in (*self.nodes, *self.arcs)})
+
+    @cached_property
+    def node_index(self) -> Mapping[str, int]:
+        """Position of each node in stock arrays."""
+        return MappingProxyType({node.id: i for i, node in enumerate(self.nodes)})
+
+    @cached_property
+    def arc_index(self) -> Mapping[str, int]:
+        """Position of each arc in flow arrays."""
+        return MappingProxyType({arc.id: k for k, arc in enumerate(self.arcs)})
+
+    @cached_property
+    def donors(self) -> Integers:
+        """Donor node of each arc, shape (arcs,)."""
+        return np.array([self.node_index[arc.donor] for arc in self.arcs], dtype=np.intp)
+
+    @cached_property
+    def recipients(self) -> Integers:
+        """Recipient node of each arc, shape (arcs,)."""
+        return np.array([self.node_index[arc.recipient] for arc in self.arcs], dtype=np.intp)
+
+    @cached_property
+    def controllable(self) -> tuple[str, ...]:
+        """Compartments that have a control, nodes first, in definition order."""
+        return tuple(c.id for c in self.compartments.values() if c.control is not None)
+
+    @cached_property
+    def agents(self) -> tuple[str, ...]:
+        """Compartments that act by default."""
+        return self.acting or self.controllable
+
+    @cached_property
+    def sustainability(self) -> Floats:
+        """σ_k of each arc: the sign with which its flow counts as finite-time sustainable, shape (arcs,).
+
+        +1 if material leaves a non-renewable reservoir or enters a landfill, an incinerator or, as a pollutant, the
+        environment; −1 if it leaves the environment or returns to a reservoir; 0 otherwise or if both hold.
+        """
+        signs = []
+        for arc in self.arcs:
+            donor, recipient = self._role(arc.donor), self._role(arc.recipient)
+            enters = recipient in SINKS and (recipient is not Role.ENVIRONMENT or arc.pollutant)
+            lost = donor is Role.NONRENEWABLE_RESERVOIR or enters
+            regained = donor is Role.ENVIRONMENT or recipient is Role.NONRENEWABLE_RESERVOIR
+            signs.append(float(lost) - float(regained))
+        return np.array(signs)
+
+    @cached_property
+    def environmental(self) -> NDArray[np.bool_]:
+        """Arcs that touch the environment, whose net flow is φ_nz, shape (arcs,)."""
+        return np.array(
+            [Role.ENVIRONMENT in (self._role(a.donor), self._role(a.recipient)) for a in self.arcs], dtype=bool
+        )
+
+    @cached_property
+    def graph(self) -> networkx.DiGraph:
+        """The network as a networkx digraph; parallel arcs share an edge, whose ``arcs`` lists them."""
+        import networkx
+
+        graph = networkx.DiGraph(name=self.name)
+        for node in self.nodes:
+            graph.add_node(node.id, role=node.role.value, compartment=node)
+        for arc in self.arcs:
+            if not graph.has_edge(arc.donor, arc.recipient):
+                graph.add_edge(arc.donor, arc.recipient, arcs=[])
+            graph.edges[arc.donor, arc.recipient]["arcs"].append(arc)
+        return graph
+
+    def circularity(self, flow: Floats) -> Floats:
+        """Return λ(N;t) = −Δ·σᵀf for continuous flows.
+
+        With ``net_zero = "abs"`` the part through the environment enters by its absolute value:
+        λ = −Δ(σ_rest·f + |σ_env·f|).
+
+        Args:
+            flow: f, shape (arcs, ...), mass/time.
+
+        Returns:
+            λ, shape (...), mass.
+
+        References: Zocco et al., CiRL (arXiv 2505.21536), Definition 2.
+        """
+        delta = self.objective.reference_interval
+        counted = np.flatnonzero(self.sustainability)
+        if self.objective.net_zero == "signed":
+            return -delta * _signed_sum(self.sustainability, counted, flow)
+        through = self.environmental[counted]
+        rest = _signed_sum(self.sustainability, counted[~through], flow)
+        return -delta * (rest + np.abs(_signed_sum(self.sustainability, counted[through], flow)))
+
+    def _role(self, node: str) -> Role:
+        return self.nodes[self.node_index[node]].role
+
+
+def _signed_sum(sign: Floats, arcs: Integers, flow: Floats) -> Floats:
+    """Σ sign_k f_k over ``arcs`` in a fixed order, so that the bits do not depend on the batch size."""
+    return np.add.reduce(sign[arcs].reshape(-1, *[1] * (flow.ndim - 1)) * flow[arcs], axis=0)

@@ -1,0 +1,182 @@
+"""What each agent sees: rows picked from one table of scaled signals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from cirl_marl.elements import Node
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.simulate import Dynamics
+
+MODES = ("local", "neighbours", "full", "stocks")
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """Rows of the signal table: stocks, flows, time, service levels, set-points of nodes and arcs.
+
+    Stocks, flows and set-points are divided by the scale of their compartment, time by the horizon.
+    """
+
+    nodes: int
+    arcs: int
+    services: int
+
+    @property
+    def quantities(self) -> int:
+        """Number of stocks and flows together."""
+        return self.nodes + self.arcs
+
+    @property
+    def time(self) -> int:
+        """Row of the time."""
+        return self.quantities
+
+    @property
+    def levels(self) -> slice:
+        """Rows of the service levels."""
+        return slice(self.quantities + 1, self.quantities + 1 + self.services)
+
+    def set_point(self, compartment: int) -> int:
+        """Row of the set-point of a compartment, nodes counted first."""
+        return self.levels.stop + compartment
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return self.set_point(self.quantities)
+
+
+class ObservationLayout:
+    """Which signals each agent sees, in which order, within which bounds.
+
+    Attributes:
+        slices: rows of each agent in the stacked observation.
+        names: what each entry of an agent's observation is.
+        spaces: observation space of each agent; float32.
+    """
+
+    def __init__(self, dynamics: Dynamics, agents: Sequence[str], mode: str | None, batch: int) -> None:
+        """Lay out the observations of ``agents``; ``mode`` None takes the network's own."""
+        network = dynamics.network
+        mode = mode or network.observation.mode
+        if mode not in MODES:
+            raise CirlError(f"observe: {unknown('observation mode', mode, MODES)}")
+        if mode == "stocks" and not network.observation.nodes:
+            raise CirlError(f"observe: mode 'stocks' needs a scenario that lists the nodes; '{network.name}' has none")
+        self.signals = Signals(len(network.nodes), len(network.arcs), len(network.services))
+        self._network = network
+        self._incident = _incident_arcs(network)
+        self._names = list(self._signal_names())
+        compartments = [c.id for c in (*network.nodes, *network.arcs)]
+        self._position = {id_: i for i, id_ in enumerate(compartments)}
+        self._debts: dict[str, list[int]] = {}
+        for row, service in zip(range(*self.signals.levels.indices(10**9)), network.services, strict=True):
+            self._debts.setdefault(service.provider, []).append(row)
+        rows = [list(dict.fromkeys(self._rows(agent, mode))) for agent in agents]
+        self._index: Integers = np.array([row for seen in rows for row in seen], dtype=np.intp)
+        edges = np.cumsum([0, *(len(seen) for seen in rows)]).tolist()
+        self.slices = {a: slice(edges[i], edges[i + 1]) for i, a in enumerate(agents)}
+        low, high = self._bounds(dynamics)
+        self.spaces = {
+            agent: Box(low[seen], high[seen], dtype=np.float32) for agent, seen in zip(agents, rows, strict=True)
+        }
+        self.names = {
+            agent: tuple(self._names[row] for row in seen) for agent, seen in zip(agents, rows, strict=True)
+        }
+        scales = np.array([c.scale for c in (*network.nodes, *network.arcs)])
+        self._inverse_scale = (1.0 / scales).reshape(-1, 1)
+        set_points = np.array([c.set_point or 0.0 for c in (*network.nodes, *network.arcs)]) / scales
+        self._table = np.zeros((self.signals.rows, batch), dtype=np.float32)
+        self._table[self.signals.set_point(0) :] = set_points[:, None]
+
+    def observe(self, quantities: Floats, time: Floats, levels: Floats) -> NDArray[np.float32]:
+        """Return the stacked observation, shape (entries of all agents, B).
+
+        Args:
+            quantities: stocks and mean flows, shape (nodes + arcs, B).
+            time: elapsed share of the episode, shape (B,).
+            levels: service levels, shape (services, B).
+        """
+        table = self._table
+        with np.errstate(over="ignore"):
+            np.multiply(
+                quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind"
+            )
+        table[self.signals.time] = time
+        table[self.signals.levels] = levels
+        return table.take(self._index, axis=0)
+
+    def _rows(self, agent: str, mode: str) -> Iterator[int]:
+        network, signals = self._network, self.signals
+        if mode == "stocks":
+            yield from (network.node_index[node] for node in network.observation.nodes)
+            return
+        compartment = network.compartments[agent]
+        own = self._position[agent]
+        yield own
+        if isinstance(compartment, Node):
+            arcs = self._incident[own]
+            neighbours = self._across(own)
+        else:
+            ends = [network.node_index[compartment.donor], network.node_index[compartment.recipient]]
+            yield from ends
+            arcs = [k for end in ends for k in self._incident[end]] if mode == "neighbours" else []
+            neighbours = [node for end in ends for node in self._across(end)]
+        yield from (signals.nodes + k for k in arcs)
+        if mode == "neighbours":
+            yield from neighbours
+        if mode == "full":
+            yield from range(signals.quantities)
+        if compartment.set_point is not None:
+            yield signals.set_point(own)
+        if mode == "full":
+            yield from range(signals.levels.start, signals.levels.stop)
+        yield from self._debts.get(agent, [])
+        yield signals.time
+
+    def _across(self, node: int) -> list[int]:
+        """Nodes at the other end of the arcs of ``node``."""
+        ends = self._network.donors, self._network.recipients
+        return [int(end[k]) for k in self._incident[node] for end in ends if end[k] != node]
+
+    def _signal_names(self) -> Iterator[str]:
+        network = self._network
+        yield from (f"stock of {node.id}" for node in network.nodes)
+        yield from (f"flow of {arc.id}" for arc in network.arcs)
+        yield "time"
+        yield from (f"service level of {service.id}" for service in network.services)
+        yield from (f"set-point of {c.id}" for c in (*network.nodes, *network.arcs))
+
+    def _bounds(self, dynamics: Dynamics) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Bounds that conservation gives: no stock exceeds all the mass there is, no flow what that mass can drive."""
+        network, signals = self._network, self.signals
+        compartments = (*network.nodes, *network.arcs)
+        scales = np.array([c.scale for c in compartments])
+        low, high = np.zeros(signals.rows), np.ones(signals.rows)
+        if dynamics.exact:
+            mass = sum(node.initial[1] for node in network.nodes)
+            drive = np.where(dynamics.driver == signals.nodes, 1.0, mass)
+            limits = np.concatenate([np.full(signals.nodes, mass), drive * dynamics.max_rate]) / scales
+            high[: signals.quantities] = limits * (1 + 1e-6) + 1e-6
+        else:
+            low[: signals.quantities] = -np.inf
+            high[: signals.quantities] = np.inf
+        set_points = np.abs([c.set_point or 0.0 for c in compartments]) / scales
+        low[signals.set_point(0) :] = -set_points - 1
+        high[signals.set_point(0) :] = set_points + 1
+        return low.astype(np.float32), high.astype(np.float32)
+
+
+def _incident_arcs(network: Network) -> list[list[int]]:
+    incident: list[list[int]] = [[] for _ in network.nodes]
+    for k, (i, j) in enumerate(zip(network.donors.tolist(), network.recipients.tolist(), strict=True)):
+        incident[i].append(k)
+        incident[j].append(k)
+    return incident

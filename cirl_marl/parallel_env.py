@@ -1,0 +1,216 @@
+"""The multi-agent environment of a material network for PettingZoo: parallel, and AEC through PettingZoo's conversion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike, NDArray
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import conversions
+
+from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.network import Floats, Network
+from cirl_marl.vector_env import Outcome, Snapshot, VectorEnv
+
+RENDER_MODES = ("rgb_array", "human")
+
+
+class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
+    """One copy of a material network whose compartments are PettingZoo agents.
+
+    Each agent has its own Box(−1, 1) action and its own float32 observation; ``layout.names[agent]`` says what each
+    entry is. Episodes end by truncation at the horizon. ``infos[agent]`` carries ``circularity`` (λ at the end of the
+    step, mass), ``local_reward``, ``flows`` (mean flows in the order of ``network.arcs``, mass/time) and
+    ``service_level``.
+
+    Attributes:
+        network: the network under the chosen scenario.
+        possible_agents: compartments that act.
+        agents: the same while an episode runs, empty after it.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (PettingZoo declares it so)
+        "name": "cirl_marl",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        network: str | Path | Network,
+        *,
+        scenario: str | None = None,
+        agents: Sequence[str] | None = None,
+        reward: str | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        """Make the environment; ``options`` and errors are those of ``VectorEnv``."""
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise CirlError(unknown("render_mode", render_mode, RENDER_MODES))
+        self._batch = VectorEnv(network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options)
+        self.network = self._batch.network
+        self.layout = self._batch.layout
+        self.possible_agents = list(self._batch.agents)
+        self.agents: list[str] = []
+        self.observation_spaces = dict(self._batch.observation_spaces)
+        self.action_spaces = dict(self._batch.action_spaces)
+        columns = len(self.network.nodes) + 1
+        self.state_space = Box(-np.inf, np.inf, (columns,), np.float64)
+        self.render_mode = render_mode
+        self._canvas: Any = None
+
+    def observation_space(self, agent: str) -> Box:
+        """Return the observation space of ``agent``, always the same object."""
+        return self._batch.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Box:
+        """Return the action space of ``agent``, always the same object."""
+        return self._batch.action_spaces[agent]
+
+    @property
+    def neutral_action(self) -> dict[str, NDArray[np.float32]]:
+        """The action of each agent that leaves it neutral."""
+        return {agent: action.astype(np.float32) for agent, action in self._batch.neutral_action.items()}
+
+    def reset(
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
+        """Start an episode; ``options={"initial_state": {node: stock}}`` starts it from a given state."""
+        observation = self._batch.reset(seed, options)
+        self.agents = list(self.possible_agents)
+        return {agent: seen[0] for agent, seen in observation.items()}, {agent: {} for agent in self.agents}
+
+    def step(
+        self, actions: Mapping[str, ArrayLike]
+    ) -> tuple[
+        dict[str, NDArray[np.float32]],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Hold one action per agent, each of shape (1,) in [−1, 1], for one control interval.
+
+        Raises:
+            ControlError: for missing or unknown agents, wrong shapes, NaN or values out of bounds.
+        """
+        if not self.agents:
+            if actions:
+                raise ControlError("no episode is running: call reset()")
+            return {}, {}, {}, {}, {}
+        agents = self.possible_agents
+        outcome = self._batch.advance(self._stack(actions))
+        truncated = bool(outcome.truncated[0])
+        if truncated:
+            self.agents = []
+        seen = outcome.observation[:, 0]
+        slices = self.layout.slices
+        return (
+            {agent: seen[slices[agent]] for agent in agents},
+            dict(zip(agents, outcome.reward[:, 0].tolist(), strict=True)),
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, truncated),
+            self._infos(outcome),
+        )
+
+    def state(self) -> Floats:
+        """Return the whole physical state: every stock in mass units, then the elapsed share of the episode."""
+        return self._batch.state()[0]
+
+    def local_rewards(self) -> dict[str, float]:
+        """Return the local reward that the current state gives each compartment, whether it acts or not."""
+        return {name: float(reward[0]) for name, reward in self._batch.local_rewards().items()}
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the whole environment state, random streams included."""
+        return self._batch.snapshot()
+
+    def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
+        """Go back to a snapshot and return the observations there."""
+        observation = self._batch.restore(snapshot)
+        over = int(self._batch.physical.step[0]) >= self.network.episode.horizon
+        self.agents = [] if over else list(self.possible_agents)
+        return {agent: seen[0] for agent, seen in observation.items()}
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``.
+
+        Raises:
+            CirlError: if the environment was made without a ``render_mode``.
+        """
+        if self.render_mode is None:
+            raise CirlError(f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when making the environment")
+        from cirl_marl.report.digraph import Canvas
+
+        if self._canvas is None:
+            self._canvas = Canvas(self.network, window=self.render_mode == "human")
+        state = self._batch.physical
+        time = float(state.step[0]) * self.network.episode.control_interval
+        image: NDArray[np.uint8] = self._canvas.draw(state.stock[:-1, 0], state.flow[:, 0], time)
+        return image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._canvas is not None:
+            self._canvas.close()
+            self._canvas = None
+
+    def _stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
+        """Stack the actions; only if they do not stack are they looked at one by one, to say why."""
+        try:
+            stacked = np.array([actions[agent] for agent in self.possible_agents], dtype=float)
+        except (KeyError, ValueError):
+            stacked = np.empty(0)
+        if stacked.shape != (len(self.possible_agents), 1) or len(actions) != len(self.possible_agents):
+            return self._batch.stack({agent: np.asarray(action)[None] for agent, action in actions.items()})
+        return stacked
+
+    def _infos(self, outcome: Outcome) -> dict[str, dict[str, Any]]:
+        circularity, service = float(outcome.circularity[0]), float(outcome.service_level[0])
+        flows = outcome.flow[:, 0]
+        return {
+            agent: {
+                "circularity": circularity,
+                "local_reward": local,
+                "flows": flows,
+                "service_level": service,
+            }
+            for agent, local in zip(self.possible_agents, outcome.local[:, 0].tolist(), strict=True)
+        }
+
+
+def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParallelEnv:
+    """Return the network as a PettingZoo ParallelEnv.
+
+    Args:
+        network: catalogue name, path of a definition file, or a network.
+        **options: ``scenario``, ``agents``, ``reward``, ``observe``, ``circularity``, ``horizon``, ``render_mode``.
+
+    >>> env = parallel_env("copper_net", agents=["mine", "use_to_collection"])
+    >>> observations, infos = env.reset(seed=0)
+    >>> observations, rewards, *_ = env.step({"mine": [-1.0], "use_to_collection": [1.0]})
+    >>> sorted(rewards)
+    ['mine', 'use_to_collection']
+    """
+    return NetworkParallelEnv(network, **options)
+
+
+def aec_env(network: str | Path | Network, **options: Any) -> AECEnv[str, Any, Any]:
+    """Return the network as a PettingZoo AECEnv: agents act in turn, the network moves when all have acted."""
+    return conversions.parallel_to_aec(NetworkParallelEnv(network, **options))
+
+
+def vector_env(network: str | Path | Network, num_envs: int = 64, **options: Any) -> VectorEnv:
+    """Return ``num_envs`` copies of the network, arrays in and out; see ``VectorEnv``.
+
+    >>> env = vector_env("copper_net", num_envs=3)
+    >>> env.reset(seed=0)["mine"].shape
+    (3, 3)
+    """
+    return VectorEnv(network, num_envs=num_envs, **options)

@@ -1,0 +1,92 @@
+"""Local rewards of compartments, service levels and the team's circularity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import sparse
+
+from cirl_marl.network import Floats, Integers, Network
+
+
+class Scoring:
+    """Scores stocks and mean flows.
+
+    The local reward of compartment c with quantity q (stock of a node, mean flow of an arc) is::
+
+        r_c = −((q − set_point)/scale)² − Σ_s weight_s · shortfall_s,    s over the services that c owes
+
+    where shortfall = 1 − level, and the level of a service with band [low, high] is min(1, q/low, high/q).
+
+    Args of all methods are compartment-major, shape (rows, B).
+    """
+
+    def __init__(self, network: Network, agents: Sequence[str]) -> None:
+        """Compile the scores of ``agents`` and of the network as a whole."""
+        compartments = list(network.compartments.values())
+        position = {c.id: i for i, c in enumerate(compartments)}
+        chosen = network.objective.tracked or [c.id for c in compartments if c.set_point is not None]
+        self._tracked: Integers = np.array([position[c] for c in chosen], dtype=np.intp)
+        tracked = [network.compartments[c] for c in chosen]
+        self._set_point = np.array([c.set_point for c in tracked], dtype=float).reshape(-1, 1)
+        self._inverse_scale = 1.0 / np.array([c.scale for c in tracked], dtype=float).reshape(-1, 1)
+        services = network.services
+        self._measure = _measurement(network, position)
+        self._low = np.array([s.low for s in services]).reshape(-1, 1)
+        self._high = np.array([s.high for s in services]).reshape(-1, 1)
+        terms = len(chosen) + len(services)
+        weights = np.array([*[1.0] * len(chosen), *(s.weight for s in services)])
+        owners = np.array([*self._tracked, *(position[s.provider] for s in services)], dtype=np.intp)
+        everyone = sparse.csr_array((-weights, (owners, np.arange(terms))), shape=(len(compartments), terms))
+        self._everyone = everyone
+        self._agents = everyone[[position[agent] for agent in agents]]
+
+    def levels(self, quantities: Floats) -> Floats:
+        """Return the level of each service in [0, 1], shape (services, B)."""
+        measured = self._measure @ quantities
+        above = np.divide(self._high, measured, out=np.ones_like(measured), where=measured > self._high)
+        level: Floats = np.minimum(np.maximum(measured / self._low, 0.0), above)
+        return np.minimum(level, 1.0, out=level)
+
+    def terms(self, quantities: Floats, levels: Floats) -> Floats:
+        """Return squared scaled distances and service shortfalls, shape (terms, B)."""
+        distance = quantities.take(self._tracked, axis=0)
+        distance -= self._set_point
+        distance *= self._inverse_scale
+        distance *= distance
+        return np.concatenate([distance, 1.0 - levels])
+
+    def local(self, terms: Floats) -> Floats:
+        """Return the local reward of each agent, shape (agents, B)."""
+        rewards: Floats = self._agents @ terms
+        return rewards
+
+    def local_of_all(self, terms: Floats) -> Floats:
+        """Return the local reward of each compartment, nodes first, shape (nodes + arcs, B)."""
+        rewards: Floats = self._everyone @ terms
+        return rewards
+
+
+def service_level(levels: Floats) -> Floats:
+    """Return the mean level over the services, shape (B,); 1 for a network that owes none."""
+    if len(levels) == 0:
+        return np.ones(levels.shape[1])
+    total: Floats = np.add.reduce(levels, axis=0)
+    total /= len(levels)
+    return total
+
+
+def _measurement(network: Network, position: dict[str, int]) -> sparse.csr_array:
+    """Matrix that reads each service off the stocks and flows, shape (services, nodes + arcs)."""
+    rows, columns = [], []
+    for row, service in enumerate(network.services):
+        if service.quantity == "outflow":
+            provider = network.node_index[service.provider]
+            read = [len(network.nodes) + int(k) for k in np.flatnonzero(network.donors == provider)]
+        else:
+            read = [position[service.provider]]
+        rows += [row] * len(read)
+        columns += read
+    shape = (len(network.services), len(position))
+    return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)

@@ -1,0 +1,186 @@
+"""The shape of a definition file: strict, typed tables in which each number has a value, a unit and a source."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cirl_marl.elements import ControlKind, Law, Role
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Source = Annotated[str, Field(min_length=1, description="where the number comes from")]
+Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+
+
+class Table(BaseModel):
+    """A TOML table without unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class Quantity(Table):
+    """A number with its unit and source."""
+
+    value: Number
+    unit: str = Field(description="pint unit, such as 'kt', '1/day', 't/day'; '1' if dimensionless")
+    source: Source
+
+
+class Range(Table):
+    """An interval from which initial stocks are drawn uniformly."""
+
+    low: Number
+    high: Number
+    unit: str
+    source: Source
+
+
+class Series(Table):
+    """A step function of time: ``values[i]`` holds from ``times[i]`` on."""
+
+    times: list[Number] = Field(description="starts of the steps, beginning with 0")
+    time_unit: str
+    values: list[Number]
+    unit: str
+    source: Source
+
+
+class ControlTable(Table):
+    """What the agent of this compartment sets."""
+
+    kind: ControlKind = Field(description="'rate': a factor on the flow(s); 'flow': the flow itself")
+    low: Number = Field(description="value at action -1")
+    neutral: Number = Field(description="value while nobody acts")
+    high: Number = Field(description="value at action +1")
+    unit: str
+    source: Source
+
+
+class NodeTable(Table):
+    """A compartment that stores material."""
+
+    title: str = ""
+    role: Role
+    initial: Range
+    set_point: Quantity | None = None
+    scale: Quantity | None = Field(None, description="reference stock; default: scales.stock")
+    control: ControlTable | None = None
+
+
+class ArcTable(Table):
+    """A compartment that moves material."""
+
+    title: str = ""
+    from_: str = Field(alias="from", description="id of the node that gives")
+    to: str = Field(description="id of the node that receives")
+    law: Law
+    rate: Quantity | None = Field(None, description="a of the donor and recipient laws, 1/time")
+    flow: Quantity | None = Field(None, description="constant flow of the exogenous law")
+    series: Series | None = Field(None, description="time series of the exogenous law")
+    set_point: Quantity | None = None
+    scale: Quantity | None = Field(None, description="reference flow; default: scales.flow")
+    pollutant: bool = Field(True, description="whether what enters an environment here is a pollutant")
+    control: ControlTable | None = None
+
+
+class ServiceTable(Table):
+    """A stock or flow to be kept within a band."""
+
+    title: str = ""
+    provider: str = Field(description="compartment that owes the service")
+    quantity: Literal["stock", "outflow", "flow"]
+    low: Quantity
+    high: Quantity | None = None
+    weight: Quantity = Field(description="factor of the shortfall in the provider's local reward")
+
+
+class UnitsTable(Table):
+    """Units in which the network is simulated and reported."""
+
+    mass: str
+    time: str
+
+
+class EpisodeTable(Table):
+    """Time and solver."""
+
+    control_interval: Quantity
+    horizon: Quantity = Field(description="decisions per episode, unit '1'")
+    solver: Literal["exact", "euler"] = "exact"
+    solver_step: Quantity | None = None
+
+
+class ScalesTable(Table):
+    """Reference stock and flow of compartments that state none of their own."""
+
+    stock: Quantity
+    flow: Quantity
+
+
+class ObjectiveTable(Table):
+    """Circularity and rewards."""
+
+    reference_interval: Quantity = Field(description="the interval Δ of λ = -(m_fb + Δ·ṁ_fc)")
+    net_zero: Literal["signed", "abs"]
+    reward: Literal["local", "circularity", "mixed", "difference", "local_sum"]
+    circularity_scale: Quantity
+    circularity_weight: Quantity
+    tracked: list[str] = Field(
+        [], description="compartments whose set-point counts in local rewards; default: all that have one"
+    )
+
+
+class ObservationTable(Table):
+    """What agents see by default."""
+
+    mode: Literal["local", "neighbours", "full", "stocks"]
+    nodes: list[str] = Field([], description="observed nodes of mode 'stocks', in order")
+
+
+class NetworkTable(Table):
+    """A material network."""
+
+    name: Identifier
+    title: str
+    material: str
+    references: list[str] = []
+    units: UnitsTable
+    episode: EpisodeTable
+    scales: ScalesTable
+    objective: ObjectiveTable
+    observation: ObservationTable
+    agents: list[str] = Field([], description="who acts; default: every compartment with a control")
+    nodes: dict[Identifier, NodeTable]
+    arcs: dict[Identifier, ArcTable]
+    services: dict[Identifier, ServiceTable] = {}
+    scenarios: dict[Identifier, dict[str, Any]] = Field(
+        {}, description="tables that replace those of the default scenario, key by key"
+    )
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON schema of definition files, with which editors complete and check them.
+
+    A scenario may give any part of a network, so in its branch nothing is required.
+    """
+    schema = NetworkTable.model_json_schema(by_alias=True)
+    definitions = schema["$defs"]
+
+    def part(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {
+                key: f"{item}Part" if key == "$ref" and item.split("/")[-1] in tables else part(item)
+                for key, item in value.items()
+                if not (key == "required" and isinstance(item, list))
+            }
+        return [part(item) for item in value] if isinstance(value, list) else value
+
+    tables = [name for name, body in definitions.items() if body.get("type") == "object"]
+    parts = {f"{name}Part": part(definitions[name]) for name in tables}
+    properties = {k: v for k, v in schema["properties"].items() if k not in ("scenarios", "name")}
+    parts["Scenario"] = {"type": "object", "additionalProperties": False, "properties": part(properties)}
+    definitions.update(parts)
+    schema["properties"]["scenarios"]["additionalProperties"] = {"$ref": "#/$defs/Scenario"}
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    return schema

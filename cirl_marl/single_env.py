@@ -1,0 +1,112 @@
+"""One agent of a material network as a Gymnasium environment; the others hold their neutral control."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Network
+from cirl_marl.parallel_env import NetworkParallelEnv
+from cirl_marl.vector_env import Snapshot
+
+
+class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One compartment of a network acts.
+
+    With ``scenario="paper"`` this is the environment of the CiRL paper: its observation is the state in the paper's
+    order and its reward the paper's. ``info["state"]`` is that state in float64; the rest of ``info`` is that of the
+    PettingZoo view.
+
+    Attributes:
+        agent: the compartment that acts.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self, network: str | Path | Network, agent: str | None = None, *, scenario: str | None = None, **options: Any
+    ) -> None:
+        """Make the environment.
+
+        Args:
+            network: catalogue name, path of a definition file, or a network.
+            agent: who acts; None if the scenario has exactly one agent.
+            scenario: scenario of the definition.
+            **options: those of ``parallel_env``, but for ``agents``.
+
+        Raises:
+            CirlError: if ``agent`` is missing or unknown.
+        """
+        if "agents" in options:
+            raise CirlError("a single-agent environment takes agent=, not agents=")
+        chosen = None if agent is None else [agent]
+        self.parallel = NetworkParallelEnv(network, scenario=scenario, agents=chosen, **options)
+        if len(self.parallel.possible_agents) != 1:
+            raise CirlError(
+                f"network '{self.parallel.network.name}' has several agents: "
+                f"give agent=, one of {', '.join(self.parallel.possible_agents)}"
+            )
+        self.agent = self.parallel.possible_agents[0]
+        self.render_mode = self.parallel.render_mode
+        self.observation_space = self.parallel.observation_space(self.agent)
+        self.action_space = self.parallel.action_space(self.agent)
+        network_ = self.parallel.network
+        observed = network_.observation.nodes or [node.id for node in network_.nodes]
+        self._order = np.array([network_.node_index[node] for node in observed], dtype=np.intp)
+
+    @property
+    def network(self) -> Network:
+        """The network under the chosen scenario."""
+        return self.parallel.network
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; ``options={"initial_state": …}`` takes a mapping or, in the paper scenarios, an array."""
+        super().reset(seed=seed)
+        observations, _ = self.parallel.reset(seed=seed, options=options)
+        return observations[self.agent], {"state": self._paper_state()}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Hold the action, shape (1,) in [−1, 1], for one control interval."""
+        observations, rewards, terminations, truncations, infos = self.parallel.step({self.agent: action})
+        info = {**infos[self.agent], "state": self._paper_state()}
+        agent = self.agent
+        return observations[agent], rewards[agent], terminations[agent], truncations[agent], info
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the whole environment state, random streams included."""
+        return self.parallel.snapshot()
+
+    def restore(self, snapshot: Snapshot) -> NDArray[np.float32]:
+        """Go back to a snapshot and return the observation there."""
+        return self.parallel.restore(snapshot)[self.agent]
+
+    def render(self) -> Any:
+        """Draw the network; see ``NetworkParallelEnv.render``."""
+        return self.parallel.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.parallel.close()
+
+    def _paper_state(self) -> NDArray[np.float64]:
+        return self.parallel.state()[self._order]
+
+
+def single_agent_env(network: str | Path | Network, agent: str | None = None, **options: Any) -> SingleAgentEnv:
+    """Return one agent of ``network`` as a Gymnasium environment.
+
+    >>> env = single_agent_env("copper_net", agent="use_to_collection", scenario="paper")
+    >>> observation, info = env.reset(seed=0)
+    >>> info["state"]
+    array([  65.,   80.,   80., 1300.,   15.,   15.])
+    """
+    return SingleAgentEnv(network, agent, **options)

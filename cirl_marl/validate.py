@@ -1,0 +1,184 @@
+"""Every reason why a network cannot be simulated, so that a definition is mended in one go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from cirl_marl.elements import (
+    NET_ZERO,
+    OBSERVE,
+    QUANTITIES,
+    REWARDS,
+    SOLVERS,
+    Arc,
+    ControlKind,
+    Episode,
+    Law,
+    Node,
+    Service,
+)
+from cirl_marl.errors import unknown
+
+if TYPE_CHECKING:
+    from cirl_marl.network import Network
+
+
+def problems(network: Network) -> Iterator[str]:
+    """Yield every reason why ``network`` cannot be simulated."""
+    seen: set[str] = set()
+    for compartment in (*network.nodes, *network.arcs):
+        if compartment.id in seen:
+            yield f"compartment '{compartment.id}': the id is used twice"
+        seen.add(compartment.id)
+    nodes = {node.id: node for node in network.nodes}
+    for node in network.nodes:
+        yield from _node_problems(network, node)
+    controlled: dict[str, list[Arc]] = {}
+    for arc in network.arcs:
+        yield from _arc_problems(network, arc, nodes)
+        if arc.law is Law.CONTROLLED:
+            controlled.setdefault(arc.donor, []).append(arc)
+    for node in network.nodes:
+        outflows = controlled.get(node.id, [])
+        if node.control and node.control.kind is ControlKind.FLOW and len(outflows) != 1:
+            yield (
+                f"node '{node.id}': control.kind 'flow' needs exactly one controlled outflow, it has {len(outflows)}"
+            )
+        for arc in outflows:
+            sets_flow = [
+                c for c in (node, arc) if c.control is not None and c.control.kind is ControlKind.FLOW
+            ]
+            if len(sets_flow) != 1:
+                yield (
+                    f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', on the arc or on its "
+                    f"donor '{node.id}'; it has {len(sets_flow)}"
+                )
+    for service in network.services:
+        yield from _service_problems(service, network, nodes)
+    yield from _setting_problems(network)
+    acting = [c.id for c in (*network.nodes, *network.arcs) if c.control is not None]
+    for agent in network.acting:
+        if agent not in acting:
+            yield f"agents: {unknown('acting compartment', agent, acting)}"
+    if len(set(network.acting)) != len(network.acting):
+        yield f"agents: {list(network.acting)} names a compartment twice"
+
+
+def _node_problems(network: Network, node: Node) -> Iterator[str]:
+    low, high = node.initial
+    if not (math.isfinite(low) and math.isfinite(high)) or low > high:
+        yield f"node '{node.id}': initial range [{low}, {high}] is empty or not finite"
+    elif low < 0 and network.episode.solver != "euler":
+        yield f"node '{node.id}': initial stock {low} is negative"
+    yield from _common_problems(f"node '{node.id}'", node)
+
+
+def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
+    where = f"arc '{arc.id}'"
+    for end, node in (("from", arc.donor), ("to", arc.recipient)):
+        if node not in nodes:
+            yield f"{where}: {end}: {unknown('node', node, nodes)}"
+    if arc.donor == arc.recipient:
+        yield f"{where}: a cycle of zero delay: it returns to its own donor '{arc.donor}' without passing a stock"
+    if not math.isfinite(arc.rate) or arc.rate < 0:
+        yield f"{where}: rate {arc.rate} must be finite and not negative"
+    if arc.law in (Law.DONOR, Law.RECIPIENT) and arc.rate == 0:
+        yield f"{where}: law '{arc.law}' needs a positive rate"
+    if not arc.flow or any(not math.isfinite(f) or f < 0 for f in arc.flow):
+        yield f"{where}: flow {arc.flow} must be finite and not negative"
+    if len(arc.times) != (len(arc.flow) if arc.times else 0):
+        yield f"{where}: series has {len(arc.times)} times and {len(arc.flow)} values"
+    if arc.times and (arc.times[0] != 0 or any(b <= a for a, b in pairwise(arc.times))):
+        yield f"{where}: series times {arc.times} must start at 0 and increase"
+    if arc.control and arc.control.kind is ControlKind.FLOW and arc.law is not Law.CONTROLLED:
+        yield f"{where}: control.kind 'flow' needs law 'controlled', not '{arc.law}'"
+    if arc.control and arc.control.kind is ControlKind.RATE and arc.law is Law.CONTROLLED:
+        yield f"{where}: law 'controlled' needs control.kind 'flow', not 'rate'"
+    yield from _common_problems(where, arc)
+    control = arc.control
+    if control and control.kind is ControlKind.FLOW and control.low < 0 and network.episode.solver != "euler":
+        yield f"{where}: control.low {control.low} would reverse the flow; use a second arc"
+
+
+def _common_problems(where: str, compartment: Node | Arc) -> Iterator[str]:
+    if not math.isfinite(compartment.scale) or compartment.scale <= 0:
+        yield f"{where}: scale {compartment.scale} must be positive and finite"
+    if compartment.set_point is not None and not math.isfinite(compartment.set_point):
+        yield f"{where}: set_point {compartment.set_point} must be finite"
+    control = compartment.control
+    if control is None:
+        return
+    if not all(map(math.isfinite, (control.low, control.neutral, control.high))):
+        yield f"{where}: control bounds must be finite"
+    elif not control.low <= control.neutral <= control.high or control.low == control.high:
+        yield (
+            f"{where}: control needs low <= neutral <= high and low < high, "
+            f"got {control.low}, {control.neutral}, {control.high}"
+        )
+    if control.kind is ControlKind.RATE and control.low < 0:
+        yield f"{where}: control.low {control.low} is negative; a valve cannot reverse a flow"
+
+
+def _service_problems(service: Service, network: Network, nodes: Mapping[str, Node]) -> Iterator[str]:
+    where = f"service '{service.id}'"
+    if service.quantity not in QUANTITIES:
+        yield f"{where}: {unknown('quantity', service.quantity, QUANTITIES)}"
+    known = [arc.id for arc in network.arcs] if service.quantity == "flow" else list(nodes)
+    if service.provider not in known:
+        kind = "arc" if service.quantity == "flow" else "node"
+        yield f"{where}: provider: {unknown(kind, service.provider, known)}"
+    if not 0 < service.low <= service.high:
+        yield f"{where}: the band [{service.low}, {service.high}] must be positive and not empty"
+    if not math.isfinite(service.weight) or service.weight < 0:
+        yield f"{where}: weight {service.weight} must be finite and not negative"
+
+
+def _setting_problems(network: Network) -> Iterator[str]:
+    episode, objective = network.episode, network.objective
+    for what, value, known in (
+        ("solver", episode.solver, SOLVERS),
+        ("net_zero", objective.net_zero, NET_ZERO),
+        ("reward", objective.reward, REWARDS),
+        ("observation mode", network.observation.mode, OBSERVE),
+    ):
+        if value not in known:
+            yield unknown(what, value, known)
+    for name, number in (
+        ("control_interval", episode.control_interval),
+        ("reference_interval", objective.reference_interval),
+        ("circularity_scale", objective.circularity_scale),
+    ):
+        if not math.isfinite(number) or number <= 0:
+            yield f"{name} {number} must be positive and finite"
+    if episode.horizon < 1:
+        yield f"horizon {episode.horizon} must be at least 1 step"
+    if not 0 <= objective.circularity_weight <= 1:
+        yield f"circularity_weight {objective.circularity_weight} must lie in [0, 1]"
+    if episode.solver == "euler":
+        yield from _euler_problems(episode)
+    tracked = [c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None]
+    for name in objective.tracked:
+        if name not in tracked:
+            yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
+    if (network.observation.mode == "stocks") != bool(network.observation.nodes):
+        yield "observation: mode 'stocks', and only that mode, lists its nodes"
+    ids = [node.id for node in network.nodes]
+    for node in network.observation.nodes:
+        if node not in ids:
+            yield f"observation: {unknown('node', node, ids)}"
+
+
+def _euler_problems(episode: Episode) -> Iterator[str]:
+    step = episode.solver_step
+    if step is None or not step > 0:
+        yield f"solver 'euler' needs a positive solver_step, got {step}"
+        return
+    ratio = episode.control_interval / step
+    if not math.isclose(ratio, round(ratio), rel_tol=1e-9) or round(ratio) < 1:
+        yield (
+            f"control_interval {episode.control_interval} is not a whole number of solver steps of {step} "
+            f"({ratio:.6g} steps)"
+        )
