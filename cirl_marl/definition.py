@@ -56,8 +56,16 @@ def read_network(path: Path) -> Network:
         raise DefinitionError(str(path), mistakes)
     for network in networks.values():
         others = {name: other for name, other in networks.items() if other is not network}
-        object.__setattr__(network, "scenarios", types.MappingProxyType(others))
+        object.__setattr__(network, "scenarios", others)
+        object.__setattr__(network, "source", path)
     return networks["default"]
+
+
+def write_network(network: Network, path: Path) -> None:
+    """Write a network built in Python as a definition file; its other scenarios are not written."""
+    from cirl_marl.writing import definition_of
+
+    path.write_text(definition_of(network), encoding="utf-8")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -228,6 +236,7 @@ class _Converter:
             quantity=service.quantity,
             low=self._value(service.low, kind, f"{where}.low"),
             weight=self._value(service.weight, "1", f"{where}.weight"),
+            owed_by=tuple(service.owed_by),
             **({} if high is None else {"high": high}),
         )
 

@@ -110,11 +110,12 @@ class Service:
 
     Attributes:
         id: name of the service.
-        provider: compartment that owes it; the shortfall enters its local reward.
+        provider: compartment at which it is measured.
         quantity: ``stock`` of a node, ``outflow`` of a node (sum of its outflows), or ``flow`` of an arc.
         low: lower end of the band, mass or mass/time.
         high: upper end of the band.
-        weight: factor of the shortfall in the local reward.
+        weight: factor of the shortfall in the local rewards.
+        owed_by: compartments whose local reward bears the shortfall; empty means the provider alone.
     """
 
     id: str
@@ -123,6 +124,12 @@ class Service:
     low: float
     high: float = math.inf
     weight: float = 1.0
+    owed_by: tuple[str, ...] = ()
+
+    @property
+    def debtors(self) -> tuple[str, ...]:
+        """Compartments whose local reward bears the shortfall."""
+        return self.owed_by or (self.provider,)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

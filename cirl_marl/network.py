@@ -12,8 +12,9 @@ so mass is conserved by construction. Circularity is derived from the roles of t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -47,6 +48,7 @@ class Network:
         mass_unit: unit of stocks.
         time_unit: unit of time.
         title: one line for tables.
+        source: definition file that it was read from; None if it was built in Python.
         scenario_name: the scenario that this network describes.
         scenarios: the other scenarios of the same definition, by name.
     """
@@ -62,6 +64,7 @@ class Network:
     mass_unit: str = "kg"
     time_unit: str = "day"
     title: str = ""
+    source: Path | None = field(default=None, repr=False, compare=False)
     scenario_name: str = "default"
     scenarios: Mapping[str, Network] = field(default_factory=dict, repr=False, compare=False)
 
@@ -70,6 +73,10 @@ class Network:
         found = list(problems(self))
         if found:
             raise NetworkError(f"network '{self.name}'", found)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Pickle the fields, not the arrays derived from them."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def scenario(self, name: str | None) -> Network:
         """Return this network under scenario ``name`` (None: as it is).
@@ -196,5 +203,17 @@ class Network:
 
 
 def _signed_sum(sign: Floats, arcs: Integers, flow: Floats) -> Floats:
-    """Σ sign_k f_k over ``arcs`` in a fixed order, so that the bits do not depend on the batch size."""
-    return np.add.reduce(sign[arcs].reshape(-1, *[1] * (flow.ndim - 1)) * flow[arcs], axis=0)
+    """Σ sign_k f_k over ``arcs``."""
+    return ordered_sum(sign[arcs].reshape(-1, *[1] * (flow.ndim - 1)) * flow[arcs])
+
+
+def ordered_sum(terms: Floats) -> Floats:
+    """Σ over axis 0, first to last, so that a column's bits do not depend on the batch it is in.
+
+    numpy adds the rows of a batch in order, but eight or more numbers of a single column pairwise.
+    """
+    if len(terms) and terms.size == len(terms):
+        last: Floats = np.add.accumulate(terms, axis=0)[-1]
+        return last
+    total: Floats = np.add.reduce(terms, axis=0)
+    return total

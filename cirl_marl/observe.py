@@ -78,7 +78,8 @@ class ObservationLayout:
         self._position = {id_: i for i, id_ in enumerate(compartments)}
         self._debts: dict[str, list[int]] = {}
         for row, service in zip(range(*self.signals.levels.indices(10**9)), network.services, strict=True):
-            self._debts.setdefault(service.provider, []).append(row)
+            for debtor in service.debtors:
+                self._debts.setdefault(debtor, []).append(row)
         rows = [list(dict.fromkeys(self._rows(agent, mode))) for agent in agents]
         self._index: Integers = np.array([row for seen in rows for row in seen], dtype=np.intp)
         edges = np.cumsum([0, *(len(seen) for seen in rows)]).tolist()

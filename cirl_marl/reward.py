@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import sparse
 
-from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network import Floats, Integers, Network, ordered_sum
 
 
 class Scoring:
@@ -36,9 +36,11 @@ class Scoring:
         self._low = np.array([s.low for s in services]).reshape(-1, 1)
         self._high = np.array([s.high for s in services]).reshape(-1, 1)
         terms = len(chosen) + len(services)
-        weights = np.array([*[1.0] * len(chosen), *(s.weight for s in services)])
-        owners = np.array([*self._tracked, *(position[s.provider] for s in services)], dtype=np.intp)
-        everyone = sparse.csr_array((-weights, (owners, np.arange(terms))), shape=(len(compartments), terms))
+        debts = [(position[d], len(chosen) + i, s.weight) for i, s in enumerate(services) for d in s.debtors]
+        owners = np.array([*self._tracked, *(owner for owner, _, _ in debts)], dtype=np.intp)
+        columns = np.array([*range(len(chosen)), *(term for _, term, _ in debts)], dtype=np.intp)
+        weights = np.array([*[1.0] * len(chosen), *(weight for _, _, weight in debts)])
+        everyone = sparse.csr_array((-weights, (owners, columns)), shape=(len(compartments), terms))
         self._everyone = everyone
         self._agents = everyone[[position[agent] for agent in agents]]
 
@@ -72,7 +74,7 @@ def service_level(levels: Floats) -> Floats:
     """Return the mean level over the services, shape (B,); 1 for a network that owes none."""
     if len(levels) == 0:
         return np.ones(levels.shape[1])
-    total: Floats = np.add.reduce(levels, axis=0)
+    total = ordered_sum(levels)
     total /= len(levels)
     return total
 

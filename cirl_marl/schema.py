@@ -88,11 +88,14 @@ class ServiceTable(Table):
     """A stock or flow to be kept within a band."""
 
     title: str = ""
-    provider: str = Field(description="compartment that owes the service")
+    provider: str = Field(description="compartment at which the service is measured")
     quantity: Literal["stock", "outflow", "flow"]
     low: Quantity
     high: Quantity | None = None
-    weight: Quantity = Field(description="factor of the shortfall in the provider's local reward")
+    weight: Quantity = Field(description="factor of the shortfall in the local rewards")
+    owed_by: list[str] = Field(
+        [], description="compartments whose local reward bears the shortfall; default: the provider"
+    )
 
 
 class UnitsTable(Table):

@@ -132,6 +132,7 @@ class Dynamics:
             (np.ones(len(own)), ([slot[int(network.donors[k])] for k in own], own)), shape=shape
         )
         self._outgoing = -self.incidence.minimum(0.0)
+        self._pulls = bool((laws == Law.RECIPIENT).any())
 
     def rate(self, controls: Floats, step: Integers | None = None) -> Floats:
         """Return r of each arc for given controls.
@@ -176,7 +177,7 @@ class Dynamics:
             if self.exact:
                 realised = self._limit_orders(stock, rate)
                 moved = self._moved_exactly(stock, realised)
-                stock, moved = self._move(stock, moved)
+                stock, moved, realised = self._move(stock, moved, realised)
             else:
                 realised = rate
                 moved = self.flow(stock, rate) * self.substep
@@ -208,7 +209,7 @@ class Dynamics:
         turned_over = self._exits @ rate
         turned_over *= self.substep
         held = stock.take(self._order_donors, axis=0)
-        if (asked <= held * (1.0 - turned_over)).all():
+        if (asked <= held * (1.0 - turned_over) * (1.0 - 1e-12)).all():
             return rate  # x·a/(e^{ah} − 1) ≥ x(1 − ah)/h: nothing can be overdrawn
         share = np.divide(turned_over, np.expm1(turned_over), out=np.ones_like(held), where=turned_over > 1e-12)
         available = held * share * (1.0 - 1e-12)
@@ -217,21 +218,26 @@ class Dynamics:
         rate[self._order_arcs] *= factor.take(self._order_slot, axis=0)
         return rate
 
-    def _move(self, stock: Floats, moved: Floats) -> tuple[Floats, Floats]:
+    def _move(self, stock: Floats, moved: Floats, rate: Floats) -> tuple[Floats, Floats, Floats]:
         """Move mass; where a recipient-driven flow asked for more than its donor held, send what was there.
 
         Proportional and scheduled flows never overdraw. A recipient that pulls more than there is gets its share: all
-        outflows of the overdrawn node are scaled to the stock it started with. Each pass settles at least one node.
+        outflows of the overdrawn node, and their rates, are scaled to the stock it started with. Each pass settles at
+        least one node.
         """
+        if self._pulls:
+            moved = np.maximum(moved, 0.0)  # the mean of an overdrawn stock may be negative
         after = stock + self.incidence @ moved
         while (after[:-1] < 0).any():
             moved = np.maximum(moved, 0.0)
             out = self._outgoing @ moved
             short = (stock + self.incidence @ moved < 0) & (out > 0)
             kept = np.divide(stock * (1.0 - 1e-12), out, out=np.ones_like(out), where=short)
-            moved *= np.minimum(kept, 1.0).take(self.network.donors, axis=0)
+            share = np.minimum(kept, 1.0).take(self.network.donors, axis=0)
+            moved *= share
+            rate = rate * share
             after = stock + self.incidence @ moved
-        return after, moved
+        return after, moved, rate
 
 
 def _base_rate(arc: Arc) -> float:

@@ -130,6 +130,10 @@ def _service_problems(service: Service, network: Network, nodes: Mapping[str, No
     if service.provider not in known:
         kind = "arc" if service.quantity == "flow" else "node"
         yield f"{where}: provider: {unknown(kind, service.provider, known)}"
+    everyone = [c.id for c in (*network.nodes, *network.arcs)]
+    for debtor in service.owed_by:
+        if debtor not in everyone:
+            yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
     if not 0 < service.low <= service.high:
         yield f"{where}: the band [{service.low}, {service.high}] must be positive and not empty"
     if not math.isfinite(service.weight) or service.weight < 0:

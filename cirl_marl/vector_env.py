@@ -6,6 +6,7 @@ Every other view (PettingZoo, Gymnasium, the seats of the learners) stands on th
 from __future__ import annotations
 
 import copy
+import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from cirl_marl.catalogue import load_network
 from cirl_marl.elements import REWARDS
 from cirl_marl.errors import CirlError, ControlError, unknown
-from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network import Floats, Integers, Network, ordered_sum
 from cirl_marl.observe import ObservationLayout
 from cirl_marl.reward import Scoring, service_level
 from cirl_marl.simulate import Dynamics
@@ -188,7 +189,7 @@ class VectorEnv:
         for node, values in given.items():
             stock[node] = values
         self._state = self._fresh(stock)
-        return self._by_agent(self._observe(self._state))
+        return self.by_agent(self._observe(self._state))
 
     def step(
         self, actions: Mapping[str, ArrayLike]
@@ -218,7 +219,7 @@ class VectorEnv:
             observation = self._restart(outcome.truncated)
         terminated = np.zeros(self.num_envs, dtype=bool)
         return (
-            self._by_agent(observation),
+            self.by_agent(observation),
             {agent: outcome.reward[i] for i, agent in enumerate(self.agents)},
             dict.fromkeys(self.agents, terminated),
             dict.fromkeys(self.agents, outcome.truncated),
@@ -311,10 +312,14 @@ class VectorEnv:
         for stream, saved in zip(self._random, snapshot.streams, strict=True):
             stream.bit_generator.state = copy.deepcopy(dict(saved))
         self._state = _copied(snapshot.state)
-        return self._by_agent(self._observe(self._state))
+        return self.by_agent(self._observe(self._state))
 
     def close(self) -> None:
         """Do nothing; the environment holds no resources."""
+
+    def by_agent(self, stacked: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
+        return {agent: stacked[rows].T for agent, rows in self.layout.slices.items()}
 
     def infos(self, outcome: Outcome) -> Infos:
         """Return λ, local reward, flows (B, arcs) and service level for each agent."""
@@ -340,7 +345,7 @@ class VectorEnv:
             return mixed
         if self.reward_mode == "difference":
             return team - self._counterfactuals(state, controls)
-        common = team if self.reward_mode == "circularity" else np.add.reduce(self.scoring.local_of_all(terms), axis=0)
+        common = team if self.reward_mode == "circularity" else ordered_sum(self.scoring.local_of_all(terms))
         return np.repeat(common[None], len(self.agents), axis=0)
 
     def _counterfactuals(self, state: State, controls: Floats) -> Floats:
@@ -368,7 +373,7 @@ class VectorEnv:
         """Add the final observations and the episode's λ̄ and service level of the copies that ended."""
         state, ended = self.physical, outcome.truncated
         steps = np.maximum(state.step, 1)
-        final = self._by_agent(outcome.observation)
+        final = self.by_agent(outcome.observation)
         for agent, info in infos.items():
             info["final_observation"] = final[agent]
             info["_final_observation"] = ended
@@ -408,9 +413,6 @@ class VectorEnv:
         time = state.step / self.network.episode.horizon
         return self.layout.observe(quantities, time, self.scoring.levels(quantities))
 
-    def _by_agent(self, stacked: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
-        return {agent: stacked[rows].T for agent, rows in self.layout.slices.items()}
-
     def _draw(self, which: Sequence[int] | range | Integers) -> Floats:
         """Draw initial stocks of some copies, each from its own stream, shape (nodes, len(which))."""
         uniform = np.empty((len(self._low), len(which)))
@@ -430,8 +432,8 @@ class VectorEnv:
     def _given_state(self, options: Mapping[str, Any] | None) -> dict[int, Floats]:
         """Return the given initial stocks by node position."""
         options = options or {}
-        for key in options:
-            if key != "initial_state":
+        for key in options:  # other keys are for wrappers: PettingZoo's own test passes one; a misspelt one is an error
+            if key != "initial_state" and difflib.get_close_matches(str(key), ["initial_state"]):
                 raise ControlError(f"reset options: {unknown('option', key, ['initial_state'])}")
         given = options.get("initial_state", {})
         if not isinstance(given, Mapping):

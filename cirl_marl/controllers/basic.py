@@ -1,0 +1,79 @@
+"""Controllers that need no learning: neutral, constant and random."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.errors import ControlError, unknown
+from cirl_marl.vector_env import VectorEnv
+
+Arrays = Mapping[str, NDArray[np.floating]]
+
+
+class Controller(Protocol):
+    """Maps the observations of all agents to their actions.
+
+    ``start`` is called once before an evaluation; ``act`` takes agent → observations (B, k) and returns agent → actions
+    (B, 1) in [−1, 1].
+    """
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        """Get ready to act in ``env``; random controllers draw from ``seed`` only."""
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the actions of all agents."""
+
+
+class Constant:
+    """Holds fixed normalised actions; agents that are not named stay neutral."""
+
+    def __init__(self, actions: Mapping[str, float] | None = None) -> None:
+        """Hold ``actions``, agent → value in [−1, 1]."""
+        self._wanted = dict(actions or {})
+        self._actions: dict[str, NDArray[np.floating]] = {}
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        """Take the actions of ``env``'s agents.
+
+        Raises:
+            ControlError: if a named agent does not act or its value is out of bounds.
+        """
+        for agent, value in self._wanted.items():
+            if agent not in env.agents:
+                raise ControlError(f"constant control: {unknown('agent', agent, env.agents)}")
+            if not -1.0 <= value <= 1.0:
+                raise ControlError(f"constant control of '{agent}' is {value}; it must lie in [-1, 1]")
+        self._actions = {
+            agent: np.full((env.num_envs, 1), self._wanted.get(agent, float(neutral[0])))
+            for agent, neutral in env.neutral_action.items()
+        }
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the fixed actions."""
+        return self._actions
+
+
+class Neutral(Constant):
+    """Leaves every agent at its neutral control."""
+
+    def __init__(self) -> None:
+        """Hold nothing."""
+        super().__init__()
+
+
+class Random:
+    """Draws every action uniformly and independently."""
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        """Seed the draws."""
+        self._agents = env.agents
+        self._random = np.random.default_rng(seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return fresh random actions."""
+        batch = len(next(iter(observations.values())))
+        return {agent: self._random.uniform(-1.0, 1.0, (batch, 1)) for agent in self._agents}

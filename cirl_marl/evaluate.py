@@ -1,0 +1,150 @@
+"""Rollouts of controllers and the figures that compare them: λ̄, circularity gain, service level, local returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from cirl_marl.controllers.basic import Controller
+from cirl_marl.network import Floats
+from cirl_marl.vector_env import VectorEnv
+
+EVALUATION_SEEDS = 2**31
+"""First seed of evaluations; training draws its seeds below it, so no evaluated episode was trained on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rollout:
+    """One episode of each of B copies under one controller.
+
+    Attributes:
+        circularity: λ at the end of each interval, shape (B, steps), mass.
+        circularity_mean: mean of λ over each interval, shape (B, steps), mass.
+        service: service level, shape (B, steps).
+        local_returns: sum of the local rewards of each agent, shape (agents, B).
+        returns: sum of the rewards of each agent, shape (agents, B).
+        stock: stocks after each interval in the first copy, shape (steps, nodes), mass.
+        flow: mean flows of each interval in the first copy, shape (steps, arcs), mass/time.
+        final_stock: mean over copies of the last stocks, shape (nodes,), mass.
+        mean_flow: mean over copies and time of the flows, shape (arcs,), mass/time.
+    """
+
+    circularity: Floats
+    circularity_mean: Floats
+    service: Floats
+    local_returns: Floats
+    returns: Floats
+    stock: Floats
+    flow: Floats
+    final_stock: Floats
+    mean_flow: Floats
+
+    @property
+    def episode_circularity(self) -> Floats:
+        """λ̄ of each episode, shape (B,), mass."""
+        return self.circularity_mean.mean(axis=1)
+
+    @property
+    def episode_service(self) -> Floats:
+        """Mean service level of each episode, shape (B,)."""
+        return self.service.mean(axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A mean with the half-width of its 95 % confidence interval (Student's t over episodes or seeds)."""
+
+    mean: float
+    half_width: float
+
+    def __str__(self) -> str:
+        """Return ``mean ± half-width``."""
+        return f"{self.mean:.4g} ± {self.half_width:.2g}"
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the two numbers by name."""
+        return {"mean": self.mean, "half_width": self.half_width}
+
+
+def estimate(samples: Floats) -> Estimate:
+    """Return the mean of independent samples and the half-width of its 95 % confidence interval.
+
+    >>> str(estimate(np.array([1.0, 2.0, 3.0])))
+    '2 ± 2.5'
+    """
+    samples = np.asarray(samples, dtype=float)
+    if len(samples) < 2:
+        return Estimate(float(samples.mean()), float("nan"))
+    error = float(samples.std(ddof=1)) / np.sqrt(len(samples))
+    return Estimate(float(samples.mean()), float(stats.t.ppf(0.975, len(samples) - 1) * error))
+
+
+def rollout(
+    env: VectorEnv,
+    controller: Controller,
+    *,
+    seed: int = EVALUATION_SEEDS,
+    progress: Callable[[int], None] | None = None,
+) -> Rollout:
+    """Run one whole episode in every copy of ``env``.
+
+    Args:
+        env: copy i is reset with ``seed + i``.
+        controller: who acts.
+        seed: first seed; the same seed gives every controller the same start states.
+        progress: called with the number of intervals done.
+    """
+    observations = env.reset(seed=seed)
+    controller.start(env, seed)
+    steps = env.network.episode.horizon
+    shape = (env.num_envs, steps)
+    circularity, mean, service = np.empty(shape), np.empty(shape), np.empty(shape)
+    local = np.zeros((len(env.agents), env.num_envs))
+    returns = np.zeros_like(local)
+    stock = np.empty((steps, len(env.network.nodes)))
+    flow = np.empty((steps, len(env.network.arcs)))
+    total_flow = np.zeros(len(env.network.arcs))
+    for t in range(steps):
+        outcome = env.advance(env.stack(controller.act(observations)))
+        circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
+        service[:, t] = outcome.service_level
+        local += outcome.local
+        returns += outcome.reward
+        stock[t], flow[t] = env.physical.stock[:-1, 0], outcome.flow[:, 0]
+        total_flow += outcome.flow.mean(axis=1)
+        observations = env.by_agent(outcome.observation)
+        if progress is not None:
+            progress(t + 1)
+    final = env.physical.stock[:-1].mean(axis=1)
+    return Rollout(circularity, mean, service, local, returns, stock, flow, final, total_flow / steps)
+
+
+def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
+    """Return the circularity gain (λ̄ − λ̄_neutral)/|λ̄_neutral| of each episode, shape (B,)."""
+    reference = neutral.episode_circularity
+    return (rollout_.episode_circularity - reference) / np.abs(reference)
+
+
+def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
+    """Return the figures of each controller beside those of ``neutral``, ready for JSON.
+
+    Each figure is a mean over episodes with the half-width of its 95 % confidence interval; gains are paired, episode by
+    episode, with the neutral controller's from the same start.
+    """
+    neutral = rollouts["neutral"]
+    figures = {}
+    for name, run in rollouts.items():
+        figures[name] = {
+            "circularity": estimate(run.episode_circularity).as_dict(),
+            "circularity_gain": estimate(gain(run, neutral)).as_dict(),
+            "service_level": estimate(run.episode_service).as_dict(),
+            "service_level_over_neutral": estimate(run.episode_service - neutral.episode_service).as_dict(),
+            "local_return": {
+                agent: estimate(run.local_returns[i]).as_dict() for i, agent in enumerate(env.agents)
+            },
+        }
+    return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}

@@ -1,0 +1,103 @@
+"""The algorithms of Stable-Baselines3 and sb3-contrib by name, unmodified."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import get_linear_fn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from cirl_marl.errors import RecipeError, unknown
+
+MODULES = ("stable_baselines3", "sb3_contrib")
+RESERVED = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "device", "_init_setup_model")
+NOISES: Mapping[str, type[ActionNoise]] = {
+    "normal": NormalActionNoise,
+    "ornstein_uhlenbeck": OrnsteinUhlenbeckActionNoise,
+}
+
+
+def algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """Return every algorithm for continuous actions that the installed packages export, by class name."""
+    found: dict[str, type[BaseAlgorithm]] = {}
+    for name in MODULES:
+        module = importlib.import_module(name)
+        for attribute in module.__all__:
+            value = getattr(module, attribute)
+            if isinstance(value, type) and issubclass(value, BaseAlgorithm):
+                found[attribute] = value
+    return {name: found[name] for name in sorted(found) if name not in ("DQN", "QRDQN", "MaskablePPO")}
+
+
+def algorithm_class(name: str) -> type[BaseAlgorithm]:
+    """Return the algorithm called ``name``.
+
+    Raises:
+        RecipeError: if there is none; names the nearest.
+
+    >>> algorithm_class("PPO").__name__
+    'PPO'
+    """
+    known = algorithms()
+    if name not in known:
+        raise RecipeError(f"algorithm: {unknown('algorithm', name, known)}")
+    return known[name]
+
+
+def parameters_of(name: str) -> list[str]:
+    """Return the constructor parameters that a recipe may set."""
+    signature = inspect.signature(algorithm_class(name).__init__)
+    return [parameter for parameter in signature.parameters if parameter not in RESERVED]
+
+
+def checked_parameters(name: str, parameters: Mapping[str, Any]) -> None:
+    """Refuse parameters that the algorithm does not have.
+
+    Raises:
+        RecipeError: naming the parameter and the nearest that exists.
+    """
+    known = parameters_of(name)
+    for parameter in parameters:
+        if parameter not in known:
+            raise RecipeError(f"parameters: {unknown(f'parameter of {name}', parameter, known)}")
+    noise = parameters.get("action_noise")
+    if noise is not None:
+        if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"}:
+            raise RecipeError(f"parameters.action_noise: needs kind and sigma, got {noise!r}")
+        if noise["kind"] not in NOISES:
+            raise RecipeError(f"parameters.action_noise: {unknown('kind', noise['kind'], NOISES)}")
+
+
+def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **fixed: Any) -> BaseAlgorithm:
+    """Construct the algorithm on ``env``.
+
+    Args:
+        name: class name in Stable-Baselines3 or sb3-contrib.
+        policy: such as ``MlpPolicy``.
+        env: what it learns in.
+        parameters: keyword arguments of its constructor; ``learning_rate = {linear_from, linear_to}`` and
+            ``action_noise = {kind, sigma}`` are turned into the objects that the library expects.
+        **fixed: seed, device, tensorboard_log and so on.
+
+    Raises:
+        RecipeError: for unknown parameters or values that the algorithm refuses.
+    """
+    checked_parameters(name, parameters)
+    arguments = dict(parameters)
+    rate = arguments.get("learning_rate")
+    if isinstance(rate, Mapping):
+        arguments["learning_rate"] = get_linear_fn(rate["linear_from"], rate["linear_to"], 1.0)
+    noise = arguments.get("action_noise")
+    if noise is not None:
+        mean = np.zeros(env.action_space.shape or (1,))
+        arguments["action_noise"] = NOISES[noise["kind"]](mean, noise["sigma"] * np.ones_like(mean))  # type: ignore[call-arg]
+    try:
+        return algorithm_class(name)(policy, env, **arguments, **fixed)
+    except (TypeError, ValueError, AssertionError) as error:
+        raise RecipeError(f"{name} refuses its parameters {dict(parameters)}: {error}") from error

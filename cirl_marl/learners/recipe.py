@@ -1,0 +1,131 @@
+"""Learner recipes: which algorithm each agent learns with, read from ``agents/*.toml``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from cirl_marl.catalogue import recipe_path
+from cirl_marl.definition import mistakes_of, read_toml
+from cirl_marl.elements import Node, Role
+from cirl_marl.errors import DefinitionError, RecipeError, unknown
+from cirl_marl.learners.algorithms import algorithm_class, checked_parameters
+from cirl_marl.network import Network
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Normalisation(_Table):
+    """Running normalisation by Stable-Baselines3's ``VecNormalize``, one per agent, saved with its policy."""
+
+    observation: bool = True
+    reward: bool = True
+    clip_observation: Annotated[float, Field(gt=0)] = 10.0
+    clip_reward: Annotated[float, Field(gt=0)] = 10.0
+
+
+class Learner(_Table):
+    """One algorithm with its parameters."""
+
+    algorithm: str
+    policy: str = "MlpPolicy"
+    parameters: dict[str, Any] = {}
+    normalise: Normalisation = Normalisation()
+    share_of_steps: Annotated[float, Field(gt=0, le=1)] = Field(
+        1.0, description="share of the run during which the agent learns; after it, it only acts"
+    )
+
+
+class Match(Learner):
+    """A learner for some agents only; of several matches the first applies."""
+
+    kind: Literal["node", "arc"] | None = None
+    role: Role | None = None
+    agents: list[str] | None = None
+
+    def fits(self, agent: str, network: Network) -> bool:
+        """Return whether the match names ``agent``."""
+        compartment = network.compartments[agent]
+        is_node = isinstance(compartment, Node)
+        return (
+            (self.agents is None or agent in self.agents)
+            and (self.kind is None or (self.kind == "node") == is_node)
+            and (self.role is None or (isinstance(compartment, Node) and compartment.role == self.role))
+        )
+
+
+class Run(_Table):
+    """How long and in how many copies; the command line overrides it."""
+
+    steps: Annotated[int, Field(gt=0)] = Field(200_000, description="environment steps, summed over the copies")
+    envs: Annotated[int, Field(gt=0)] = Field(16, description="copies of the environment")
+
+
+class Recipe(_Table):
+    """A learner for each agent of a network.
+
+    Attributes:
+        name: name in the catalogue.
+        title: one line for tables.
+        run: defaults of a training run.
+        environment: options of ``vector_env``, such as ``reward`` and ``observe``.
+        learner: the learner of agents that no match names.
+        match: learners of some agents.
+    """
+
+    name: str
+    title: str
+    run: Run = Run()
+    environment: dict[str, Any] = {}
+    learner: Learner
+    match: list[Match] = []
+
+    def learner_of(self, agent: str, network: Network) -> Learner:
+        """Return the learner of ``agent``: that of the first match that fits, else the common one."""
+        return next((match for match in self.match if match.fits(agent, network)), self.learner)
+
+    def check(self, network: Network, agents: Sequence[str]) -> None:
+        """Refuse matches that name agents which do not act.
+
+        Raises:
+            RecipeError: naming the agent and the nearest that acts.
+        """
+        for match in self.match:
+            for agent in match.agents or ():
+                if agent not in agents:
+                    raise RecipeError(f"recipe '{self.name}': match.agents: {unknown('agent', agent, agents)}")
+
+
+OPTIONS = ("reward", "observe", "circularity", "horizon", "scenario")
+
+
+def load_recipe(name: str | Path) -> Recipe:
+    """Read a recipe of the catalogue, or of a file if ``name`` ends in ``.toml``.
+
+    Raises:
+        DefinitionError: if the file has mistakes; all are named.
+    """
+    path = recipe_path(name)
+    document = read_toml(path)
+    try:
+        recipe = Recipe.model_validate(document)
+    except ValidationError as error:
+        raise DefinitionError(str(path), mistakes_of(error, Recipe)) from None
+    mistakes = []
+    for key in recipe.environment:
+        if key not in OPTIONS:
+            mistakes.append(f"environment: {unknown('option', key, OPTIONS)}")
+    for where, learner in (("learner", recipe.learner), *((f"match.{i}", m) for i, m in enumerate(recipe.match))):
+        try:
+            algorithm_class(learner.algorithm)
+            checked_parameters(learner.algorithm, learner.parameters)
+        except RecipeError as error:
+            mistakes.append(f"{where}.{error}")
+    if mistakes:
+        raise DefinitionError(str(path), mistakes)
+    return recipe

@@ -1,0 +1,234 @@
+"""A training run on disk: what was asked for, how far it got, what was learnt. Nothing in it is ever half written.
+
+::
+
+    RUN/
+      config.json          network, recipe, seed, steps, copies, options, as resolved
+      network.toml         the definition that was trained on
+      versions.json        of Python and of every package that matters
+      status.json          state, joint steps, the checkpoint that counts; rewritten last, atomically
+      checkpoints/NNN/     AGENT.zip (policy and optimiser), AGENT.normaliser.pkl, AGENT.replay.pkl
+      metrics.csv          one row an episode: λ̄, service level, return of each agent
+      tensorboard/AGENT/   learning curves of each agent
+      evaluation.json      written by an evaluation
+      pictures/
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from cirl_marl.catalogue import load_network
+from cirl_marl.errors import RunError
+from cirl_marl.learners.recipe import Recipe
+from cirl_marl.vector_env import VectorEnv
+
+PACKAGES = (
+    "cirl-marl", "gymnasium", "greenlet", "networkx", "numpy", "pettingzoo", "sb3-contrib", "scipy",
+    "stable-baselines3", "torch",
+)  # fmt: skip
+STATES = ("running", "complete", "interrupted", "failed")
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill a temporary file, then put it in the place of ``path`` in one step."""
+    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
+    write(temporary)
+    with temporary.open("rb") as file:
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write JSON atomically."""
+    write_atomically(path, lambda temporary: temporary.write_text(json.dumps(value, indent=2) + "\n"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunConfig:
+    """What a run was asked to do, fully resolved.
+
+    Attributes:
+        network: name of the network.
+        scenario: its scenario.
+        agents: who acts.
+        recipe: the recipe, validated.
+        seed: from which every random stream derives.
+        steps: environment steps, summed over the copies.
+        envs: number of copies.
+        options: other options of ``VectorEnv``.
+    """
+
+    network: str
+    scenario: str
+    agents: tuple[str, ...]
+    recipe: Recipe
+    seed: int
+    steps: int
+    envs: int
+    options: dict[str, Any]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        plain = {name: getattr(self, name) for name in RunConfig.__slots__}
+        return {**plain, "agents": list(self.agents), "recipe": self.recipe.model_dump(mode="json")}
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> RunConfig:
+        """Read what ``as_dict`` returned."""
+        return cls(
+            **{**plain, "agents": tuple(plain["agents"]), "recipe": Recipe.model_validate(plain["recipe"])}
+        )
+
+
+class RunDirectory:
+    """Reads and writes one run.
+
+    Attributes:
+        path: the directory.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Refer to a run; nothing is read or written yet."""
+        self.path = Path(path)
+
+    @classmethod
+    def create(cls, path: str | Path, config: RunConfig, definition: Path) -> RunDirectory:
+        """Start a run in a new or empty directory.
+
+        Raises:
+            RunError: if the directory already holds something.
+        """
+        run = cls(path)
+        if run.path.exists() and (not run.path.is_dir() or any(run.path.iterdir())):
+            raise RunError(f"{run.path}: already exists and is not empty; choose another directory, or resume it")
+        run.path.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(definition, run.path / "network.toml")
+        write_json(run.path / "versions.json", versions())
+        write_json(run.path / "config.json", config.as_dict())
+        run.set_status("running", 0, None)
+        return run
+
+    @property
+    def config(self) -> RunConfig:
+        """The resolved configuration.
+
+        Raises:
+            RunError: if the directory holds no complete run description.
+        """
+        return RunConfig.from_dict(self._json("config.json"))
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """State, joint steps and checkpoint."""
+        return self._json("status.json")
+
+    def set_status(self, state: str, joint_steps: int, checkpoint: str | None, reason: str = "") -> None:
+        """Say how far the run got; written atomically."""
+        status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "reason": reason}
+        write_json(self.path / "status.json", status)
+
+    @property
+    def checkpoint(self) -> Path:
+        """The newest complete checkpoint.
+
+        Raises:
+            RunError: if nothing was saved yet, or files of it are missing.
+        """
+        name = self.status["checkpoint"]
+        if name is None:
+            raise RunError(f"{self.path}: nothing was saved in this run yet (state: {self.status['state']})")
+        folder = self.path / "checkpoints" / name
+        missing = [agent for agent in self.config.agents if not (folder / f"{agent}.zip").is_file()]
+        if missing:
+            raise RunError(f"{folder}: the checkpoint lacks the policies of {', '.join(missing)}")
+        return folder
+
+    def make_env(self, num_envs: int) -> VectorEnv:
+        """Return the environment that the run trained in, with ``num_envs`` copies."""
+        config = self.config
+        definition = self.path / "network.toml"
+        if not definition.is_file():
+            raise RunError(f"{definition}: missing; the run directory is incomplete")
+        return VectorEnv(
+            load_network(definition),
+            num_envs=num_envs,
+            scenario=config.scenario,
+            agents=config.agents,
+            **config.options,
+        )
+
+    def save_checkpoint(self, joint_steps: int, write: Callable[[Path], None], state: str, reason: str = "") -> None:
+        """Let ``write`` fill a new checkpoint folder, then make it the one that counts and drop the older ones."""
+        folder = self.path / "checkpoints" / f"{joint_steps:09d}"
+        previous = self.status["checkpoint"]
+        if previous != folder.name:
+            partial = folder.with_name(folder.name + ".partial")
+            shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
+            partial.mkdir(parents=True)
+            write(partial)
+            partial.replace(folder)
+        self.set_status(state, joint_steps, folder.name, reason)
+        for other in folder.parent.iterdir():
+            if other != folder:
+                shutil.rmtree(other)
+
+    def metrics(self) -> dict[str, list[float]]:
+        """Return the columns of ``metrics.csv``."""
+        path = self.path / "metrics.csv"
+        if not path.is_file():
+            raise RunError(f"{path}: missing; no episode ended in this run")
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        names = list(rows[0]) if rows else []
+        return {name: [float(row[name]) for row in rows] for name in names}
+
+    def _json(self, name: str) -> dict[str, Any]:
+        path = self.path / name
+        if not self.path.is_dir():
+            raise RunError(f"{self.path}: no such run directory")
+        if not path.is_file():
+            raise RunError(f"{path}: missing; {self.path} is not a run directory, or it was not written to the end")
+        try:
+            value: dict[str, Any] = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise RunError(f"{path}: cannot be read: {error}") from error
+        return value
+
+
+class MetricsFile:
+    """Appends one row per joint episode to ``metrics.csv``."""
+
+    def __init__(self, path: Path, agents: Sequence[str]) -> None:
+        """Open the file; the header is written once."""
+        fresh = not path.is_file()
+        self._file = path.open("a", newline="")
+        self._writer = csv.writer(self._file)
+        if fresh:
+            returns = [f"return:{agent}" for agent in agents]
+            self._writer.writerow(["joint_step", "env_steps", "seconds", "circularity", "service_level", *returns])
+
+    def append(self, row: Sequence[float]) -> None:
+        """Write a row and flush it."""
+        self._writer.writerow([f"{value:.10g}" for value in row])
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, the platform and every package that bears on a result."""
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    return found | {package: metadata.version(package) for package in PACKAGES}

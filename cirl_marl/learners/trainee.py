@@ -1,0 +1,164 @@
+"""One agent's learner: algorithm, normaliser, random streams; how it learns, goes on acting, is saved and loaded."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sb3_contrib import ARS
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from cirl_marl.errors import RunError
+from cirl_marl.learners.algorithms import algorithm_class, build
+from cirl_marl.learners.recipe import Learner
+from cirl_marl.learners.run import write_atomically
+from cirl_marl.learners.seat import Seat
+from cirl_marl.learners.streams import Streams, global_streams_kept
+
+
+def derived_seed(seed: int, *names: str | int) -> int:
+    """Return a seed below 2³¹ that depends on ``seed`` and ``names`` only, not on who else learns.
+
+    >>> derived_seed(0, "mine") == derived_seed(0, "mine") != derived_seed(0, "use")
+    True
+    """
+    keys = [name if isinstance(name, int) else zlib.crc32(name.encode()) for name in names]
+    return int(np.random.SeedSequence([seed, *keys]).generate_state(1)[0] >> 1)
+
+
+class Trainee:
+    """The learner of one agent, seated in the joint environment.
+
+    Attributes:
+        agent: whose learner it is.
+        spec: its part of the recipe.
+        seat: its view of the environment.
+        env: the seat, behind ``VecNormalize`` if the recipe normalises.
+        streams: its random streams.
+        model: the algorithm, as Stable-Baselines3 made it.
+    """
+
+    model: BaseAlgorithm
+    env: VecEnv
+
+    def __init__(self, seat: Seat, spec: Learner, seed: int) -> None:
+        """Give the agent its streams; ``build`` or ``load`` makes the algorithm."""
+        self.agent = seat.agent
+        self.spec = spec
+        self.seat = seat
+        self._seed = derived_seed(seed, seat.agent)
+        noisy = spec.parameters.get("action_noise") is not None
+        self.streams = Streams(self._seed, keep_gaussian=noisy)
+
+    def build(self, log: Path | None) -> Trainee:
+        """Make a fresh algorithm; ``log`` is the folder of its TensorBoard events."""
+        spec = self.spec
+        self.env = self._normalised(spec)
+        parameters = dict(spec.parameters)
+        if issubclass(algorithm_class(spec.algorithm), ARS):
+            parameters.setdefault("n_eval_episodes", self.seat.num_envs)
+        with self.streams.active():
+            self.model = build(spec.algorithm, spec.policy, self.env, parameters, seed=self._seed, device="cpu")
+        self._log_to(log)
+        return self
+
+    def load(self, folder: Path, log: Path | None) -> Trainee:
+        """Go on with the algorithm saved in ``folder``."""
+        with self.streams.active():
+            self.env = load_normaliser(folder, self.agent, self.seat) or self.seat
+            self.model = load_model(folder, self.agent, self.spec.algorithm, env=self.env)
+            replay = folder / f"{self.agent}.replay.pkl"
+            if isinstance(self.model, OffPolicyAlgorithm) and replay.is_file():
+                self.model.load_replay_buffer(replay)
+        self._log_to(log)
+        return self
+
+    def budget(self, steps: int) -> int:
+        """Joint steps after which it is stopped if it has not stopped itself; only ARS, which counts otherwise, needs it."""
+        if isinstance(self.model, ARS):
+            return math.ceil(steps * self.spec.share_of_steps / self.seat.num_envs)
+        return 2**62
+
+    def learn(self, steps: int, callback: BaseCallback | None) -> None:
+        """Run the algorithm's own ``learn()`` up to its share of ``steps``, counting what it had learnt before."""
+        done = self.model.num_timesteps
+        total = 10**15 if isinstance(self.model, ARS) else math.ceil(steps * self.spec.share_of_steps) - done
+        if total > 0:
+            self.model.learn(total, callback=callback, reset_num_timesteps=done == 0)
+
+    def act(self) -> None:
+        """Act for ever by the learnt policy, learning nothing."""
+        state: tuple[NDArray[Any], ...] | None = None
+        done = np.ones(self.seat.num_envs, dtype=bool)
+        while True:
+            observation = self.seat.reset()
+            if isinstance(self.env, VecNormalize):
+                observation = self.env.normalize_obs(observation)  # type: ignore[arg-type]
+            action, state = self.model.predict(observation, state, done, deterministic=True)  # type: ignore[arg-type]
+            _, _, done, _ = self.seat.step(action)
+
+    def save(self, folder: Path, *, replay: bool) -> None:
+        """Save policy, optimiser and normaliser, and the replay buffer if learning may go on."""
+        self.model.save(folder / f"{self.agent}.zip")
+        if isinstance(self.env, VecNormalize):
+            self.env.save(str(folder / f"{self.agent}.normaliser.pkl"))
+        if replay and isinstance(self.model, OffPolicyAlgorithm) and self.model.replay_buffer is not None:
+            write_atomically(folder / f"{self.agent}.replay.pkl", self.model.save_replay_buffer)
+
+    def close(self) -> None:
+        """Close the log files."""
+        self.model.logger.close()
+
+    def _normalised(self, spec: Learner) -> VecEnv:
+        normalise = spec.normalise
+        if not (normalise.observation or normalise.reward):
+            return self.seat
+        return VecNormalize(
+            self.seat,
+            norm_obs=normalise.observation,
+            norm_reward=normalise.reward,
+            clip_obs=normalise.clip_observation,
+            clip_reward=normalise.clip_reward,
+            gamma=spec.parameters.get("gamma", 0.99),
+        )
+
+    def _log_to(self, log: Path | None) -> None:
+        if log is not None:
+            self.model.set_logger(configure(str(log / self.agent), ["tensorboard"]))
+        else:
+            self.model.set_logger(configure(None, []))
+
+
+def load_model(folder: Path, agent: str, algorithm: str, env: VecEnv | None = None) -> BaseAlgorithm:
+    """Load the policy that ``agent`` learnt; the global random streams are left as they were.
+
+    Raises:
+        RunError: if the file cannot be read.
+    """
+    path = folder / f"{agent}.zip"
+    with global_streams_kept():
+        try:
+            return algorithm_class(algorithm).load(path, env=env, device="cpu")
+        except (OSError, ValueError, KeyError, RuntimeError, EOFError) as error:
+            raise RunError(f"{path}: cannot be read: {error}") from error
+
+
+def load_normaliser(folder: Path, agent: str, seat: Seat | None = None) -> VecNormalize | None:
+    """Load the normaliser saved with a policy; None if the recipe did not normalise."""
+    path = folder / f"{agent}.normaliser.pkl"
+    if not path.is_file():
+        return None
+    if seat is not None:
+        return VecNormalize.load(str(path), seat)
+    with path.open("rb") as file:
+        normaliser: VecNormalize = pickle.load(file)
+    return normaliser

@@ -1,0 +1,315 @@
+"""Training: seat the agents, let their learners run in lockstep, keep what they learn."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+
+from cirl_marl.catalogue import load_network
+from cirl_marl.definition import write_network
+from cirl_marl.errors import CirlError, LearnerError, RunError, unknown
+from cirl_marl.learners.lockstep import Interrupted, Lockstep
+from cirl_marl.learners.recipe import OPTIONS, Recipe, load_recipe
+from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
+from cirl_marl.learners.trainee import Trainee, derived_seed
+from cirl_marl.network import Network
+from cirl_marl.vector_env import Infos, VectorEnv
+
+CHECKPOINTS = 10
+"""Checkpoints of a run, evenly spaced; a crash loses at most what came after the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What a running training reports.
+
+    Attributes:
+        env_steps: environment steps done, summed over the copies, in this call.
+        total: environment steps that this call will do.
+        seconds: since training began.
+        circularity: mean over the copies of λ at the end of the last step, or λ̄ of the last episode; mass.
+        service_level: likewise.
+        episode: whether the two figures are those of a finished episode.
+    """
+
+    env_steps: int
+    total: int
+    seconds: float
+    circularity: float
+    service_level: float
+    episode: bool
+
+
+class Training:
+    """A run in progress.
+
+    Attributes:
+        config: what it was asked to do.
+        env: the joint environment.
+        trainees: the learner of each agent.
+        run: where it is kept; None if it is not.
+    """
+
+    def __init__(self, config: RunConfig, env: VectorEnv, run: RunDirectory | None, *, resume: bool = False) -> None:
+        """Seat the agents and make, or load, their algorithms."""
+        self.config = config
+        self.env = env
+        self.run = run
+        self.done = int(run.status["joint_steps"]) if run is not None and resume else 0
+        keys: tuple[str | int, ...] = ("copies", self.done) if self.done else ("copies",)
+        seeds = [derived_seed(config.seed, *keys, i) for i in range(config.envs)]
+        self.lockstep = Lockstep(env, seeds)
+        log = run.path / "tensorboard" if run is not None else None
+        checkpoint = run.checkpoint if run is not None and self.done else None
+        self.trainees: dict[str, Trainee] = {}
+        for agent, seat in self.lockstep.seats.items():
+            trainee = Trainee(seat, config.recipe.learner_of(agent, env.network), config.seed + self.done)
+            self.trainees[agent] = trainee.load(checkpoint, log) if checkpoint else trainee.build(log)
+        self._metrics = MetricsFile(run.path / "metrics.csv", env.agents) if run is not None else None
+        self._interrupted = False
+
+    def start(
+        self,
+        *,
+        callbacks: Mapping[str, BaseCallback] | None = None,
+        report: Callable[[Progress], None] | None = None,
+    ) -> None:
+        """Train to the end of the budget.
+
+        Ctrl-C, and an error in a learner, save what was learnt before they are raised.
+
+        Args:
+            callbacks: Stable-Baselines3 callbacks by agent.
+            report: called after every joint step.
+
+        Raises:
+            LearnerError: if a learner fails; the others' policies are saved.
+            KeyboardInterrupt: after Ctrl-C.
+        """
+        callbacks = callbacks or {}
+        for agent in callbacks:
+            if agent not in self.trainees:
+                raise CirlError(f"callbacks: {unknown('agent', agent, self.trainees)}")
+        steps = self.config.steps
+        try:
+            with _one_torch_thread(), self._interruptible():
+                self.lockstep.run(
+                    learners={a: _learner(t, steps, callbacks.get(a)) for a, t in self.trainees.items()},
+                    actors={a: t.act for a, t in self.trainees.items()},
+                    streams={a: t.streams for a, t in self.trainees.items()},
+                    budgets={a: t.budget(steps) - self.done for a, t in self.trainees.items()},
+                    hook=_Hook(self, report),
+                )
+        except Interrupted:
+            self._save("interrupted", "stopped by the user")
+            raise KeyboardInterrupt from None
+        except LearnerError as error:
+            self._save("failed", str(error))
+            raise
+        else:
+            self._save("complete")
+        finally:
+            if self._metrics is not None:
+                self._metrics.close()
+            for trainee in self.trainees.values():
+                trainee.close()
+
+    @property
+    def joint_steps(self) -> int:
+        """Joint steps done, those before a resumption included."""
+        return self.done + self.lockstep.joint_steps
+
+    def after_step(self, seconds: float, infos: Infos, ended: NDArray[np.bool_]) -> None:
+        """Record finished episodes, save checkpoints, heed Ctrl-C."""
+        if ended.any() and self._metrics is not None:
+            first = infos[self.env.agents[0]]
+            returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
+            self._metrics.append(
+                [
+                    self.joint_steps,
+                    self.joint_steps * self.env.num_envs,
+                    seconds,
+                    float(first["episode_circularity"][ended].mean()),
+                    float(first["episode_service_level"][ended].mean()),
+                    *returns,
+                ]
+            )
+        every = max(1, self.config.steps // self.env.num_envs // CHECKPOINTS)
+        if self.joint_steps % every == 0:
+            self._save("running")
+        if self._interrupted:
+            raise Interrupted
+
+    def _save(self, state: str, reason: str = "") -> None:
+        if self.run is None:
+            return
+
+        def write(folder: Path) -> None:
+            for trainee in self.trainees.values():
+                trainee.save(folder, replay=state != "complete")
+
+        self.run.save_checkpoint(self.joint_steps, write, state, reason)
+
+    @contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        """Turn the first Ctrl-C into a clean stop at the next joint step; the second acts as usual."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = signal.getsignal(signal.SIGINT)
+
+        def note(_signal: int, _frame: FrameType | None) -> None:
+            self._interrupted = True
+            signal.signal(signal.SIGINT, before)
+
+        signal.signal(signal.SIGINT, note)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+
+class _Hook:
+    """Runs after each joint step."""
+
+    def __init__(self, training: Training, report: Callable[[Progress], None] | None) -> None:
+        self._training = training
+        self._report = report
+        self._began = time.perf_counter()
+
+    def __call__(self, infos: Infos, ended: NDArray[np.bool_]) -> None:
+        training = self._training
+        seconds = time.perf_counter() - self._began
+        if self._report is not None:
+            copies = training.env.num_envs
+            first = infos[training.env.agents[0]]
+            episode = bool(ended.any())
+            circularity = first["episode_circularity"][ended] if episode else first["circularity"]
+            service = first["episode_service_level"][ended] if episode else first["service_level"]
+            self._report(
+                Progress(
+                    training.lockstep.joint_steps * copies,
+                    training.config.steps - training.done * copies,
+                    seconds,
+                    float(circularity.mean()),
+                    float(service.mean()),
+                    episode,
+                )
+            )
+        training.after_step(seconds, infos, ended)
+
+
+def train(
+    network: str | Path | Network,
+    recipe: str | Path | Recipe = "independent_ppo",
+    *,
+    directory: str | Path | None = None,
+    steps: int | None = None,
+    envs: int | None = None,
+    seed: int = 0,
+    agents: Sequence[str] | None = None,
+    callbacks: Mapping[str, BaseCallback] | None = None,
+    report: Callable[[Progress], None] | None = None,
+    **options: Any,
+) -> Training:
+    """Train one learner per agent, all at once, in the same coupled environment.
+
+    The same arguments give bit-identical policies.
+
+    Args:
+        network: catalogue name, definition file, or network.
+        recipe: catalogue name, recipe file, or recipe.
+        directory: where the run is kept; None keeps it in memory only.
+        steps: environment steps, summed over the copies; None takes the recipe's.
+        envs: copies of the environment; None takes the recipe's.
+        seed: from which every random stream derives.
+        agents: who acts and learns; None takes the network's choice.
+        callbacks: Stable-Baselines3 callbacks by agent.
+        report: called after every joint step.
+        **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``horizon``; they override the recipe's.
+
+    Returns:
+        The finished training; ``trainees[agent].model`` is the Stable-Baselines3 model.
+
+    Raises:
+        CirlError: for input that cannot be used, before anything is written.
+        LearnerError: if a learner fails; what was learnt is saved first.
+    """
+    found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
+    for option in options:
+        if option not in OPTIONS:
+            raise CirlError(unknown("option", option, OPTIONS))
+    settings = found.environment | {name: value for name, value in options.items() if value is not None}
+    copies = envs or found.run.envs
+    env = VectorEnv(network, num_envs=copies, agents=agents, **settings)
+    found.check(env.network, env.agents)
+    settings.pop("scenario", None)
+    config = RunConfig(
+        network=env.network.name,
+        scenario=env.network.scenario_name,
+        agents=env.agents,
+        recipe=found,
+        seed=seed,
+        steps=steps or found.run.steps,
+        envs=copies,
+        options=settings,
+    )
+    run = None if directory is None else _create(Path(directory), config, env.network)
+    training = Training(config, env, run)
+    training.start(callbacks=callbacks, report=report)
+    return training
+
+
+def resume(directory: str | Path, *, report: Callable[[Progress], None] | None = None) -> Training:
+    """Go on with an interrupted run from its last checkpoint, with fresh episodes and fresh random streams.
+
+    Raises:
+        RunError: if the run is complete, or its directory is not.
+    """
+    run = RunDirectory(directory)
+    config, status = run.config, run.status
+    if status["state"] == "complete":
+        raise RunError(f"{run.path}: the run is complete ({status['joint_steps']} joint steps); nothing is left to do")
+    training = Training(config, run.make_env(config.envs), run, resume=status["checkpoint"] is not None)
+    training.start(report=report)
+    return training
+
+
+def _create(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
+    source = network.source
+    if source is not None and load_network(source, scenario=network.scenario_name).nodes == network.nodes:
+        return RunDirectory.create(directory, config, source)
+    written = directory.with_name(f".{directory.name}.network.toml")
+    written.parent.mkdir(parents=True, exist_ok=True)
+    write_network(network, written)
+    try:
+        return RunDirectory.create(directory, config, written)
+    finally:
+        written.unlink()
+
+
+def _learner(trainee: Trainee, steps: int, callback: BaseCallback | None) -> Callable[[], None]:
+    return lambda: trainee.learn(steps, callback)
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Small networks learn fastest on one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

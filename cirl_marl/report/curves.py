@@ -1,0 +1,227 @@
+"""Curves: circularity and service over time, learning curves, and trajectories."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.special import stdtrit
+
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats, Network
+from cirl_marl.report.style import DASHES, MUTED, SERIES, dressed, save, spoken
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+WIDTH = 9.0
+"""Width of a figure, inch; shown 900 pixels wide, 9 points are about 12 pixels."""
+AGENT_PANELS = 20
+SHOWN = 10
+"""Largest number of compartments in one panel of a trajectory."""
+
+
+def save_circularity(
+    path: str | Path,
+    network: Network,
+    time: Floats,
+    runs: Mapping[str, Floats],
+    services: Mapping[str, Floats],
+) -> Path:
+    """Save λ(t) and, below it, the service level of several controls as a PNG.
+
+    Lines are means over episodes; bands are the 95 % confidence intervals of the means (Student's t), where
+    there are at least two episodes.
+
+    Args:
+        path: file to write; its folder is made.
+        network: gives the units.
+        time: shape (steps,), time.
+        runs: λ by control, shape (episodes, steps) each, mass.
+        services: service level by control, shape (episodes, steps) each.
+
+    Returns:
+        The path.
+
+    Raises:
+        CirlError: if an array has the wrong shape.
+    """
+    figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
+    names = list(dict.fromkeys([*runs, *services]))
+    for axes, curves in ((above, runs), (below, services)):
+        for name, values in curves.items():
+            _draw_mean(axes, time, _matching(name, values, time), name, names.index(name))
+    dressed(above, title="Circularity", ylabel=f"λ / {network.mass_unit}")
+    dressed(below, title="Service level", ylabel="service level")
+    below.set_ylim(-0.03, 1.06)
+    _set_time(below, time, network)
+    if names:
+        source = above if runs else below
+        figure.legend(
+            *source.get_legend_handles_labels(), loc="outside upper right", ncols=4, frameon=False, fontsize=9
+        )
+    return save(figure, path)
+
+
+def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, Floats]) -> Path:
+    """Save the episode returns of each agent while it learned as a PNG, one panel per agent.
+
+    Raw returns are light, their centred moving average over a fifteenth of the episodes is bold. Of more
+    than 20 agents the first 20 are shown.
+
+    Args:
+        path: file to write; its folder is made.
+        steps: environment steps at the end of each episode, shape (episodes,).
+        returns: episode returns by agent, shape (episodes,) each.
+
+    Returns:
+        The path.
+
+    Raises:
+        CirlError: if an array has the wrong shape.
+    """
+    shown = list(returns.items())[:AGENT_PANELS]
+    columns = max(1, min(len(shown), 3 if len(shown) <= 9 else 4))
+    rows = max(1, math.ceil(len(shown) / columns))
+    figure = Figure(figsize=(WIDTH, 0.7 + max(1.7 * rows, 2.6)), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    for axes, (agent, values) in zip(panels, shown, strict=False):
+        _draw_returns(axes, steps, _matching(agent, values, steps))
+        dressed(axes, title=spoken(agent), size=8.0)
+        axes.locator_params(nbins=4)
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
+    figure.supxlabel("environment steps", fontsize=9, color=MUTED)
+    figure.supylabel("episode return", fontsize=9, color=MUTED)
+    if len(returns) > len(shown):
+        figure.suptitle(f"The first {len(shown)} of {len(returns)} agents", fontsize=9, color=MUTED)
+    return save(figure, path)
+
+
+def save_trajectory(
+    path: str | Path, network: Network, time: Floats, stock: Floats, flow: Floats, circularity: Floats
+) -> Path:
+    """Save stocks, flows and λ over time as a PNG.
+
+    Of more than 10 compartments in a panel, those that change most are shown.
+
+    Args:
+        path: file to write; its folder is made.
+        network: the network.
+        time: shape (steps,), time.
+        stock: stocks, shape (nodes, steps), mass.
+        flow: flows, shape (arcs, steps), mass/time.
+        circularity: λ, shape (steps,), mass.
+
+    Returns:
+        The path.
+
+    Raises:
+        CirlError: if an array has the wrong shape.
+    """
+    steps, mass = (len(time),), network.mass_unit
+    stock = _shaped("stock", stock, (len(network.nodes), *steps))
+    flow = _shaped("flow", flow, (len(network.arcs), *steps))
+    circularity = _shaped("circularity", circularity, steps)
+    figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
+    above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.25, 0.8))
+    _draw_largest(above, time, stock, [node.id for node in network.nodes], "Stocks", mass)
+    _draw_largest(
+        middle, time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}"
+    )
+    below.plot(time, circularity, color=SERIES[0], linewidth=1.8, marker=_dots(time))
+    dressed(below, title="Circularity", ylabel=f"λ / {mass}")
+    _set_time(below, time, network)
+    return save(figure, path)
+
+
+def _shaped(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
+    found = np.asarray(values, dtype=float)
+    if found.shape != shape:
+        raise CirlError(f"{name} has shape {found.shape}, expected {shape}")
+    return found
+
+
+def _matching(name: str, values: Floats, time: Floats) -> Floats:
+    """Check that the last axis of ``values`` is that of ``time``."""
+    found = np.asarray(values, dtype=float)
+    if found.ndim not in (1, 2) or found.shape[-1] != len(time):
+        raise CirlError(f"'{name}' has shape {found.shape}, expected {len(time)} along the last axis")
+    return found
+
+
+def _dots(time: Floats) -> str:
+    """A single point makes no line: mark it."""
+    return "o" if len(time) == 1 else ""
+
+
+def _set_time(axes: Axes, time: Floats, network: Network) -> None:
+    axes.set_xlabel(f"time / {network.time_unit}", fontsize=9)
+    if len(time) > 1:
+        axes.set_xlim(float(np.min(time)), float(np.max(time)))
+
+
+def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int) -> None:
+    episodes = np.atleast_2d(values)
+    count = len(episodes)
+    if count == 0:
+        return
+    colour, dash = SERIES[index % len(SERIES)], DASHES[index % len(DASHES)]
+    mean = episodes.mean(axis=0)
+    axes.plot(time, mean, color=colour, linestyle=dash, linewidth=1.8, label=spoken(name), marker=_dots(time))
+    if count > 1:
+        error = episodes.std(axis=0, ddof=1) / math.sqrt(count) * float(stdtrit(count - 1, 0.975))
+        axes.fill_between(time, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
+
+
+def _draw_returns(axes: Axes, steps: Floats, values: Floats) -> None:
+    if values.size == 0:
+        axes.text(
+            0.5,
+            0.5,
+            "no episodes",
+            transform=axes.transAxes,
+            ha="center",
+            va="center",
+            color=MUTED,
+            fontsize=8,
+        )
+        return
+    marker = "o" if values.size < 5 else ""
+    axes.plot(steps, values, color=SERIES[5], linewidth=0.7, alpha=0.7, marker=marker, markersize=4)
+    if values.size >= 5:
+        axes.plot(steps, _smoothed(values, max(3, values.size // 15)), color=SERIES[0], linewidth=2.0)
+
+
+def _smoothed(values: Floats, window: int) -> Floats:
+    """Centred moving average over about ``window`` values, fewer at the ends."""
+    half = window // 2
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(len(values))
+    low, high = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
+    mean: Floats = (total[high] - total[low]) / (high - low)
+    return mean
+
+
+def _draw_largest(
+    axes: Axes, time: Floats, values: Floats, names: Sequence[str], title: str, unit: str
+) -> None:
+    """Draw the rows that change most, with a legend beside the panel."""
+    change = np.ptp(values, axis=1) if values.size else np.zeros(len(values))
+    kept = np.sort(np.argsort(-change, kind="stable")[:SHOWN])
+    # A reserve that dwarfs the rest would flatten it: show such rows by their change from the start.
+    largest = np.abs(values).max(axis=1, initial=0.0)
+    for place, row in enumerate(kept.tolist()):
+        shifted = largest[row] > 20 * max(float(np.median(largest)), float(change[row]), 1e-12)
+        line = values[row] - values[row, :1] if shifted else values[row]
+        label = f"{spoken(names[row])} (change)" if shifted else spoken(names[row])
+        axes.plot(time, line, color=SERIES[place % len(SERIES)], linestyle=DASHES[place // len(SERIES)],
+                  linewidth=1.5, label=label, marker=_dots(time))  # fmt: skip
+    more = f": {SHOWN} of {len(names)}, the largest changes" if len(names) > SHOWN else ""
+    dressed(axes, title=title + more, ylabel=unit)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)

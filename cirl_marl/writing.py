@@ -1,0 +1,107 @@
+"""From a ``Network`` built in Python to the text of a definition file."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+
+from cirl_marl.elements import Arc, Control, ControlKind, Law, Node
+from cirl_marl.network import Network
+
+SOURCE = "network built in Python"
+
+
+def definition_of(network: Network) -> str:
+    """Return a TOML definition that reads back as ``network``, its numbers equal to the last bit."""
+    return "\n".join(_lines(network)) + "\n"
+
+
+def _lines(network: Network) -> Iterator[str]:
+    mass, time = network.mass_unit, network.time_unit
+    episode, objective = network.episode, network.objective
+    yield f"name = {_text(network.name)}"
+    yield f"title = {_text(network.title or network.name)}"
+    yield 'material = "not stated"'
+    yield f"agents = {_list(network.acting)}"
+    yield f"[units]\nmass = {_text(mass)}\ntime = {_text(time)}"
+    yield f"[scales]\nstock = {_quantity(1.0, mass)}\nflow = {_quantity(1.0, _flow(network))}"
+    yield f"[episode]\nsolver = {_text(episode.solver)}"
+    yield f"control_interval = {_quantity(episode.control_interval, time)}"
+    yield f"horizon = {_quantity(episode.horizon, '1')}"
+    if episode.solver_step is not None:
+        yield f"solver_step = {_quantity(episode.solver_step, time)}"
+    yield f"[objective]\nnet_zero = {_text(objective.net_zero)}\nreward = {_text(objective.reward)}"
+    yield f"reference_interval = {_quantity(objective.reference_interval, time)}"
+    yield f"circularity_scale = {_quantity(objective.circularity_scale, mass)}"
+    yield f"circularity_weight = {_quantity(objective.circularity_weight, '1')}"
+    yield f"tracked = {_list(objective.tracked)}"
+    yield f"[observation]\nmode = {_text(network.observation.mode)}\nnodes = {_list(network.observation.nodes)}"
+    for node in network.nodes:
+        yield from _node(network, node)
+    for arc in network.arcs:
+        yield from _arc(network, arc)
+    for service in network.services:
+        unit = mass if service.quantity == "stock" else _flow(network)
+        yield f"[services.{service.id}]\nprovider = {_text(service.provider)}\nquantity = {_text(service.quantity)}"
+        yield f"owed_by = {_list(service.owed_by)}"
+        yield f"low = {_quantity(service.low, unit)}\nweight = {_quantity(service.weight, '1')}"
+        if math.isfinite(service.high):
+            yield f"high = {_quantity(service.high, unit)}"
+
+
+def _node(network: Network, node: Node) -> Iterator[str]:
+    low, high = node.initial
+    unit = _text(network.mass_unit)
+    yield f"[nodes.{node.id}]\nrole = {_text(node.role.value)}"
+    yield f"initial = {{ low = {low!r}, high = {high!r}, unit = {unit}, source = {_text(SOURCE)} }}"
+    yield from _common(network, node, network.mass_unit)
+
+
+def _arc(network: Network, arc: Arc) -> Iterator[str]:
+    flow = _flow(network)
+    yield f"[arcs.{arc.id}]\nfrom = {_text(arc.donor)}\nto = {_text(arc.recipient)}\nlaw = {_text(arc.law.value)}"
+    yield f"pollutant = {json.dumps(arc.pollutant)}"
+    if arc.law in (Law.DONOR, Law.RECIPIENT):
+        yield f"rate = {_quantity(arc.rate, f'1/({network.time_unit})')}"
+    elif arc.law is Law.EXOGENOUS and not arc.times:
+        yield f"flow = {_quantity(arc.flow[0], flow)}"
+    elif arc.law is Law.EXOGENOUS:
+        times, values = list(map(float, arc.times)), list(map(float, arc.flow))
+        yield (
+            f"series = {{ times = {times!r}, time_unit = {_text(network.time_unit)}, values = {values!r}, "
+            f"unit = {_text(flow)}, source = {_text(SOURCE)} }}"
+        )
+    yield from _common(network, arc, flow)
+
+
+def _common(network: Network, compartment: Node | Arc, unit: str) -> Iterator[str]:
+    yield f"scale = {_quantity(compartment.scale, unit)}"
+    if compartment.set_point is not None:
+        yield f"set_point = {_quantity(compartment.set_point, unit)}"
+    if compartment.control is not None:
+        yield f"control = {_control(network, compartment.control)}"
+
+
+def _control(network: Network, control: Control) -> str:
+    unit = _flow(network) if control.kind is ControlKind.FLOW else "1"
+    return (
+        f"{{ kind = {_text(control.kind.value)}, low = {float(control.low)!r}, neutral = {float(control.neutral)!r}, "
+        f"high = {float(control.high)!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
+    )
+
+
+def _flow(network: Network) -> str:
+    return f"({network.mass_unit})/({network.time_unit})"
+
+
+def _quantity(value: float, unit: str) -> str:
+    return f"{{ value = {value!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
+
+
+def _list(names: tuple[str, ...]) -> str:
+    return json.dumps(list(names))
+
+
+def _text(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,137 @@
+"""Random networks for property tests: ``st.from_type(Network)`` draws them."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    Node,
+    Objective,
+    Role,
+    Service,
+)
+
+settings.register_profile(
+    "cirl_marl",
+    deadline=None,
+    database=None,
+    max_examples=25,
+    derandomize="CI" in os.environ,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.register_profile("thorough", settings.get_profile("cirl_marl"), max_examples=1000, derandomize=False)
+settings.load_profile("cirl_marl")
+
+ROLES = list(Role)
+LAWS = list(Law)
+
+
+def random_network(seed: int, nodes: int, arcs: int) -> Network:
+    """Return a network with every law, role and kind of control, drawn from ``seed``."""
+    rng = np.random.default_rng(seed)
+    ends = [rng.choice(nodes, 2, replace=False) for _ in range(arcs if nodes > 1 else 0)]
+    laws = [LAWS[rng.integers(4)] for _ in ends]
+    orders = np.bincount(
+        [i for (i, _), law in zip(ends, laws, strict=True) if law is Law.CONTROLLED], minlength=nodes
+    )
+    sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) for i in range(nodes)]
+    return Network(
+        name="random",
+        nodes=tuple(_node(rng, i, sets_flow[i]) for i in range(nodes)),
+        arcs=tuple(
+            _arc(rng, k, int(i), int(j), law, sets_flow[int(i)])
+            for k, ((i, j), law) in enumerate(zip(ends, laws, strict=True))
+        ),
+        services=tuple(_services(rng, nodes, len(ends))),
+        episode=Episode(control_interval=float(rng.uniform(0.05, 3)), horizon=int(rng.integers(1, 5))),
+        objective=Objective(
+            reference_interval=float(rng.uniform(0.1, 3)),
+            net_zero=str(rng.choice(["signed", "abs"])),
+            circularity_scale=float(rng.uniform(1, 100)),
+            circularity_weight=float(rng.random()),
+        ),
+    )
+
+
+def _control(rng: np.random.Generator, kind: ControlKind) -> Control:
+    most = 1.5 if kind is ControlKind.RATE else 10 ** rng.uniform(-1, 3)
+    low, neutral, high = np.sort(rng.random(3)) * most
+    return Control(kind=kind, low=float(low * rng.integers(2)), neutral=float(neutral), high=float(high))
+
+
+def _node(rng: np.random.Generator, i: int, sets_flow: bool) -> Node:
+    low = float(rng.integers(2) * rng.uniform(0, 300))
+    acts = sets_flow or i == 0 or rng.random() < 0.3
+    return Node(
+        id=f"node_{i}",
+        role=ROLES[rng.integers(len(ROLES))],
+        initial=(low, low + float(rng.integers(2) * rng.uniform(0, 300))),
+        set_point=float(rng.uniform(0, 300)) if rng.random() < 0.5 else None,
+        scale=float(rng.uniform(1, 300)),
+        control=_control(rng, ControlKind.FLOW if sets_flow else ControlKind.RATE) if acts else None,
+    )
+
+
+def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_flow: bool) -> Arc:
+    control = None
+    if law is Law.CONTROLLED and not donor_sets_flow:
+        control = _control(rng, ControlKind.FLOW)
+    elif law is not Law.CONTROLLED and rng.random() < 0.4:
+        control = _control(rng, ControlKind.RATE)
+    flow, times = [0.0], []
+    if law is Law.EXOGENOUS:
+        steps = int(rng.integers(1, 5))
+        flow = (rng.integers(0, 2, steps) * rng.uniform(0, 200, steps)).tolist()
+        times = (
+            [0.0, *np.cumsum(rng.uniform(0.01, 2, steps - 1)).tolist()]
+            if rng.integers(2) or steps > 1
+            else []
+        )
+    return Arc(
+        id=f"arc_{k}",
+        donor=f"node_{i}",
+        recipient=f"node_{j}",
+        law=law,
+        rate=float(10 ** rng.uniform(-2, 0.7)),
+        flow=tuple(flow),
+        times=tuple(times),
+        set_point=float(rng.uniform(0, 100)) if rng.random() < 0.3 else None,
+        scale=float(rng.uniform(1, 100)),
+        pollutant=bool(rng.integers(2)),
+        control=control,
+    )
+
+
+def _services(rng: np.random.Generator, nodes: int, arcs: int) -> list[Service]:
+    services = []
+    for s in range(rng.integers(0, 3)):
+        quantity = str(rng.choice(["stock", "outflow", "flow"] if arcs else ["stock", "outflow"]))
+        provider = f"arc_{rng.integers(arcs)}" if quantity == "flow" else f"node_{rng.integers(nodes)}"
+        low = float(rng.uniform(0.1, 200))
+        high = low * float(rng.uniform(1, 3)) if rng.integers(2) else np.inf
+        services.append(
+            Service(
+                id=f"service_{s}",
+                provider=provider,
+                quantity=quantity,
+                low=low,
+                high=high,
+                weight=float(rng.random()),
+            )
+        )
+    return services
+
+
+st.register_type_strategy(
+    Network, st.builds(random_network, st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(0, 20))
+)

@@ -1,0 +1,295 @@
+"""The catalogue, its schema, and what a mistake in a definition file says."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cirl_marl import CirlError, DefinitionError, Network, VectorEnv, load_network, networks, parallel_env
+from cirl_marl.catalogue import folder
+from cirl_marl.elements import ControlKind
+from cirl_marl.schema import json_schema
+from cirl_marl.units import factor
+
+FILES = sorted(folder("envs").glob("*.toml"))
+COPPER = (folder("envs") / "copper_net.toml").read_text(encoding="utf-8")
+SIZES = {"copper_net": (17, 15), "carbo_net": (15, 8)}
+"""Compartments, and how many agents there are at least."""
+
+
+def scenarios(name: str) -> list[str]:
+    """Return every scenario of a network."""
+    return ["default", *load_network(name).scenarios]
+
+
+@pytest.mark.parametrize("name", networks())
+def test_every_network_reads_in_every_scenario(name: str) -> None:
+    """DESIGN 3: a network is one file, named like it."""
+    for scenario in scenarios(name):
+        network = load_network(name, scenario=scenario)
+        assert network.name == name
+        assert network.scenario_name == scenario
+        assert set(network.graph) == set(network.node_index)
+        assert sum(len(arcs) for _, _, arcs in network.graph.edges(data="arcs")) == len(network.arcs)
+    assert load_network(name).services, "a network states its service: zero throughput maximises λ"
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_sizes(name: str) -> None:
+    """Compartments of the paper; every one that could act, acts."""
+    network = load_network(name)
+    compartments, agents = SIZES[name]
+    assert len(network.compartments) == compartments
+    assert agents <= len(network.agents) < compartments
+    spaces = [parallel_env(network).observation_space(agent).shape for agent in network.agents]
+    assert len(set(spaces)) > 1, "observations are heterogeneous"
+
+
+def test_schema_is_up_to_date() -> None:
+    """The published schema is the one that the code implies; json_schema() writes it anew."""
+    published = (folder("envs") / "network.schema.json").read_text(encoding="utf-8")
+    assert published == json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_files_pass_the_schema(path: Path) -> None:
+    """Editors accept what the library accepts."""
+    schema = json_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(tomllib.loads(path.read_text(encoding="utf-8")), schema)
+
+
+def test_schema_refuses_what_the_library_refuses() -> None:
+    """A misspelt key, also inside a scenario, is underlined."""
+    for old, new in (("rate = { value = 0.82", "rat = { value = 0.82"), ("tracked = [", "trakced = [")):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(tomllib.loads(COPPER.replace(old, new)), json_schema())
+
+
+def initial_circularity(name: str, scenario: str) -> tuple[dict[str, float], float]:
+    """Return the stocks and λ at the start under neutral control."""
+    env = VectorEnv(name, scenario=scenario, num_envs=1)
+    env.reset(0)
+    stock = env.physical.stock[:-1]
+    return dict(zip(env.network.node_index, stock[:, 0].tolist(), strict=True)), float(
+        env.network.circularity(env.physical.flow)[0]
+    )
+
+
+def test_circularity_of_copper_net() -> None:
+    """λ = −(a17·x1 + a84·x4)."""
+    x, circularity = initial_circularity("copper_net", "paper")
+    assert circularity == pytest.approx(-(0.72 * x["refinery"] + 0.25 * x["use"]), rel=1e-14)
+
+
+@pytest.mark.parametrize("capture", [0.0, 0.25, 1.0])
+def test_circularity_of_carbo_net(capture: float) -> None:
+    """λ = −(a22·x2 + a33·x3 + emissions − u); more capture than emission gives λ > 0 or, as "abs", does not."""
+    network = load_network("carbo_net", scenario="paper")
+    flows: NDArray[np.float64] = np.zeros(len(network.arcs))
+    vehicles, heaters, u = 210.0, 500.0, 4000 * capture
+    for id_, flow in (
+        ("vehicles_to_urban", 0.5 * vehicles),
+        ("vehicles_to_adjacent", 0.5 * vehicles),
+        ("heaters_to_urban", 0.5 * heaters),
+        ("heaters_to_adjacent", 0.5 * heaters),
+        ("reserve_to_vehicles", 0.3 * vehicles),
+        ("reserve_to_heaters", 0.6 * heaters),
+        ("urban_to_capture", u),
+        ("urban_to_adjacent", 183.08),
+        ("adjacent_to_urban", 183.08),
+    ):
+        flows[network.arc_index[id_]] = flow
+    mined, net = 0.3 * vehicles + 0.6 * heaters, vehicles + heaters - u
+    assert network.circularity(flows) == pytest.approx(-(mined + net), rel=1e-14)
+    absolute = network.with_options(objective={"net_zero": "abs"})
+    assert absolute.circularity(flows) == pytest.approx(-(mined + abs(net)), rel=1e-14)
+
+
+def broken(tmp_path: Path, *changes: tuple[str, str]) -> str:
+    """Return what reading copper_net with these changes says."""
+    text = COPPER
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = tmp_path / "broken.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(DefinitionError) as caught:
+        load_network(path)
+    message = str(caught.value)
+    assert all(line.startswith(str(path)) for line in message.splitlines())
+    return message
+
+
+RATE = 'rate = { value = 0.82, unit = "1/day"'
+REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            RATE,
+            RATE.replace("rate", "rte"),
+            ["arcs.refinery_to_fabrication.rte", "'rte'", "Did you mean 'rate'"],
+        ),
+        (
+            RATE,
+            RATE.replace("value", "vale"),
+            ["arcs.refinery_to_fabrication.rate.vale", "Did you mean 'value'"],
+        ),
+        (
+            'law = "donor"',
+            'law = "donnor"',
+            ["arcs.mine_to_refinery.law", "'donnor'", "Did you mean 'donor'"],
+        ),
+        ('from = "mine"', 'from = "mime"', ["arc 'mine_to_refinery'", "'mime'", "Did you mean 'mine'"]),
+        (RATE, RATE.replace("0.82", "-0.82"), ["arc 'refinery_to_fabrication'", "-0.82", "negative"]),
+        (RATE, RATE.replace("0.82", "nan"), ["arcs.refinery_to_fabrication.rate.value", "nan"]),
+        (RATE, RATE.replace("1/day", "kg"), ["arcs.refinery_to_fabrication.rate", "'kg'", "inconsistent"]),
+        (RATE, RATE.replace("1/day", "1/dya"), ["arcs.refinery_to_fabrication.rate", "dya"]),
+        (REFINERY, REFINERY.replace("kt", "knot"), ["nodes.refinery.initial", "'knot'", "inconsistent"]),
+        (REFINERY, REFINERY.replace("60.0", "-6.0"), ["node 'refinery'", "-6.0", "negative"]),
+        (REFINERY, REFINERY.replace("60.0", "95.0"), ["node 'refinery'", "95.0", "90.0", "empty"]),
+        ('to = "refinery"', 'to = "mine"', ["arc 'mine_to_refinery'", "zero delay", "'mine'"]),
+        ("[arcs.mine_to_refinery]", "[arcs.mine]", ["'mine'", "twice"]),
+        ("[nodes.fabrication]", "[nodes.refinery]", ["not valid TOML", "line"]),
+        ("[units]", "[units", ["not valid TOML", "line 29"]),
+        (
+            'role = "landfill"',
+            'role = "landfil"',
+            ["nodes.landfill.role", "'landfil'", "Did you mean 'landfill'"],
+        ),
+        (
+            'provider = "use"',
+            'provider = "usage"',
+            ["service 'copper_in_use'", "'usage'", "Did you mean 'use'"],
+        ),
+        ("horizon = { value = 160", "horizon = { value = 16.5", ["horizon", "16.5", "whole number"]),
+        ("horizon = { value = 160", "horizon = { value = 0", ["horizon", "0"]),
+        ('mass = "kt"', 'mass = "day"', ["units.mass", "'day'"]),
+        ("neutral = 40, high = 120", "neutral = 140, high = 120", ["'use_to_collection'", "140", "120"]),
+        ("low = 0, neutral = 40", "low = -5, neutral = 40", ["'use_to_collection'", "-5", "reverse"]),
+        ('kind = "flow", low = 0', 'kind = "rate", low = 0', ["'use_to_collection'", "control"]),
+        ('mode = "local"', 'mode = "locl"', ["observation.mode", "'locl'", "Did you mean 'local'"]),
+        (
+            ', source = "CiRL (arXiv 2505.21536), CopperNet" }\nset_point = { value = 44.5',
+            " }\nset_point = { value = 44.5",
+            ["arcs.refinery_to_fabrication.rate.source", "missing"],
+        ),
+        (
+            "solver_step = { value = 5e-5",
+            "solver_step = { value = 3e-5",
+            ["scenarios.paper", "3e-05", "whole number"],
+        ),
+        (
+            'law = "recipient"',
+            'law = "receiver"',
+            ["scenarios.paper.", "arcs.mine_to_refinery.law", "'receiver'"],
+        ),
+        (
+            "[scenarios.paper.nodes.use]",
+            "[scenarios.paper.nodes.user]",
+            ["scenarios.paper.nodes", "'user'", "'use'"],
+        ),
+        (
+            'agents = ["use_to_collection"]',
+            'agents = ["use_to_colection"]',
+            ["agents", "Did you mean 'use_to_collection'"],
+        ),
+    ],
+)
+def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, said: list[str]) -> None:
+    """DESIGN 5.7: file, object, value, nearest valid name."""
+    message = broken(tmp_path, (old, new))
+    for fragment in said:
+        assert fragment in message
+
+
+def test_all_mistakes_are_named_at_once(tmp_path: Path) -> None:
+    """A file is mended in one go."""
+    shape = broken(tmp_path, (RATE, RATE.replace("rate", "rte")), ('role = "landfill"', 'role = "landfil"'))
+    assert "'rte'" in shape
+    assert "'landfil'" in shape
+    sense = broken(tmp_path, ('from = "mine"', 'from = "mime"'), (RATE, RATE.replace("0.82", "-0.82")))
+    assert "'mime'" in sense
+    assert "-0.82" in sense
+    units = broken(tmp_path, (RATE, RATE.replace("1/day", "kg")), (REFINERY, REFINERY.replace("kt", "s")))
+    assert "'kg'" in units
+    assert "'s'" in units
+
+
+def test_scenario_mistakes_are_all_named(tmp_path: Path) -> None:
+    """Mistakes in a scenario name the scenario."""
+    message = broken(
+        tmp_path,
+        ("[scenarios.paper.nodes.use]", "[scenarios.paper.nodes.user]"),
+        ("[scenarios.paper.nodes.sorting]", "[scenarios.paper.nodes.sortng]"),
+    )
+    assert "'user'" in message
+    assert "Did you mean 'sorting'" in message
+
+
+def test_kt_is_the_kilotonne() -> None:
+    """Pint alone reads kt as the knot."""
+    assert factor("kt", "kg") == pytest.approx(1e6)
+    with pytest.raises(CirlError, match="inconsistent"):
+        factor("kt", "m/s")
+
+
+def test_units_are_converted(tmp_path: Path) -> None:
+    """A rate per year is a rate per day, 365.25 times smaller."""
+    path = tmp_path / "yearly.toml"
+    yearly = COPPER.replace(RATE, RATE.replace("0.82", str(0.82 * 365.25)).replace("1/day", "1/year"))
+    path.write_text(yearly, encoding="utf-8")
+    arc = load_network(path).arcs[load_network(path).arc_index["refinery_to_fabrication"]]
+    assert arc.rate == pytest.approx(0.82, rel=1e-14)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    """A missing file is named."""
+    with pytest.raises(DefinitionError, match=r"nowhere\.toml.*no such file"):
+        load_network(tmp_path / "nowhere.toml")
+
+
+def test_unknown_names_give_the_nearest() -> None:
+    """Networks and scenarios; agents and options are in test_environments."""
+    with pytest.raises(CirlError, match="unknown network 'coper_net'. Did you mean 'copper_net'"):
+        load_network("coper_net")
+    with pytest.raises(CirlError, match="unknown scenario 'papers'. Did you mean 'paper'"):
+        load_network("copper_net", scenario="papers")
+
+
+def test_an_edit_is_noticed(tmp_path: Path) -> None:
+    """A definition changed on disk is read again."""
+    path = tmp_path / "mine.toml"
+    path.write_text(COPPER, encoding="utf-8")
+    assert load_network(path).episode.horizon == 160
+    path.write_text(COPPER.replace("horizon = { value = 160", "horizon = { value = 7"), encoding="utf-8")
+    os.utime(path, ns=(1, 1))
+    assert load_network(path).episode.horizon == 7
+    assert load_network(path) is load_network(path)
+
+
+@pytest.mark.parametrize("name", networks())
+def test_physical_scenario_is_physical(name: str) -> None:
+    """Flows that are set are bounded below by 0, and reservoirs are finite stocks."""
+    network = load_network(name)
+    assert network.episode.solver == "exact"
+    for compartment in network.compartments.values():
+        control = compartment.control
+        assert control is None or control.kind is not ControlKind.FLOW or control.low >= 0
+
+
+def test_network_can_be_built_in_python() -> None:
+    """A network without a definition file obeys the same checks."""
+    source = load_network("copper_net")
+    with pytest.raises(CirlError, match="used twice"):
+        Network(name="twice", nodes=(*source.nodes, source.nodes[0]), arcs=())
