@@ -11,6 +11,7 @@ so mass is conserved by construction. Circularity is derived from the roles of t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -23,12 +24,12 @@ from numpy.typing import NDArray
 
 from cirl_marl.elements import SINKS, Arc, Episode, Node, Objective, Observation, Role, Service
 from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.rowsum import Floats, RowSum
 from cirl_marl.validate import problems
 
 if TYPE_CHECKING:
     import networkx
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
 
@@ -190,30 +191,20 @@ class Network:
 
         References: Zocco et al., CiRL (arXiv 2505.21536), Definition 2.
         """
-        delta = self.objective.reference_interval
+        parts = self._circularity_parts(flow.reshape(len(self.arcs), math.prod(flow.shape[1:])))
+        if self.objective.net_zero == "abs":
+            circularity = parts[0] - np.abs(parts[1])
+        else:
+            circularity = parts[0] + parts[1]
+        return circularity.reshape(flow.shape[1:])
+
+    @cached_property
+    def _circularity_parts(self) -> RowSum:
+        """Rows −Δ·σ_rest and −Δ·σ_env."""
         counted = np.flatnonzero(self.sustainability)
-        if self.objective.net_zero == "signed":
-            return -delta * _signed_sum(self.sustainability, counted, flow)
-        through = self.environmental[counted]
-        rest = _signed_sum(self.sustainability, counted[~through], flow)
-        return -delta * (rest + np.abs(_signed_sum(self.sustainability, counted[through], flow)))
+        rows = self.environmental[counted].astype(np.intp)
+        weights = -self.objective.reference_interval * self.sustainability[counted]
+        return RowSum(rows, counted, weights, (2, len(self.arcs)))
 
     def _role(self, node: str) -> Role:
         return self.nodes[self.node_index[node]].role
-
-
-def _signed_sum(sign: Floats, arcs: Integers, flow: Floats) -> Floats:
-    """Σ sign_k f_k over ``arcs``."""
-    return ordered_sum(sign[arcs].reshape(-1, *[1] * (flow.ndim - 1)) * flow[arcs])
-
-
-def ordered_sum(terms: Floats) -> Floats:
-    """Σ over axis 0, first to last, so that a column's bits do not depend on the batch it is in.
-
-    numpy adds the rows of a batch in order, but eight or more numbers of a single column pairwise.
-    """
-    if len(terms) and terms.size == len(terms):
-        last: Floats = np.add.accumulate(terms, axis=0)[-1]
-        return last
-    total: Floats = np.add.reduce(terms, axis=0)
-    return total

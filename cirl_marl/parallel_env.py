@@ -19,7 +19,7 @@ from cirl_marl.vector_env import Outcome, Snapshot, VectorEnv
 RENDER_MODES = ("rgb_array", "human")
 
 
-class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
+class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
     """One copy of a material network whose compartments are PettingZoo agents.
 
     Each agent has its own Box(−1, 1) action and its own float32 observation; ``layout.names[agent]`` says what each
@@ -65,11 +65,11 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         self.render_mode = render_mode
         self._canvas: Any = None
 
-    def observation_space(self, agent: str) -> Box:
+    def observation_space(self, agent: str) -> Box[np.float32]:
         """Return the observation space of ``agent``, always the same object."""
         return self._batch.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Box:
+    def action_space(self, agent: str) -> Box[np.float32]:
         """Return the action space of ``agent``, always the same object."""
         return self._batch.action_spaces[agent]
 
@@ -121,7 +121,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
     def state(self) -> Floats:
         """Return the whole physical state: every stock in mass units, then the elapsed share of the episode."""
-        return self._batch.state()[0]
+        state: Floats = self._batch.state()[0]
+        return state
 
     def local_rewards(self) -> dict[str, float]:
         """Return the local reward that the current state gives each compartment, whether it acts or not."""
@@ -211,6 +212,6 @@ def vector_env(network: str | Path | Network, num_envs: int = 64, **options: Any
 
     >>> env = vector_env("copper_net", num_envs=3)
     >>> env.reset(seed=0)["mine"].shape
-    (3, 3)
+    (3, 4)
     """
     return VectorEnv(network, num_envs=num_envs, **options)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import sparse
 
-from cirl_marl.network import Floats, Integers, Network, ordered_sum
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.rowsum import RowSum
 
 
 class Scoring:
@@ -35,21 +35,25 @@ class Scoring:
         self._measure = _measurement(network, position)
         self._low = np.array([s.low for s in services]).reshape(-1, 1)
         self._high = np.array([s.high for s in services]).reshape(-1, 1)
+        self._bounded = bool(np.isfinite(self._high).any())
         terms = len(chosen) + len(services)
         debts = [(position[d], len(chosen) + i, s.weight) for i, s in enumerate(services) for d in s.debtors]
         owners = np.array([*self._tracked, *(owner for owner, _, _ in debts)], dtype=np.intp)
         columns = np.array([*range(len(chosen)), *(term for _, term, _ in debts)], dtype=np.intp)
         weights = np.array([*[1.0] * len(chosen), *(weight for _, _, weight in debts)])
-        everyone = sparse.csr_array((-weights, (owners, columns)), shape=(len(compartments), terms))
-        self._everyone = everyone
-        self._agents = everyone[[position[agent] for agent in agents]]
+        self._everyone = RowSum(owners, columns, -weights, (len(compartments), terms))
+        self._agents = self._everyone.chosen([position[agent] for agent in agents])
+        self._all = RowSum([0] * terms, range(terms), self._everyone.column_sums(), (1, terms))
+        self._sum_of_levels = RowSum([0] * len(services), range(len(services)), [1.0] * len(services), (1, len(services)))
 
     def levels(self, quantities: Floats) -> Floats:
         """Return the level of each service in [0, 1], shape (services, B)."""
-        measured = self._measure @ quantities
-        above = np.divide(self._high, measured, out=np.ones_like(measured), where=measured > self._high)
-        level: Floats = np.minimum(np.maximum(measured / self._low, 0.0), above)
-        return np.minimum(level, 1.0, out=level)
+        measured = self._measure(quantities)
+        level: Floats = measured / self._low
+        if self._bounded:
+            np.divide(self._high, measured, out=level, where=measured > self._high)
+        np.minimum(level, 1.0, out=level)
+        return np.maximum(level, 0.0, out=level)
 
     def terms(self, quantities: Floats, levels: Floats) -> Floats:
         """Return squared scaled distances and service shortfalls, shape (terms, B)."""
@@ -61,25 +65,26 @@ class Scoring:
 
     def local(self, terms: Floats) -> Floats:
         """Return the local reward of each agent, shape (agents, B)."""
-        rewards: Floats = self._agents @ terms
-        return rewards
+        return self._agents(terms)
 
     def local_of_all(self, terms: Floats) -> Floats:
         """Return the local reward of each compartment, nodes first, shape (nodes + arcs, B)."""
-        rewards: Floats = self._everyone @ terms
-        return rewards
+        return self._everyone(terms)
+
+    def local_sum(self, terms: Floats) -> Floats:
+        """Return the sum of the local rewards of all compartments, shape (B,)."""
+        return self._all(terms)[0]
+
+    def service_level(self, levels: Floats) -> Floats:
+        """Return the mean level over the services, shape (B,); 1 for a network that owes none."""
+        if len(levels) == 0:
+            return np.ones(levels.shape[1])
+        total = self._sum_of_levels(levels)[0]
+        total /= len(levels)
+        return total
 
 
-def service_level(levels: Floats) -> Floats:
-    """Return the mean level over the services, shape (B,); 1 for a network that owes none."""
-    if len(levels) == 0:
-        return np.ones(levels.shape[1])
-    total = ordered_sum(levels)
-    total /= len(levels)
-    return total
-
-
-def _measurement(network: Network, position: dict[str, int]) -> sparse.csr_array:
+def _measurement(network: Network, position: dict[str, int]) -> RowSum:
     """Matrix that reads each service off the stocks and flows, shape (services, nodes + arcs)."""
     rows, columns = [], []
     for row, service in enumerate(network.services):
@@ -91,4 +96,4 @@ def _measurement(network: Network, position: dict[str, int]) -> sparse.csr_array
         rows += [row] * len(read)
         columns += read
     shape = (len(network.services), len(position))
-    return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
+    return RowSum(rows, columns, np.ones(len(rows)), shape)

@@ -184,6 +184,7 @@ def json_schema() -> dict[str, Any]:
     properties = {k: v for k, v in schema["properties"].items() if k not in ("scenarios", "name")}
     parts["Scenario"] = {"type": "object", "additionalProperties": False, "properties": part(properties)}
     definitions.update(parts)
-    schema["properties"]["scenarios"]["additionalProperties"] = {"$ref": "#/$defs/Scenario"}
+    scenarios = schema["properties"]["scenarios"]["patternProperties"]
+    scenarios.update({pattern: {"$ref": "#/$defs/Scenario"} for pattern in scenarios})
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return schema

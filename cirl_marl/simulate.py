@@ -14,10 +14,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
+from numpy.typing import NDArray
 
 from cirl_marl.elements import Arc, ControlKind, Law
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.rowsum import RowSum
 
 MAX_TURNOVER = 1.0
 """Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
@@ -51,7 +52,7 @@ class Dynamics:
 
     Attributes:
         network: what is simulated.
-        incidence: S with an empty unit row, sparse, shape (nodes + 1, arcs).
+        incidence: S with an empty unit row, shape (nodes + 1, arcs).
         control_low: lower bounds of the controls, in the order of ``network.controllable``.
         control_high: upper bounds.
         neutral: values while nobody acts.
@@ -65,10 +66,13 @@ class Dynamics:
         laws = np.array([arc.law for arc in network.arcs])
         scheduled = np.isin(laws, [Law.CONTROLLED, Law.EXOGENOUS])
         columns = np.arange(arcs)
-        self.incidence = sparse.csr_array(
-            (np.repeat([-1.0, 1.0], arcs), (np.concatenate([donors, recipients]), np.tile(columns, 2))),
-            shape=(nodes + 1, arcs),
+        self.incidence = RowSum(
+            np.concatenate([donors, recipients]),
+            np.tile(columns, 2),
+            np.repeat([-1.0, 1.0], arcs),
+            (nodes + 1, arcs),
         )
+        self._outgoing = RowSum(donors, columns, np.ones(arcs), (nodes + 1, arcs))
         self.driver: Integers = np.where(scheduled, nodes, np.where(laws == Law.RECIPIENT, recipients, donors))
         self._compile_controls()
         self._compile_solver(scheduled, laws)
@@ -100,7 +104,7 @@ class Dynamics:
             [_interval_means(network.arcs[k], network) for k in self._series_arcs],
         ).reshape(len(self._series_arcs), network.episode.horizon)
 
-    def _compile_solver(self, scheduled: np.ndarray, laws: np.ndarray) -> None:
+    def _compile_solver(self, scheduled: NDArray[np.bool_], laws: NDArray[np.str_]) -> None:
         network, episode = self.network, self.network.episode
         self.exact = episode.solver == "exact"
         highest = self.rate(self.control_high[:, None])[:, 0]
@@ -118,20 +122,19 @@ class Dynamics:
             self.substeps = round(episode.control_interval / episode.solver_step)
         self.substep = episode.control_interval / self.substeps
         self.terms = _series_terms(2 * fastest * self.substep) if self.exact else 1
-        self._horner = [self.incidence * (self.substep / k) for k in range(self.terms, 1, -1)]
+        self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
         self._order_arcs: Integers = np.flatnonzero(scheduled)
         self._order_donors, order_slot = np.unique(network.donors[self._order_arcs], return_inverse=True)
         self._order_slot: Integers = order_slot
         slot = {int(node): i for i, node in enumerate(self._order_donors)}
         own = np.flatnonzero([laws[k] == Law.DONOR and int(d) in slot for k, d in enumerate(network.donors)])
-        shape = (len(slot), len(network.arcs))
-        self._orders = sparse.csr_array(
-            (np.ones(len(self._order_arcs)), (order_slot, self._order_arcs)), shape=shape
+        exit_slot = [len(slot) + slot[int(network.donors[k])] for k in own]
+        self._orders_and_exits = RowSum(
+            np.concatenate([order_slot, np.array(exit_slot, dtype=np.intp)]),
+            np.concatenate([self._order_arcs, own]),
+            np.ones(len(self._order_arcs) + len(own)),
+            (2 * len(slot), len(network.arcs)),
         )
-        self._exits = sparse.csr_array(
-            (np.ones(len(own)), ([slot[int(network.donors[k])] for k in own], own)), shape=shape
-        )
-        self._outgoing = -self.incidence.minimum(0.0)
         self._pulls = bool((laws == Law.RECIPIENT).any())
 
     def rate(self, controls: Floats, step: Integers | None = None) -> Floats:
@@ -181,18 +184,25 @@ class Dynamics:
             else:
                 realised = rate
                 moved = self.flow(stock, rate) * self.substep
-                stock = stock + self.incidence @ moved
+                stock = self.incidence.add_to(stock.copy(), moved)
             total = moved if total is None else total + moved
         assert total is not None
         return Transition(stock, total, realised)
 
-    def _moved_exactly(self, stock: Floats, rate: Floats) -> Floats:
-        """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep."""
-        mean = stock
-        for scaled_incidence in self._horner:
-            mean = scaled_incidence @ self.flow(mean, rate)
-            mean += stock
-        moved = self.flow(mean, rate)
+    def _moved_exactly(self, stock: Floats, rate: Floats, settled: Floats | None = None) -> Floats:
+        """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep.
+
+        Flows given in ``settled``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
+        """
+        mean, moved = stock.copy(), np.empty_like(rate)
+        for incidence in (*self._horner, None):
+            mean.take(self.driver, axis=0, out=moved, mode="clip")
+            moved *= rate
+            if settled is not None:
+                np.copyto(moved, settled, where=~np.isnan(settled))
+            if incidence is not None:
+                mean[...] = stock
+                incidence.add_to(mean, moved)
         moved *= self.substep
         return moved
 
@@ -204,10 +214,9 @@ class Dynamics:
         """
         if not len(self._order_arcs):
             return rate
-        asked = self._orders @ rate
-        asked *= self.substep
-        turned_over = self._exits @ rate
-        turned_over *= self.substep
+        outflows = self._orders_and_exits(rate)
+        outflows *= self.substep
+        asked, turned_over = outflows[: len(self._order_donors)], outflows[len(self._order_donors) :]
         held = stock.take(self._order_donors, axis=0)
         if (asked <= held * (1.0 - turned_over) * (1.0 - 1e-12)).all():
             return rate  # x·a/(e^{ah} − 1) ≥ x(1 − ah)/h: nothing can be overdrawn
@@ -222,21 +231,26 @@ class Dynamics:
         """Move mass; where a recipient-driven flow asked for more than its donor held, send what was there.
 
         Proportional and scheduled flows never overdraw. A recipient that pulls more than there is gets its share: all
-        outflows of the overdrawn node, and their rates, are scaled to the stock it started with. Each pass settles at
-        least one node.
+        outflows of the overdrawn node, and their rates, are scaled to the stock it started with. They are then settled,
+        and the others follow from them, lest the recipient passes on what it did not get. Each pass settles at least
+        one more node.
         """
         if self._pulls:
             moved = np.maximum(moved, 0.0)  # the mean of an overdrawn stock may be negative
-        after = stock + self.incidence @ moved
-        while (after[:-1] < 0).any():
-            moved = np.maximum(moved, 0.0)
-            out = self._outgoing @ moved
-            short = (stock + self.incidence @ moved < 0) & (out > 0)
+        after = self.incidence.add_to(stock.copy(), moved)
+        if after.min() >= 0:
+            return after, moved, rate
+        settled = np.full_like(moved, np.nan)
+        while after.min() < 0:
+            out = self._outgoing(moved)
+            short = (after < 0) & (out > 0)
             kept = np.divide(stock * (1.0 - 1e-12), out, out=np.ones_like(out), where=short)
             share = np.minimum(kept, 1.0).take(self.network.donors, axis=0)
-            moved *= share
+            cut = short.take(self.network.donors, axis=0)
+            settled[cut] = (moved * share)[cut] / self.substep
             rate = rate * share
-            after = stock + self.incidence @ moved
+            moved = np.maximum(self._moved_exactly(stock, rate, settled), 0.0)
+            after = self.incidence.add_to(stock.copy(), moved)
         return after, moved, rate
 
 

@@ -1,8 +1,8 @@
 """A conformance suite for multi-agent environments, stricter than PettingZoo's own.
 
-PettingZoo's tests let NaN and out-of-range observations pass, compare no reset with another, and look at one step
-after seeding. ``check_parallel_env`` runs whole episodes of any PettingZoo ``ParallelEnv`` and names agent, step
-and value of the first breach:
+PettingZoo's tests let NaN and out-of-range observations pass, compare no reset with another, and look at
+one step after seeding. ``check_parallel_env`` runs whole episodes of any PettingZoo ``ParallelEnv`` and
+names agent, step and value of the first breach:
 
 >>> import cirl_marl
 >>> from cirl_marl.testing import check_parallel_env
@@ -12,7 +12,7 @@ and value of the first breach:
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -20,8 +20,12 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from cirl_marl.nested import ConformanceError, check_member, check_memory, require, same_or_raise
+
 if TYPE_CHECKING:
     from cirl_marl.vector_env import VectorEnv
+
+__all__ = ["ConformanceError", "check_parallel_env", "check_vector_env"]
 
 AnyEnv: TypeAlias = ParallelEnv[Any, Any, Any]
 RETURNS = ("observations", "rewards", "terminations", "truncations", "infos")
@@ -29,19 +33,15 @@ REMEMBERED = 4
 """How many steps back observations are watched for later change."""
 
 
-class ConformanceError(AssertionError):
-    """An environment breaks the contract; the message names agent, step and value."""
-
-
 def check_parallel_env(make: Callable[[], AnyEnv], *, steps: int = 200, seed: int = 0) -> None:
     """Check a PettingZoo parallel environment, of whatever spaces, over two episodes.
 
-    Two environments are stepped side by side under the same actions, up to the end of the episode or ``steps``;
-    then the first is reset in mid-episode and has to repeat the episode bit for bit. Checked at every step:
-    observations lie in their spaces (NaN, bounds, dtype, shape), share no memory with each other and do not
-    change afterwards; rewards are finite; terminations and truncations are booleans; keys equal the agents that
-    acted; agents leave exactly when they are done and nobody joins; actions are left untouched; spaces are one
-    lasting object per agent.
+    Two environments are stepped side by side under the same actions, up to the end of the episode or
+    ``steps``; then the first is reset in mid-episode and has to repeat the episode bit for bit. Checked
+    at every step: observations lie in their spaces (NaN, bounds, dtype, shape), share no memory with
+    each other and do not change afterwards; rewards are finite; terminations and truncations are
+    booleans; keys equal the agents that acted; agents leave exactly when they are done and nobody joins;
+    actions are left untouched; spaces are one lasting object per agent.
 
     Infinite observations pass only where the bound of a ``Box`` is infinite.
 
@@ -92,26 +92,26 @@ def check_vector_env(make: Callable[[], VectorEnv], *, steps: int = 200, seed: i
         drawn = {agent: generator.uniform(-1, 1, (first.num_envs, 1)) for agent in first.agents}
         given = copy.deepcopy(drawn)
         result = first.step(given)
-        _same_or_raise(drawn, given, f"step {step}: the actions were changed")
-        _same_or_raise(kept, observations, f"step {step}: observations returned at step {step - 1} changed")
+        same_or_raise(drawn, given, f"step {step}: the actions were changed")
+        same_or_raise(kept, observations, f"step {step}: observations returned at step {step - 1} changed")
         _compare(result, second.step(drawn), "two environments with the same seed and actions", step)
         observations, rewards, terminations, truncations, infos = result
         _check_batch(first, observations, step)
-        _check_memory(observations, f"step {step}")
+        check_memory(observations, f"step {step}")
         for agent in first.agents:
             where = f"agent {agent!r}, step {step}"
-            _require(
+            require(
                 rewards[agent].shape == (first.num_envs,), f"{where}: rewards of shape {rewards[agent].shape}"
             )
-            _require(
+            require(
                 bool(np.isfinite(rewards[agent]).all()), f"{where}: reward {rewards[agent]} is not finite"
             )
             for name, ends in (("terminations", terminations[agent]), ("truncations", truncations[agent])):
-                _require(ends.dtype == np.bool_, f"{where}: {name} have dtype {ends.dtype}, not bool")
+                require(ends.dtype == np.bool_, f"{where}: {name} have dtype {ends.dtype}, not bool")
             ended = terminations[agent] | truncations[agent]
             if ended.any():
                 final = infos[agent].get("final_observation")
-                _require(final is not None, f"{where}: an episode ended without 'final_observation' in infos")
+                require(final is not None, f"{where}: an episode ended without 'final_observation' in infos")
                 _check_rows(first, agent, final, f"{where}, final_observation")
 
 
@@ -147,10 +147,8 @@ class _Watched:
     def reset(self, seed: int | None = None) -> tuple[Any, Any]:
         env = self.env
         observations, infos = env.reset(seed=seed)
-        _require(
-            set(env.agents) <= set(env.possible_agents), f"agents {env.agents} go beyond possible_agents"
-        )
-        _require(
+        require(set(env.agents) <= set(env.possible_agents), f"agents {env.agents} go beyond possible_agents")
+        require(
             len(set(env.agents)) == len(env.agents) > 0,
             f"reset: agents {env.agents} are not distinct or none",
         )
@@ -164,33 +162,29 @@ class _Watched:
         before = list(env.agents)
         given = copy.deepcopy(dict(actions))
         returned = env.step(given)
-        _same_or_raise(dict(actions), given, f"step {step}: the actions were changed")
-        _require(
-            len(returned) == len(RETURNS), f"step {step}: returned {len(returned)} things, not {RETURNS}"
-        )
+        same_or_raise(dict(actions), given, f"step {step}: the actions were changed")
+        require(len(returned) == len(RETURNS), f"step {step}: returned {len(returned)} things, not {RETURNS}")
         self._check_keys(dict(zip(RETURNS, returned, strict=True)), before, step)
         observations, rewards, terminations, truncations, _ = returned
         joined = [agent for agent in env.agents if agent not in before]
-        _require(not joined, f"step {step}: agents {joined} joined in mid-episode")
+        require(not joined, f"step {step}: agents {joined} joined in mid-episode")
         for agent in before:
             where = f"agent {agent!r}, step {step}"
             _check_reward(rewards[agent], where)
             for name, flag in (("termination", terminations[agent]), ("truncation", truncations[agent])):
-                _require(isinstance(flag, bool | np.bool_), f"{where}: {name} {flag!r} is not a bool")
+                require(isinstance(flag, bool | np.bool_), f"{where}: {name} {flag!r} is not a bool")
             done = bool(terminations[agent] or truncations[agent])
-            _require(
-                done != (agent in env.agents), f"{where}: done is {done}, but env.agents is {env.agents}"
-            )
+            require(done != (agent in env.agents), f"{where}: done is {done}, but env.agents is {env.agents}")
         self._check_spaces(step)
         self._check_observations(observations, step)
         return copy.deepcopy(returned)
 
     def _check_keys(self, returned: Mapping[str, Any], agents: list[Any], step: int) -> None:
         for name, by_agent in returned.items():
-            _require(
+            require(
                 isinstance(by_agent, dict), f"step {step}: {name} are a {type(by_agent).__name__}, not a dict"
             )
-            _require(
+            require(
                 set(by_agent) == set(agents),
                 f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}",
             )
@@ -201,20 +195,20 @@ class _Watched:
             now = (env.observation_space(agent), env.action_space(agent))
             before = self._spaces.setdefault(agent, now)
             for name, old, new in zip(("observation_space", "action_space"), before, now, strict=True):
-                _require(
+                require(
                     old is new, f"agent {agent!r}, step {step}: {name} returned another object than before"
                 )
         if step == 0:
             for (one, mine), (other, theirs) in combinations(self._spaces.items(), 2):
                 for name, a, b in zip(("observation", "action"), mine, theirs, strict=True):
-                    _require(a is not b, f"agents {one!r} and {other!r} share one {name} space object")
+                    require(a is not b, f"agents {one!r} and {other!r} share one {name} space object")
 
     def _check_observations(self, observations: Mapping[Any, Any], step: int) -> None:
         for agent, seen in observations.items():
-            _check_member(self._spaces[agent][0], seen, f"agent {agent!r}, step {step}: observation")
-        _check_memory(observations, f"step {step}")
+            check_member(self._spaces[agent][0], seen, f"agent {agent!r}, step {step}: observation")
+        check_memory(observations, f"step {step}")
         for earlier, original, kept in self._returned:
-            _same_or_raise(kept, original, f"step {step}: observations returned at step {earlier} changed")
+            same_or_raise(kept, original, f"step {step}: observations returned at step {earlier} changed")
         self._returned = [*self._returned[-REMEMBERED:], (step, observations, copy.deepcopy(observations))]
 
 
@@ -239,7 +233,7 @@ def _check_restart(
 
 
 def _check_batch(env: VectorEnv, observations: Mapping[str, Any], step: int) -> None:
-    _require(
+    require(
         list(observations) == list(env.agents), f"step {step}: observations have keys {list(observations)}"
     )
     for agent, seen in observations.items():
@@ -247,104 +241,20 @@ def _check_batch(env: VectorEnv, observations: Mapping[str, Any], step: int) -> 
 
 
 def _check_rows(env: VectorEnv, agent: str, seen: Any, where: str) -> None:
-    _require(len(seen) == env.num_envs, f"{where}: {len(seen)} rows for {env.num_envs} copies")
+    require(len(seen) == env.num_envs, f"{where}: {len(seen)} rows for {env.num_envs} copies")
     for i, row in enumerate(seen):
-        _check_member(env.observation_spaces[agent], row, f"{where} of copy {i}")
+        check_member(env.observation_spaces[agent], row, f"{where} of copy {i}")
 
 
 def _check_reward(reward: Any, where: str) -> None:
     number = isinstance(reward, int | float | np.number) or (
         isinstance(reward, np.ndarray) and reward.shape == ()
     )
-    _require(number and not isinstance(reward, bool), f"{where}: reward {reward!r} is not a number")
-    _require(bool(np.isfinite(reward)), f"{where}: reward {reward!r} is not finite")
-
-
-def _check_member(space: spaces.Space[Any], value: Any, where: str) -> None:
-    """Require that ``value`` lies in ``space``, with exactly its dtype and shape, part by part."""
-    if isinstance(space, spaces.Dict):
-        _require(isinstance(value, Mapping), f"{where}: {value!r} is not a mapping")
-        _require(
-            set(value) == set(space.spaces), f"{where}: keys {list(value)}, expected {list(space.spaces)}"
-        )
-        for key, part in space.spaces.items():
-            _check_member(part, value[key], f"{where}[{key!r}]")
-        return
-    if isinstance(space, spaces.Tuple):
-        _require(
-            isinstance(value, tuple) and len(value) == len(space.spaces),
-            f"{where}: {value!r} does not fit {space}",
-        )
-        for i, part in enumerate(space.spaces):
-            _check_member(part, value[i], f"{where}[{i}]")
-        return
-    if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
-        _require(
-            isinstance(value, np.ndarray), f"{where}: {value!r} is a {type(value).__name__}, not an array"
-        )
-        _require(value.shape == space.shape, f"{where}: shape {value.shape}, expected {space.shape}")
-        _require(value.dtype == space.dtype, f"{where}: dtype {value.dtype}, expected {space.dtype}")
-    if isinstance(space, spaces.Box):
-        wrong = ~((value >= space.low) & (value <= space.high))
-        if wrong.any():
-            entry = tuple(int(i) for i in np.argwhere(wrong)[0])
-            bounds = f"[{space.low[entry]}, {space.high[entry]}]"
-            raise ConformanceError(f"{where}: entry {entry} is {value[entry]}, outside {bounds}")
-    _require(space.contains(value), f"{where}: {value!r} is not in {space}")
-
-
-def _check_memory(observations: Mapping[Any, Any], where: str) -> None:
-    """Require that no two agents see the same memory."""
-    arrays = [(agent, leaf) for agent, seen in observations.items() for leaf in _leaves(seen)]
-    for (one, mine), (other, theirs) in combinations(arrays, 2):
-        if one != other and np.may_share_memory(mine, theirs):
-            _require(
-                not np.shares_memory(mine, theirs),
-                f"{where}: agents {one!r} and {other!r} share an observation's memory",
-            )
-
-
-def _leaves(value: Any) -> Iterator[np.ndarray[Any, Any]]:
-    if isinstance(value, np.ndarray):
-        yield value
-    elif isinstance(value, Mapping | tuple | list):
-        for part in value.values() if isinstance(value, Mapping) else value:
-            yield from _leaves(part)
+    require(number and not isinstance(reward, bool), f"{where}: reward {reward!r} is not a number")
+    require(bool(np.isfinite(reward)), f"{where}: reward {reward!r} is not finite")
 
 
 def _compare(one: tuple[Any, ...], other: tuple[Any, ...], what: str, step: int) -> None:
     names = RETURNS if len(one) == len(RETURNS) else ("observations", "infos")
     for name, a, b in zip(names, one, other, strict=False):
-        _same_or_raise(a, b, f"step {step}: {what} differ in {name}")
-
-
-def _same_or_raise(one: Any, other: Any, message: str) -> None:
-    for path, a, b in _differences(one, other, ""):
-        raise ConformanceError(f"{message}: at {path or 'the value itself'}, {a!r} and {b!r}")
-
-
-def _differences(one: Any, other: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield where two nested values differ, arrays and numbers compared bit for bit."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping) and set(one) == set(other):
-        for key in one:
-            yield from _differences(one[key], other[key], f"{path}[{key!r}]")
-    elif isinstance(one, list | tuple) and type(one) is type(other) and len(one) == len(other):
-        for i, (a, b) in enumerate(zip(one, other, strict=True)):
-            yield from _differences(a, b, f"{path}[{i}]")
-    elif isinstance(one, np.ndarray | np.generic | float) and type(one) is type(other):
-        a, b = np.asarray(one), np.asarray(other)
-        same = a.dtype == b.dtype and a.shape == b.shape
-        if not same or (a.tobytes() != b.tobytes() if not a.dtype.hasobject else not np.array_equal(a, b)):
-            yield path, one, other
-    elif type(one) is not type(other) or (_comparable(one) and not bool(one == other)):
-        yield path, one, other
-
-
-def _comparable(value: Any) -> bool:
-    """Whether the type says what equality means; identity of plain objects says nothing about bits."""
-    return getattr(type(value), "__eq__", None) is not getattr(object, "__eq__", None)
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ConformanceError(message)
+        same_or_raise(a, b, f"step {step}: {what} differ in {name}")

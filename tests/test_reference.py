@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -45,7 +46,7 @@ def test_initial_state_in_the_papers_order(name: str) -> None:
     """An array is taken in the paper's order; one step from it is one published step."""
     published = reference(name)
     network, agent = PAPER[name]
-    env = single_agent_env(network, agent=agent, scenario="paper")
+    env: gymnasium.Env[Any, Any] = single_agent_env(network, agent=agent, scenario="paper")
     _, info = env.reset(seed=0, options={"initial_state": published["state"][7]})
     np.testing.assert_array_equal(info["state"], published["state"][7])
     *_, info = env.step(published["action"][7:8])
@@ -53,7 +54,7 @@ def test_initial_state_in_the_papers_order(name: str) -> None:
 
 
 def test_local_rewards_sum_to_the_papers() -> None:
-    """In the paper scenario of copper_net the local rewards of its compartments are the paper's reward, split."""
+    """The local rewards of copper_net's compartments are the paper's reward, split."""
     published = reference("CopperNet")
     env = parallel_env("copper_net", scenario="paper")
     env.reset(seed=0)
@@ -73,7 +74,7 @@ def test_eigenvalues(name: str, eigenvalues: list[float]) -> None:
     sets_flow = np.isin(network.controllable, [arc.id for arc in network.arcs if arc.law is Law.CONTROLLED])
     rate = dynamics.rate(np.where(sets_flow, 0.0, dynamics.neutral)[:, None])
     unit = np.eye(len(network.nodes) + 1)
-    matrix = (dynamics.incidence @ dynamics.flow(unit, np.repeat(rate, unit.shape[1], axis=1)))[:-1, :-1]
+    matrix = dynamics.incidence(dynamics.flow(unit, np.repeat(rate, unit.shape[1], axis=1)))[:-1, :-1]
     order = [network.node_index[node] for node in network.observation.nodes]
     found = np.sort(np.linalg.eigvals(matrix[np.ix_(order, order)]).real)
     np.testing.assert_allclose(found, eigenvalues, atol=1e-9)

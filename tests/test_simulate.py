@@ -255,3 +255,15 @@ def test_hundred_thousand_compartments() -> None:
         if not truncations[env.agents[0]].any():
             np.testing.assert_allclose(env.state()[:, :-1].sum(axis=1), before, rtol=1e-12)
     assert time.perf_counter() - began < 20
+
+
+def test_recipient_passes_on_only_what_it_got() -> None:
+    """Where a donor is exhausted, what leaves the recipient follows from what really arrived."""
+    arcs = [
+        Arc(id="pull", donor="reserve", recipient="plant", law=Law.RECIPIENT, rate=0.9),
+        Arc(id="out", donor="plant", recipient="sink", rate=0.09),
+    ]
+    stock = advanced(small({"reserve": 0.0, "plant": 10.0, "sink": 0.0}, arcs))
+    np.testing.assert_allclose(
+        stock, [0.0, 10 * math.exp(-0.09), -10 * math.expm1(-0.09)], rtol=1e-11, atol=1e-12
+    )

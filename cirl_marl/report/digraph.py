@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cirl_marl.network import Floats, Network
-from cirl_marl.report.drawing import draw_network, legend_of
+from cirl_marl.report.drawing import draw_network, largest_flow, legend_of
 from cirl_marl.report.style import number, save, spoken
 from cirl_marl.report.window import Window
 
@@ -53,7 +53,7 @@ class Canvas:
             time: time of the stocks, for the heading.
         """
         network = self._network
-        reference = max(self._reference, float(np.abs(flow).max(initial=0.0)))
+        reference = max(self._reference, largest_flow(flow))
         title = f"{spoken(network.name)}, {network.time_unit} {number(time)}"
         draw_network(self._axes, network, stock, flow, title=title, reference_flow=reference)
         self._agg.draw()  # type: ignore[no-untyped-call]
@@ -113,7 +113,7 @@ def save_before_after(
         CirlError: if an array has the wrong shape.
     """
     figure = Figure(figsize=(9.0, 5.6))
-    reference = max(float(np.abs(flow).max(initial=0.0)) for _, flow in (before, after))
+    reference = max(largest_flow(np.asarray(flow)) for _, flow in (before, after))
     for column, ((stock, flow), label) in enumerate(zip((before, after), labels, strict=True)):
         axes = figure.add_axes((0.005 + 0.5 * column, 0.1, 0.49, 0.78))
         draw_network(axes, network, stock, flow, title=label, reference_flow=reference, legend=False)

@@ -34,6 +34,8 @@ LARGEST_EM = 14.0
 """Largest font of a digraph, points."""
 WIDEST = 1.0
 """Width of the arrow that carries the reference flow, em."""
+BROADEST = 1.25
+"""Largest width of an arrow, relative to that."""
 
 
 def draw_network(
@@ -66,9 +68,8 @@ def draw_network(
         CirlError: if an array has the wrong shape.
     """
     stock, flow = _checked("stock", stock, len(network.nodes)), _checked("flow", flow, len(network.arcs))
-    largest = float(np.abs(flow).max(initial=0.0))
-    reference = largest if reference_flow is None else reference_flow
-    share = np.clip(np.abs(flow) / max(reference, 1e-12), 0, 1.25)
+    reference = largest_flow(flow) if reference_flow is None else reference_flow
+    share = np.clip(np.nan_to_num(np.abs(flow)) / max(reference, 1e-12), 0, BROADEST)
     width, height = _inches(axes)
     layout = layout_of(network, width / height)
     axes.clear()
@@ -82,6 +83,11 @@ def draw_network(
     _write_title(axes, network, flow, title)
     if legend:
         axes.legend(**legend_of(network), loc="lower center", ncols=3)
+
+
+def largest_flow(flow: Floats) -> float:
+    """Return the largest finite |f|, mass/time; 0 if there is none."""
+    return float(np.abs(flow, where=np.isfinite(flow), out=np.zeros(flow.shape)).max(initial=0.0))
 
 
 def legend_of(network: Network) -> dict[str, Any]:
@@ -185,7 +191,9 @@ def _draw_boxes(axes: Axes, network: Network, layout: Layout, stock: Floats, em:
 
 
 def _fill(amount: float, scale: float) -> float:
-    return max(amount, 0.0) / (max(amount, 0.0) + scale)
+    """Share of a box that a stock fills: 0 without stock or for one that is no number, half at ``scale``."""
+    held = max(amount, 0.0) if math.isfinite(amount) else 0.0
+    return held / (held + scale)
 
 
 def _tint(colour: str, share: float) -> str:
@@ -220,7 +228,8 @@ def _draw_dots(axes: Axes, network: Network, layout: Layout, stock: Floats, shar
 
 
 def _write_title(axes: Axes, network: Network, flow: Floats, title: str) -> None:
-    value = number(float(network.circularity(flow)))
+    with np.errstate(invalid="ignore"):  # flows that overflowed are shown as they are
+        value = number(float(network.circularity(flow)))
     heading = title or network.title or spoken(network.name)
     below = f"λ = {value} {network.mass_unit}    flows in {network.mass_unit}/{network.time_unit}"
     axes.text(

@@ -228,7 +228,7 @@ class _Search:
         offset = points[:, None] - start[:, :, None]
         share = np.clip((offset * along[:, :, None]).sum(axis=-1) / square[..., None], 0, 1)
         gap = (offset - share[..., None] * along[:, :, None]) / self._unit
-        near = np.clip(1.6 - 3 * np.abs(gap).max(axis=-1), 0, 1)
+        near: Floats = np.clip(1.6 - 3 * np.abs(gap).max(axis=-1), 0, 1)
         rows = np.arange(len(self._edges))
         near[:, rows, self._edges[:, 0]] = 0
         near[:, rows, self._edges[:, 1]] = 0

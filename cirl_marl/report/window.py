@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,7 @@ class Window:
         Raises:
             CirlError: if pygame is not installed.
         """
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # pygame greets on stdout otherwise
         try:
             import pygame
         except ImportError as missing:

@@ -1,0 +1,119 @@
+"""Tables for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from cirl_marl.elements import Arc, Control, ControlKind, Law
+from cirl_marl.network import Floats, Network
+
+
+def networks_table(networks: Mapping[str, Network]) -> Table:
+    """One row a network: compartments, agents, services, scenarios."""
+    table = Table(title="Networks")
+    for column in ("name", "what it is", "compartments", "agents", "services", "scenarios"):
+        table.add_column(column)
+    for name, network in networks.items():
+        table.add_row(
+            name,
+            network.title,
+            f"{len(network.compartments)} ({len(network.nodes)} nodes, {len(network.arcs)} arcs)",
+            str(len(network.agents)),
+            ", ".join(service.id for service in network.services) or "none",
+            ", ".join([network.scenario_name, *network.scenarios]),
+        )
+    return table
+
+
+def nodes_table(network: Network, stock: Floats) -> Table:
+    """One row a node: role, stock at the start, set-point, control."""
+    table = Table(title=f"{network.title or network.name}: nodes ({network.mass_unit})")
+    for column in ("node", "role", "initial range", "stock", "set-point", "control"):
+        table.add_column(column, justify="right" if column in ("stock", "set-point") else "left")
+    for node, held in zip(network.nodes, stock, strict=True):
+        low, high = node.initial
+        span = f"{low:g}" if low == high else f"{low:g} – {high:g}"
+        target = "" if node.set_point is None else f"{node.set_point:g}"
+        acting = node.control if node.id in network.agents else None
+        table.add_row(node.id, node.role.value, span, f"{held:.5g}", target, control_text(network, acting))
+    return table
+
+
+def arcs_table(network: Network, flow: Floats) -> Table:
+    """One row an arc: ends, law, flow at the start, its sign in λ, set-point, control."""
+    table = Table(title=f"arcs ({network.mass_unit}/{network.time_unit})")
+    for column in ("arc", "from", "to", "law", "flow", "in λ", "set-point", "control"):
+        table.add_column(column, justify="right" if column in ("flow", "set-point") else "left")
+    signs = {1.0: "−", -1.0: "+", 0.0: ""}
+    for k, arc in enumerate(network.arcs):
+        target = "" if arc.set_point is None else f"{arc.set_point:g}"
+        acting = arc.control if arc.id in network.agents else None
+        table.add_row(
+            arc.id,
+            arc.donor,
+            arc.recipient,
+            law_text(network, arc),
+            f"{flow[k]:.5g}",
+            signs[float(network.sustainability[k])],
+            target,
+            control_text(network, acting),
+        )
+    return table
+
+
+def law_text(network: Network, arc: Arc) -> str:
+    """Say the flow law of an arc as a formula."""
+    if arc.law is Law.DONOR:
+        return f"{arc.rate:g}/{network.time_unit} × {arc.donor}"
+    if arc.law is Law.RECIPIENT:
+        return f"{arc.rate:g}/{network.time_unit} × {arc.recipient}"
+    if arc.law is Law.CONTROLLED:
+        return "u"
+    return "series" if arc.times else f"{arc.flow[0]:g}"
+
+
+def control_text(network: Network, control: Control | None) -> str:
+    """Say what an agent sets and within which bounds."""
+    if control is None:
+        return ""
+    unit = f" {network.mass_unit}/{network.time_unit}" if control.kind is ControlKind.FLOW else ""
+    return f"{control.kind.value} {control.low:g} … {control.high:g}{unit}, neutral {control.neutral:g}"
+
+
+def evaluation_table(figures: Mapping[str, Any]) -> Table:
+    """One row a controller: λ̄, circularity gain, service level, each with its confidence interval."""
+    title = f"{figures['episodes']} fresh episodes, mean ± half-width of the 95 % confidence interval"
+    table = Table(title=title)
+    columns = ("controller", f"λ̄ ({figures['unit']})", "gain over neutral", "service level", "local return, all agents")
+    for column in columns:
+        table.add_column(column, justify="left" if column == "controller" else "right")
+    for name, row in figures["controllers"].items():
+        local = float(np.sum([value["mean"] for value in row["local_return"].values()]))
+        table.add_row(
+            name,
+            _figure(row["circularity"], "{:.4g}"),
+            _figure(row["circularity_gain"], "{:+.1%}"),
+            _figure(row["service_level"], "{:.4f}"),
+            f"{local:.4g}",
+        )
+    return table
+
+
+def local_returns_table(figures: Mapping[str, Any]) -> Table:
+    """One row an agent: its local return under each controller."""
+    table = Table(title="local return of each agent")
+    controllers = figures["controllers"]
+    table.add_column("agent")
+    for name in controllers:
+        table.add_column(name, justify="right")
+    for agent in next(iter(controllers.values()))["local_return"]:
+        table.add_row(agent, *(_figure(row["local_return"][agent], "{:.4g}") for row in controllers.values()))
+    return table
+
+
+def _figure(estimate: Mapping[str, float], form: str) -> str:
+    return f"{form.format(estimate['mean'])} ± {form.format(estimate['half_width']).lstrip('+')}"

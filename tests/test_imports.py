@@ -1,0 +1,59 @@
+"""What importing the library costs, and which way imports go."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import cirl_marl
+
+PACKAGE = Path(cirl_marl.__file__).parent
+LAYERS = (
+    {
+        "errors",
+        "units",
+        "elements",
+        "rowsum",
+        "validate",
+        "network",
+        "schema",
+        "definition",
+        "writing",
+        "catalogue",
+    },
+    {"compartments", "simulate", "observe", "reward", "vector_env"},
+    {"parallel_env", "single_env", "registration"},
+    {"controllers", "learners", "evaluate", "report", "nested", "testing"},
+    {"cli"},
+)
+"""Network ← environments ← learners ← command line; a module imports from its own layer or earlier ones."""
+
+
+def test_import_is_light() -> None:
+    """``import cirl_marl`` loads neither torch nor mujoco."""
+    heavy = ("torch", "mujoco", "stable_baselines3")
+    code = f"import sys, cirl_marl; print([module for module in {heavy} if module in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def imported(path: Path) -> set[str]:
+    """Return the modules of this library that a file imports when it is loaded."""
+    found = set()
+    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith("cirl_marl."):
+            found.add(str(statement.module).split(".")[1])
+    return found
+
+
+def test_imports_go_one_way() -> None:
+    """No module imports, when it is loaded, from a later layer."""
+    layer = {module: i for i, modules in enumerate(LAYERS) for module in modules}
+    files = [path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py" or path.parent != PACKAGE]
+    for path in files:
+        own = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        assert own in layer, f"{own} belongs to no layer"
+        for other in imported(path):
+            assert layer[other] <= layer[own], f"{path.name} imports {other}"

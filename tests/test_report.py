@@ -1,0 +1,296 @@
+"""Pictures: they exist, show what changed, leave matplotlib's settings alone and keep labels apart."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import combinations
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from numpy.typing import NDArray
+
+import cirl_marl
+from cirl_marl import Arc, CirlError, Network, Node, Role
+from cirl_marl.network import Floats
+from cirl_marl.report import (
+    Canvas,
+    draw_network,
+    save_before_after,
+    save_circularity,
+    save_learning_curves,
+    save_network,
+    save_trajectory,
+)
+from cirl_marl.report.plan import layout_of
+
+Picture = NDArray[np.float32]
+
+
+def read(path: Path) -> Picture:
+    """Return a PNG that must not be blank."""
+    assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    image: Picture = imread(path)
+    height, width = image.shape[:2]
+    assert 1500 <= width <= 2000
+    assert 400 <= height <= 2400
+    assert 0.005 < float((image[..., :3].min(axis=-1) < 0.97).mean()) < 0.9
+    return image
+
+
+def some_flows(network: Network) -> tuple[Floats, Floats]:
+    """Return stocks and flows of a plausible size."""
+    random = np.random.default_rng(3)
+    stock = np.array([node.scale for node in network.nodes]) * random.uniform(0, 2, len(network.nodes))
+    return stock, np.array([arc.scale for arc in network.arcs]) * random.uniform(0, 1, len(network.arcs))
+
+
+def random_network(nodes: int, arcs: int) -> Network:
+    """Return a network with one reservoir, one landfill and cycles, loops through two nodes included."""
+    random = np.random.default_rng(0)
+    pairs = {(int(random.integers(0, i)), i) for i in range(1, nodes)}
+    while len(pairs) < arcs:
+        donor, recipient = (int(i) for i in random.integers(1, nodes - 1, 2))
+        if donor != recipient:
+            pairs |= {(donor, recipient), (recipient, donor)}
+    roles = {0: Role.NONRENEWABLE_RESERVOIR, nodes - 1: Role.LANDFILL}
+    return Network(
+        name="random",
+        nodes=tuple(Node(id=f"node_{i}", role=roles.get(i, Role.TECHNOSPHERE)) for i in range(nodes)),
+        arcs=tuple(
+            Arc(id=f"arc_{k}", donor=f"node_{i}", recipient=f"node_{j}", rate=0.1)
+            for k, (i, j) in enumerate(sorted(pairs))
+        ),
+    )
+
+
+@pytest.fixture(autouse=True)
+def _settings_untouched() -> Iterator[None]:
+    """Every picture leaves matplotlib's settings, backend and figures as they were."""
+    before = dict(matplotlib.rcParams)
+    yield
+    assert dict(matplotlib.rcParams) == before
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert pyplot is None or not pyplot.get_fignums()
+
+
+def test_package_needs_no_matplotlib() -> None:
+    """Importing the library and stepping an environment leave this package, and pyplot with it, unloaded."""
+    code = (
+        "import sys, cirl_marl; env = cirl_marl.parallel_env('copper_net'); env.reset(seed=0); "
+        "env.step(env.neutral_action); assert 'cirl_marl.report' not in sys.modules; "
+        "import cirl_marl.report; assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+
+
+@pytest.mark.parametrize("name", cirl_marl.networks())
+def test_catalogue_is_readable(name: str) -> None:
+    """In every network of the catalogue no box, label or arrow hides another box or label."""
+    network = cirl_marl.load_network(name)
+    for aspect in (0.9, 1.6):
+        layout = layout_of(network, aspect)
+        if layout.routes is None:
+            continue
+        for one, two in combinations(layout.positions, 2):
+            assert (np.abs(one - two) > layout.box).any()
+        for arc, label in enumerate(layout.routes.labels):
+            text = np.array([2.6, 1.0])
+            assert (np.abs(layout.positions - label) > (layout.box + text) / 2).any(axis=1).all()
+            others = np.delete(layout.routes.labels, arc, axis=0)
+            assert (np.abs(others - label) > text).any(axis=1).all()
+        for curve, donor, recipient in zip(
+            layout.routes.curves, network.donors, network.recipients, strict=True
+        ):
+            others = np.delete(layout.positions, [donor, recipient], axis=0)
+            assert (np.abs(curve[:, None] - others) > layout.box / 2).any(axis=-1).all()
+
+
+@pytest.mark.parametrize("size", [(2, 1), (3, 2), (9, 16), (20, 40), (50, 90), (2000, 4000)])
+def test_networks_of_any_size(tmp_path: Path, size: tuple[int, int]) -> None:
+    """A digraph is drawn from a pair of nodes to thousands."""
+    network = random_network(*size)
+    path = tmp_path / "folder" / "network.png"
+    stock, flow = some_flows(network)
+    assert save_network(path, network, stock, flow, title="one") == path
+    read(path)
+    assert [found.name for found in path.parent.iterdir()] == ["network.png"]
+
+
+@pytest.mark.parametrize("nodes", [7, 300])
+def test_long_chain_and_ring(tmp_path: Path, nodes: int) -> None:
+    """A ring without sources and a chain are drawn too."""
+    ring = [(i, (i + 1) % nodes) for i in range(nodes)]
+    for pairs in (ring, ring[:-1]):
+        network = Network(
+            name="ring",
+            nodes=tuple(Node(id=f"n{i}") for i in range(nodes)),
+            arcs=tuple(Arc(id=f"a{i}", donor=f"n{i}", recipient=f"n{j}", rate=0.1) for i, j in pairs),
+        )
+        positions = layout_of(network, 1.4).positions
+        assert len(np.unique(positions, axis=0)) == nodes
+        width, height = np.ptp(positions, axis=0)
+        assert 0.3 < width / max(height, 1.0) < 12
+        save_network(tmp_path / "ring.png", network, *some_flows(network))
+        read(tmp_path / "ring.png")
+
+
+def test_opposite_arcs_keep_apart() -> None:
+    """Two arcs between the same compartments bend to opposite sides."""
+    network = cirl_marl.load_network("carbo_net")
+    routes = layout_of(network, 1.4).routes
+    assert routes is not None
+    there, back = (
+        routes.curves[network.arc_index[arc]] for arc in ("urban_to_adjacent", "adjacent_to_urban")
+    )
+    assert np.hypot(*(there[:, None] - back).T).min() > 1.5
+
+
+def test_before_and_after(tmp_path: Path) -> None:
+    """Two states stand side by side, with the wider arrow where the flow is larger."""
+    network = cirl_marl.load_network("carbo_net")
+    stock, flow = some_flows(network)
+    path = save_before_after(
+        tmp_path / "two.png", network, (stock, flow), (stock, 0.2 * flow), ("now", "then")
+    )
+    image = read(path)[..., :3]
+    vermilion = np.abs(image - np.array([0xD5, 0x5E, 0x00]) / 255).max(axis=-1) < 0.05
+    half = image.shape[1] // 2
+    assert vermilion[:-200, :half].sum() > 1.5 * vermilion[:-200, half:].sum() > 0
+
+
+def test_title_tells_circularity() -> None:
+    """λ of the flows and its unit stand above the digraph; the text of an axes is its own."""
+    network = cirl_marl.load_network("copper_net")
+    axes = Figure().add_axes((0, 0, 1, 0.9))
+    draw_network(axes, network, np.zeros(8), np.full(9, 46.8), title="copper")
+    texts = [text.get_text() for text in axes.texts]
+    assert "copper" in texts
+    assert any(text.startswith("λ = −93.6 kt ") for text in texts)
+    assert texts.count("46.8") == 9
+
+
+def test_overflow_is_drawn(tmp_path: Path) -> None:
+    """A simulation that diverged can still be looked at."""
+    network = cirl_marl.load_network("copper_net")
+    stock, flow = some_flows(network)
+    stock[:2], flow[:2] = (np.nan, -5.0), (np.inf, np.nan)
+    read(save_network(tmp_path / "diverged.png", network, stock, -flow))
+
+
+def test_wrong_shapes_are_named(tmp_path: Path) -> None:
+    """Arrays that do not fit are refused with their shape, and nothing is written."""
+    network = cirl_marl.load_network("copper_net")
+    time, path = np.arange(4.0), tmp_path / "no.png"
+    with pytest.raises(CirlError, match=r"stock has shape \(9,\), expected \(8,\)"):
+        save_network(path, network, np.zeros(9), np.zeros(9))
+    with pytest.raises(CirlError, match=r"flow has shape \(4, 9\), expected \(9, 4\)"):
+        save_trajectory(path, network, time, np.zeros((8, 4)), np.zeros((4, 9)), time)
+    with pytest.raises(CirlError, match=r"'trained' has shape \(2, 5\), expected 4 along"):
+        save_circularity(path, network, time, {"trained": np.zeros((2, 5))}, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_render_is_deterministic_and_follows_the_state() -> None:
+    """render() gives the same picture for the same state, another for another, and keeps its size."""
+    frames = []
+    for _ in range(2):
+        env = cirl_marl.parallel_env("copper_net", render_mode="rgb_array")
+        env.reset(seed=0)
+        first = env.render()
+        env.step(env.neutral_action)
+        second = env.render()
+        env.close()
+        assert first is not None
+        assert second is not None
+        frames.append((first, second))
+    (first, second), again = frames
+    assert first.dtype == np.uint8
+    assert first.ndim == 3
+    assert first.shape[2] == 3
+    assert first.shape == second.shape
+    assert not np.array_equal(first, second)
+    assert np.array_equal(first, again[0])
+    assert np.array_equal(second, again[1])
+
+
+def test_frames_share_no_memory() -> None:
+    """A frame does not change when the next is drawn."""
+    network = cirl_marl.load_network("carbo_net")
+    canvas = Canvas(network, window=False)
+    stock, flow = some_flows(network)
+    frame = canvas.draw(stock, flow, 0.0)
+    kept = frame.copy()
+    assert not np.array_equal(canvas.draw(0 * stock, 0 * flow, 1.0), frame)
+    assert np.array_equal(frame, kept)
+    assert np.array_equal(canvas.draw(stock, flow, 0.0), kept)
+
+
+# pygame imports pkg_resources, which is deprecated.
+@pytest.mark.filterwarnings("ignore:pkg_resources is deprecated:UserWarning")
+@pytest.mark.filterwarnings("ignore:pkg_resources is deprecated:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:Deprecated call to `pkg_resources:DeprecationWarning")
+def test_window(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A window shows the picture, without a word on stdout, and opens again after it was closed."""
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = cirl_marl.parallel_env("copper_net", render_mode="human")
+    for _ in range(2):
+        env.reset(seed=0)
+        assert env.render() is None
+        env.step(env.neutral_action)
+        assert env.render() is None
+        env.close()
+    assert capsys.readouterr().out == ""
+
+
+def test_window_needs_pygame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without pygame the error names the extra."""
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    env = cirl_marl.parallel_env("copper_net", render_mode="human")
+    env.reset(seed=0)
+    with pytest.raises(CirlError, match=r"cirl-marl\[human\]"):
+        env.render()
+
+
+@pytest.mark.parametrize("episodes", [0, 1, 12])
+def test_circularity_curves(tmp_path: Path, episodes: int) -> None:
+    """λ and service are drawn for any number of episodes, and for a single step."""
+    network = cirl_marl.load_network("copper_net")
+    random = np.random.default_rng(0)
+    for steps in (1, 40):
+        runs = {name: random.normal(-90, 5, (episodes, steps)) for name in ("trained", "neutral", "random")}
+        service = {name: random.uniform(0.8, 1, (episodes, steps)) for name in runs}
+        read(save_circularity(tmp_path / "λ.png", network, np.arange(steps) / 4, runs, service))
+    read(save_circularity(tmp_path / "none.png", network, np.arange(3.0), {}, {}))
+
+
+@pytest.mark.parametrize("agents", [0, 1, 2, 7, 20, 33])
+def test_learning_curves(tmp_path: Path, agents: int) -> None:
+    """Any number of agents and of episodes, none included."""
+    random = np.random.default_rng(0)
+    for episodes in (0, 1, 3, 200) if agents < 3 else (200,):
+        steps = np.linspace(0.0, 160.0 * episodes, episodes)
+        returns = {f"use_to_collection_{i}": random.normal(0, 1, episodes) for i in range(agents)}
+        path = save_learning_curves(tmp_path / "curves.png", steps, returns)
+        if agents:
+            read(path)
+
+
+@pytest.mark.parametrize(
+    "network", [lambda: cirl_marl.load_network("copper_net"), lambda: random_network(40, 90)]
+)
+@pytest.mark.parametrize("steps", [1, 60])
+def test_trajectory(tmp_path: Path, network: Callable[[], Network], steps: int) -> None:
+    """Stocks, flows and λ are drawn over time, for few compartments and many."""
+    shown, random = network(), np.random.default_rng(0)
+    stock = random.normal(100, 5, (len(shown.nodes), steps))
+    flow = random.normal(10, 1, (len(shown.arcs), steps))
+    time = np.arange(steps) / 4
+    read(save_trajectory(tmp_path / "path.png", shown, time, stock, flow, shown.circularity(flow)))
