@@ -50,7 +50,8 @@ def main(
             spent = f"{minutes:.1f}" if controller == "trained" else ""
             lines.append(
                 f"| {network} | {controller} | {row[0].mean:.2f} ± {row[0].half_width:.2f} {results[0]['unit']} "
-                f"| {row[1].mean:+.1%} ± {row[1].half_width:.1%} | {row[2].mean:.4f} ± {row[2].half_width:.4f} | {spent} |"
+                f"| {row[1].mean:+.1%} ± {row[1].half_width:.1%} "
+                f"| {row[2].mean:.4f} ± {row[2].half_width:.4f} | {spent} |"
             )
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True)

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from cirl_marl.catalogue import load_network, networks, recipes
 from cirl_marl.controllers import Constant, Controller, Neutral, Random
 from cirl_marl.errors import CirlError, DefinitionError, LearnerError, unknown
-from cirl_marl.evaluate import Rollout, rollout
+from cirl_marl.evaluate import Rollout, interval_ends, rollout
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
 
@@ -79,7 +79,9 @@ def show(
     console.print(arcs_table(found, flow))
     for service in found.services:
         high = "" if np.isinf(service.high) else f" and at most {service.high:g}"
-        console.print(f"service '{service.id}': {service.quantity} of {service.provider} at least {service.low:g}{high}")
+        console.print(
+            f"service '{service.id}': {service.quantity} of {service.provider} at least {service.low:g}{high}"
+        )
     console.print(f"λ of the start state: {float(found.circularity(flow)):.5g} {found.mass_unit}")
     path = picture or Path(f"{found.name}.png")
     save_network(path, found, stock, flow, title=found.title)
@@ -132,7 +134,7 @@ def simulate(
     folder = out or Path()
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{found.name}_{control}"
-    time = (np.arange(found.episode.horizon) + 1.0) * found.episode.control_interval
+    time = interval_ends(found)
     _write_csv(folder / f"{name}.csv", found, time, run)
     save_trajectory(folder / f"{name}.png", found, time, run.stock.T, run.flow.T, run.circularity[0])
     console.print(
@@ -219,7 +221,9 @@ def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:
     console.print(evaluation_table(figures))
     for path in draw_run(run, rollouts, env):
         console.print(f"picture: {path}", soft_wrap=True)
-    console.print(f"run: {directory}  (figures in evaluation.json; more with: cirl evaluate {directory})", soft_wrap=True)
+    console.print(
+        f"run: {directory}  (figures in evaluation.json; more with: cirl evaluate {directory})", soft_wrap=True
+    )
 
 
 def _controller(control: str, settings: list[str]) -> Controller:
@@ -277,7 +281,7 @@ def _bar(what: str, total: int) -> Iterator[Any]:
 
 @contextmanager
 def _training_bar() -> Iterator[Any]:
-    """Live line of a training: joint steps/s, λ̄ and service level of the last episode; plain lines without a terminal."""
+    """Live line of a training: joint steps/s, λ̄ and service level of the last episode; plain lines if no terminal."""
     columns = (
         TextColumn("training"),
         BarColumn(),

@@ -150,17 +150,11 @@ class _Converter:
                 solver_step=self._optional(episode.solver_step, "time", "episode.solver_step"),
             ),
             "objective": Objective(
-                reference_interval=self._value(
-                    objective.reference_interval, "time", "objective.reference_interval"
-                ),
+                reference_interval=self._value(objective.reference_interval, "time", "objective.reference_interval"),
                 net_zero=objective.net_zero,
                 reward=objective.reward,
-                circularity_scale=self._value(
-                    objective.circularity_scale, "mass", "objective.circularity_scale"
-                ),
-                circularity_weight=self._value(
-                    objective.circularity_weight, "1", "objective.circularity_weight"
-                ),
+                circularity_scale=self._value(objective.circularity_scale, "mass", "objective.circularity_scale"),
+                circularity_weight=self._value(objective.circularity_weight, "1", "objective.circularity_weight"),
                 tracked=tuple(objective.tracked),
             ),
         }

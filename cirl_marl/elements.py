@@ -51,55 +51,58 @@ class Control:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Node:
-    """A compartment that stores material.
+class Compartment:
+    """What nodes and arcs have in common.
 
     Attributes:
         id: unique among nodes and arcs.
-        role: decides which flows count as finite-time sustainable.
-        initial: (low, high) of the initial stock, drawn uniformly, mass.
-        set_point: stock aimed at, mass; None if it has none.
-        scale: reference stock for observations and rewards, mass.
-        control: ``rate`` scales every outflow, ``flow`` sets the one controlled outflow; None if it cannot act.
+        set_point: stock (mass) or mean flow (mass/time) aimed at; None if it has none.
+        scale: reference stock or flow for observations and rewards.
+        control: its actuator; None if it cannot act.
     """
 
     id: str
-    role: Role = Role.TECHNOSPHERE
-    initial: tuple[float, float] = (0.0, 0.0)
     set_point: float | None = None
     scale: float = 1.0
     control: Control | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Arc:
+class Node(Compartment):
+    """A compartment that stores material.
+
+    A ``rate`` control scales every outflow, a ``flow`` control sets the one controlled outflow.
+
+    Attributes:
+        role: decides which flows count as finite-time sustainable.
+        initial: (low, high) of the initial stock, drawn uniformly, mass.
+    """
+
+    role: Role = Role.TECHNOSPHERE
+    initial: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arc(Compartment):
     """A compartment that moves material from ``donor`` to ``recipient``.
 
     Attributes:
-        id: unique among nodes and arcs.
         donor: id of the node that gives.
         recipient: id of the node that receives.
         law: ``donor`` f = a·x_donor, ``recipient`` f = a·x_recipient, ``controlled`` f = u, ``exogenous`` f = e(t).
         rate: a, 1/time (donor and recipient laws).
         flow: e, mass/time (exogenous law); with ``times`` the values of a step function, else a single value.
         times: starts of the steps of an exogenous series, time; empty for a constant.
-        set_point: mean flow aimed at, mass/time; None if it has none.
-        scale: reference flow for observations and rewards, mass/time.
         pollutant: whether material that enters an environment here is a pollutant.
-        control: actuator; None if it cannot act.
     """
 
-    id: str
     donor: str
     recipient: str
     law: Law = Law.DONOR
     rate: float = 0.0
     flow: tuple[float, ...] = (0.0,)
     times: tuple[float, ...] = ()
-    set_point: float | None = None
-    scale: float = 1.0
     pollutant: bool = True
-    control: Control | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from cirl_marl.controllers.basic import Controller
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Network
 from cirl_marl.vector_env import VectorEnv
 
 EVALUATION_SEEDS = 2**31
@@ -46,12 +46,14 @@ class Rollout:
     @property
     def episode_circularity(self) -> Floats:
         """λ̄ of each episode, shape (B,), mass."""
-        return self.circularity_mean.mean(axis=1)
+        mean: Floats = self.circularity_mean.mean(axis=1)
+        return mean
 
     @property
     def episode_service(self) -> Floats:
         """Mean service level of each episode, shape (B,)."""
-        return self.service.mean(axis=1)
+        mean: Floats = self.service.mean(axis=1)
+        return mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +125,14 @@ def rollout(
     return Rollout(circularity, mean, service, local, returns, stock, flow, final, total_flow / steps)
 
 
+def interval_ends(network: Network) -> Floats:
+    """Return the time at which each control interval of an episode ends, shape (steps,)."""
+    ends: Floats = np.multiply(
+        np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64
+    )
+    return ends
+
+
 def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
     """Return the circularity gain (λ̄ − λ̄_neutral)/|λ̄_neutral| of each episode, shape (B,)."""
     reference = neutral.episode_circularity
@@ -132,8 +142,8 @@ def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
 def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
     """Return the figures of each controller beside those of ``neutral``, ready for JSON.
 
-    Each figure is a mean over episodes with the half-width of its 95 % confidence interval; gains are paired, episode by
-    episode, with the neutral controller's from the same start.
+    Each figure is a mean over episodes with the half-width of its 95 % confidence interval; gains are paired, episode
+    by episode, with the neutral controller's from the same start.
     """
     neutral = rollouts["neutral"]
     figures = {}
@@ -143,8 +153,6 @@ def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
             "circularity_gain": estimate(gain(run, neutral)).as_dict(),
             "service_level": estimate(run.episode_service).as_dict(),
             "service_level_over_neutral": estimate(run.episode_service - neutral.episode_service).as_dict(),
-            "local_return": {
-                agent: estimate(run.local_returns[i]).as_dict() for i, agent in enumerate(env.agents)
-            },
+            "local_return": {agent: estimate(run.local_returns[i]).as_dict() for i, agent in enumerate(env.agents)},
         }
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}

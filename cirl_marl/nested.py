@@ -18,9 +18,7 @@ def check_member(space: spaces.Space[Any], value: Any, where: str) -> None:
     """Require that ``value`` lies in ``space``, with exactly its dtype and shape, part by part."""
     if isinstance(space, spaces.Dict):
         require(isinstance(value, Mapping), f"{where}: {value!r} is not a mapping")
-        require(
-            set(value) == set(space.spaces), f"{where}: keys {list(value)}, expected {list(space.spaces)}"
-        )
+        require(set(value) == set(space.spaces), f"{where}: keys {list(value)}, expected {list(space.spaces)}")
         for key, part in space.spaces.items():
             check_member(part, value[key], f"{where}[{key!r}]")
         return

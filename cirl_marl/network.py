@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.elements import SINKS, Arc, Episode, Node, Objective, Observation, Role, Service
+from cirl_marl.elements import SINKS, Arc, Compartment, Episode, Node, Objective, Observation, Role, Service
 from cirl_marl.errors import CirlError, NetworkError, unknown
-from cirl_marl.rowsum import Floats, RowSum
+from cirl_marl.rowsum import Floats as Floats
+from cirl_marl.rowsum import RowSum
 from cirl_marl.validate import problems
 
 if TYPE_CHECKING:
@@ -58,9 +59,9 @@ class Network:
     nodes: tuple[Node, ...]
     arcs: tuple[Arc, ...]
     services: tuple[Service, ...] = ()
-    episode: Episode = Episode()
-    objective: Objective = Objective()
-    observation: Observation = Observation()
+    episode: Episode = field(default_factory=Episode)
+    objective: Objective = field(default_factory=Objective)
+    observation: Observation = field(default_factory=Observation)
     acting: tuple[str, ...] = ()
     mass_unit: str = "kg"
     time_unit: str = "day"
@@ -99,14 +100,11 @@ class Network:
         >>> load_network("copper_net").with_options(episode={"horizon": 3}).episode.horizon
         3
         """
-        changes = {
-            group: replace(getattr(self, group), **dict(values))  # type: ignore[type-var]
-            for group, values in groups.items()
-        }
-        return replace(self, **changes)  # type: ignore[arg-type]
+        changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
+        return replace(self, **changes)
 
     @cached_property
-    def compartments(self) -> Mapping[str, Node | Arc]:
+    def compartments(self) -> Mapping[str, Compartment]:
         """Every compartment by id, nodes first."""
         return MappingProxyType({c.id: c for c in (*self.nodes, *self.arcs)})
 
@@ -196,7 +194,8 @@ class Network:
             circularity = parts[0] - np.abs(parts[1])
         else:
             circularity = parts[0] + parts[1]
-        return circularity.reshape(flow.shape[1:])
+        shaped: Floats = circularity.reshape(flow.shape[1:])
+        return shaped
 
     @cached_property
     def _circularity_parts(self) -> RowSum:

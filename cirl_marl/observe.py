@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from cirl_marl.elements import Node
+from cirl_marl.elements import Arc
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.simulate import Dynamics
@@ -45,7 +45,7 @@ class Signals:
 
     def set_point(self, compartment: int) -> int:
         """Row of the set-point of a compartment, nodes counted first."""
-        return self.levels.stop + compartment
+        return self.quantities + 1 + self.services + compartment
 
     @property
     def rows(self) -> int:
@@ -88,9 +88,7 @@ class ObservationLayout:
         self.spaces = {
             agent: Box(low[seen], high[seen], dtype=np.float32) for agent, seen in zip(agents, rows, strict=True)
         }
-        self.names = {
-            agent: tuple(self._names[row] for row in seen) for agent, seen in zip(agents, rows, strict=True)
-        }
+        self.names = {agent: tuple(self._names[row] for row in seen) for agent, seen in zip(agents, rows, strict=True)}
         scales = np.array([c.scale for c in (*network.nodes, *network.arcs)])
         self._inverse_scale = (1.0 / scales).reshape(-1, 1)
         set_points = np.array([c.set_point or 0.0 for c in (*network.nodes, *network.arcs)]) / scales
@@ -107,9 +105,7 @@ class ObservationLayout:
         """
         table = self._table
         with np.errstate(over="ignore"):
-            np.multiply(
-                quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind"
-            )
+            np.multiply(quantities, self._inverse_scale, out=table[: self.signals.quantities], casting="same_kind")
         table[self.signals.time] = time
         table[self.signals.levels] = levels
         return table.take(self._index, axis=0)
@@ -122,7 +118,7 @@ class ObservationLayout:
         compartment = network.compartments[agent]
         own = self._position[agent]
         yield own
-        if isinstance(compartment, Node):
+        if not isinstance(compartment, Arc):
             arcs = self._incident[own]
             neighbours = self._across(own)
         else:

@@ -1,4 +1,4 @@
-"""The multi-agent environment of a material network for PettingZoo: parallel, and AEC through PettingZoo's conversion."""
+"""The environment of a material network for PettingZoo: parallel, and AEC through PettingZoo's conversion."""
 
 from __future__ import annotations
 
@@ -146,7 +146,9 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             CirlError: if the environment was made without a ``render_mode``.
         """
         if self.render_mode is None:
-            raise CirlError(f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when making the environment")
+            raise CirlError(
+                f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when making the environment"
+            )
         from cirl_marl.report.digraph import Canvas
 
         if self._canvas is None:

@@ -44,7 +44,9 @@ class Scoring:
         self._everyone = RowSum(owners, columns, -weights, (len(compartments), terms))
         self._agents = self._everyone.chosen([position[agent] for agent in agents])
         self._all = RowSum([0] * terms, range(terms), self._everyone.column_sums(), (1, terms))
-        self._sum_of_levels = RowSum([0] * len(services), range(len(services)), [1.0] * len(services), (1, len(services)))
+        self._sum_of_levels = RowSum(
+            [0] * len(services), range(len(services)), [1.0] * len(services), (1, len(services))
+        )
 
     def levels(self, quantities: Floats) -> Floats:
         """Return the level of each service in [0, 1], shape (services, B)."""
@@ -73,13 +75,14 @@ class Scoring:
 
     def local_sum(self, terms: Floats) -> Floats:
         """Return the sum of the local rewards of all compartments, shape (B,)."""
-        return self._all(terms)[0]
+        total: Floats = self._all(terms)[0]
+        return total
 
     def service_level(self, levels: Floats) -> Floats:
         """Return the mean level over the services, shape (B,); 1 for a network that owes none."""
         if len(levels) == 0:
             return np.ones(levels.shape[1])
-        total = self._sum_of_levels(levels)[0]
+        total: Floats = self._sum_of_levels(levels)[0]
         total /= len(levels)
         return total
 

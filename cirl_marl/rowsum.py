@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-# The kernel behind scipy's ``csr_array @ dense``. The operator spends most of its time on dispatch and on a fresh result
-# for the small matrices here; the kernel adds to an array that is already there.
+# The kernel behind scipy's ``csr_array @ dense``. For the small matrices here
+# the operator spends most of its time on dispatch and on a fresh result; the kernel adds to an array already there.
 from scipy.sparse._sparsetools import csr_matvecs
 
 Floats = NDArray[np.float64]
@@ -38,7 +38,14 @@ class RowSum:
         """Add W x to ``result``, shape (rows, B), in place, and return it; both arrays are C-contiguous."""
         rows, columns = self.shape
         csr_matvecs(
-            rows, columns, values.shape[1], self._rows, self._columns, self._weights, values.ravel(), result.ravel()
+            rows,
+            columns,
+            values.shape[1],
+            self._rows,
+            self._columns,
+            self._weights,
+            values.reshape(-1),
+            result.reshape(-1, copy=False),
         )
         return result
 
@@ -51,7 +58,8 @@ class RowSum:
 
     def column_sums(self) -> Floats:
         """Return Σ_i W_ik for each column k."""
-        return np.bincount(self._columns, weights=self._weights, minlength=self.shape[1])
+        sums: Floats = np.bincount(self._columns, weights=self._weights, minlength=self.shape[1]).astype(float)
+        return sums
 
     def chosen(self, rows: list[int]) -> RowSum:
         """Return the matrix of the given rows of W."""

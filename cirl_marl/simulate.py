@@ -23,6 +23,9 @@ from cirl_marl.rowsum import RowSum
 MAX_TURNOVER = 1.0
 """Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
 
+NOTHING = 1e-290
+"""Stock that no recipient can pull: emptied again and again it would become subnormal, which does not round well."""
+
 TRUNCATION = 1e-13
 """Bound on the first neglected term of the exact solver's series, relative to the mass in the network."""
 
@@ -111,9 +114,7 @@ class Dynamics:
         if len(self._series_arcs):
             highest[self._series_arcs] *= self._series.max(axis=1)
         self.max_rate: Floats = highest
-        turnover = np.bincount(
-            self.driver[~scheduled], weights=highest[~scheduled], minlength=len(network.nodes)
-        )
+        turnover = np.bincount(self.driver[~scheduled], weights=highest[~scheduled], minlength=len(network.nodes))
         fastest = float(turnover.max(initial=0.0))
         if self.exact:
             self.substeps = max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
@@ -244,7 +245,8 @@ class Dynamics:
         while after.min() < 0:
             out = self._outgoing(moved)
             short = (after < 0) & (out > 0)
-            kept = np.divide(stock * (1.0 - 1e-12), out, out=np.ones_like(out), where=short)
+            held = np.where(stock > NOTHING, stock * (1.0 - 1e-12), 0.0)
+            kept = np.divide(held, out, out=np.ones_like(out), where=short)
             share = np.minimum(kept, 1.0).take(self.network.donors, axis=0)
             cut = short.take(self.network.donors, axis=0)
             settled[cut] = (moved * share)[cut] / self.substep

@@ -72,9 +72,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         observations, _ = self.parallel.reset(seed=seed, options=options)
         return observations[self.agent], {"state": self._paper_state()}
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Hold the action, shape (1,) in [−1, 1], for one control interval."""
         observations, rewards, terminations, truncations, infos = self.parallel.step({self.agent: action})
         info = {**infos[self.agent], "state": self._paper_state()}

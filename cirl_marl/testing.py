@@ -100,12 +100,8 @@ def check_vector_env(make: Callable[[], VectorEnv], *, steps: int = 200, seed: i
         check_memory(observations, f"step {step}")
         for agent in first.agents:
             where = f"agent {agent!r}, step {step}"
-            require(
-                rewards[agent].shape == (first.num_envs,), f"{where}: rewards of shape {rewards[agent].shape}"
-            )
-            require(
-                bool(np.isfinite(rewards[agent]).all()), f"{where}: reward {rewards[agent]} is not finite"
-            )
+            require(rewards[agent].shape == (first.num_envs,), f"{where}: rewards of shape {rewards[agent].shape}")
+            require(bool(np.isfinite(rewards[agent]).all()), f"{where}: reward {rewards[agent]} is not finite")
             for name, ends in (("terminations", terminations[agent]), ("truncations", truncations[agent])):
                 require(ends.dtype == np.bool_, f"{where}: {name} have dtype {ends.dtype}, not bool")
             ended = terminations[agent] | truncations[agent]
@@ -181,9 +177,7 @@ class _Watched:
 
     def _check_keys(self, returned: Mapping[str, Any], agents: list[Any], step: int) -> None:
         for name, by_agent in returned.items():
-            require(
-                isinstance(by_agent, dict), f"step {step}: {name} are a {type(by_agent).__name__}, not a dict"
-            )
+            require(isinstance(by_agent, dict), f"step {step}: {name} are a {type(by_agent).__name__}, not a dict")
             require(
                 set(by_agent) == set(agents),
                 f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}",
@@ -195,9 +189,7 @@ class _Watched:
             now = (env.observation_space(agent), env.action_space(agent))
             before = self._spaces.setdefault(agent, now)
             for name, old, new in zip(("observation_space", "action_space"), before, now, strict=True):
-                require(
-                    old is new, f"agent {agent!r}, step {step}: {name} returned another object than before"
-                )
+                require(old is new, f"agent {agent!r}, step {step}: {name} returned another object than before")
         if step == 0:
             for (one, mine), (other, theirs) in combinations(self._spaces.items(), 2):
                 for name, a, b in zip(("observation", "action"), mine, theirs, strict=True):
@@ -216,9 +208,7 @@ def _called(env: AnyEnv, actions: Mapping[Any, Any]) -> tuple[Any, ...]:
     return copy.deepcopy(env.step(copy.deepcopy(dict(actions))))
 
 
-def _check_restart(
-    watched: _Watched, seed: int, recorded: list[tuple[Any, ...]], taken: list[dict[Any, Any]]
-) -> None:
+def _check_restart(watched: _Watched, seed: int, recorded: list[tuple[Any, ...]], taken: list[dict[Any, Any]]) -> None:
     """Reset in mid-episode, then repeat what was recorded."""
     watched.reset(seed + 1)
     actions = _Actions(watched.env, seed + 1)
@@ -233,9 +223,7 @@ def _check_restart(
 
 
 def _check_batch(env: VectorEnv, observations: Mapping[str, Any], step: int) -> None:
-    require(
-        list(observations) == list(env.agents), f"step {step}: observations have keys {list(observations)}"
-    )
+    require(list(observations) == list(env.agents), f"step {step}: observations have keys {list(observations)}")
     for agent, seen in observations.items():
         _check_rows(env, agent, seen, f"agent {agent!r}, step {step}: observation")
 
@@ -247,9 +235,7 @@ def _check_rows(env: VectorEnv, agent: str, seen: Any, where: str) -> None:
 
 
 def _check_reward(reward: Any, where: str) -> None:
-    number = isinstance(reward, int | float | np.number) or (
-        isinstance(reward, np.ndarray) and reward.shape == ()
-    )
+    number = isinstance(reward, int | float | np.number) or (isinstance(reward, np.ndarray) and reward.shape == ())
     require(number and not isinstance(reward, bool), f"{where}: reward {reward!r} is not a number")
     require(bool(np.isfinite(reward)), f"{where}: reward {reward!r} is not finite")
 

@@ -14,6 +14,7 @@ from cirl_marl.elements import (
     REWARDS,
     SOLVERS,
     Arc,
+    Compartment,
     ControlKind,
     Episode,
     Law,
@@ -48,9 +49,7 @@ def problems(network: Network) -> Iterator[str]:
                 f"node '{node.id}': control.kind 'flow' needs exactly one controlled outflow, it has {len(outflows)}"
             )
         for arc in outflows:
-            sets_flow = [
-                c for c in (node, arc) if c.control is not None and c.control.kind is ControlKind.FLOW
-            ]
+            sets_flow = [c for c in (node, arc) if c.control is not None and c.control.kind is ControlKind.FLOW]
             if len(sets_flow) != 1:
                 yield (
                     f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', on the arc or on its "
@@ -103,7 +102,7 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
         yield f"{where}: control.low {control.low} would reverse the flow; use a second arc"
 
 
-def _common_problems(where: str, compartment: Node | Arc) -> Iterator[str]:
+def _common_problems(where: str, compartment: Compartment) -> Iterator[str]:
     if not math.isfinite(compartment.scale) or compartment.scale <= 0:
         yield f"{where}: scale {compartment.scale} must be positive and finite"
     if compartment.set_point is not None and not math.isfinite(compartment.set_point):

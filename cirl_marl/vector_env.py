@@ -87,8 +87,8 @@ class VectorEnv:
     """``num_envs`` independent copies of a material network, stepped together.
 
     Observations, rewards and so on are dicts agent → array with leading axis ``num_envs``. A copy whose episode ended
-    starts the next one within the same step; its last observation is then in ``infos[agent]["final_observation"]``, valid
-    where ``infos[agent]["_final_observation"]`` is true.
+    starts the next one within the same step; its last observation is then in
+    ``infos[agent]["final_observation"]``, valid where ``infos[agent]["_final_observation"]`` is true.
 
     Attributes:
         network: the network under the chosen scenario.
@@ -176,7 +176,8 @@ class VectorEnv:
         """Start an episode in every copy and return the observations.
 
         Args:
-            seed: an integer s seeds copy i with s + i; a sequence gives each copy its own; None goes on with the streams.
+            seed: an integer s seeds copy i with s + i; a sequence gives each copy its own; None goes on with the
+                streams.
             options: ``{"initial_state": …}``: a mapping node → stock (a number or shape (num_envs,)), the rest being
                 drawn; or, in a scenario that observes ``stocks``, an array in the order of the observation.
 
@@ -237,9 +238,7 @@ class VectorEnv:
                 raise ControlError(self._wrong_agents(actions))
             action = np.asarray(actions[agent])
             if action.shape != (self.num_envs, 1):
-                raise ControlError(
-                    f"action of agent '{agent}' has shape {action.shape}, expected {(self.num_envs, 1)}"
-                )
+                raise ControlError(f"action of agent '{agent}' has shape {action.shape}, expected {(self.num_envs, 1)}")
             if action.dtype.kind not in "biuf":
                 raise ControlError(f"action of agent '{agent}' is {actions[agent]!r}; it must hold numbers in [-1, 1]")
             stacked[i] = action[:, 0]
@@ -270,9 +269,7 @@ class VectorEnv:
         team = circularity if self._team == "end" else mean
         reward = self._reward(team, local, terms, state, controls)
         step = state.step + 1
-        self._state = State(
-            transition.stock, flow, step, state.circularity + mean, state.service + service
-        )
+        self._state = State(transition.stock, flow, step, state.circularity + mean, state.service + service)
         observation = self.layout.observe(quantities, step / horizon, levels)
         return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon)
 
@@ -287,7 +284,7 @@ class VectorEnv:
         return controls
 
     def local_rewards(self) -> dict[str, Floats]:
-        """Return the local reward that the current state gives each compartment, whether it acts or not, shape (B,)."""
+        """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
         quantities = self._quantities(self.physical)
         rewards = self.scoring.local_of_all(self.scoring.terms(quantities, self.scoring.levels(quantities)))
         return dict(zip(self.network.compartments, rewards, strict=True))
@@ -475,9 +472,7 @@ class VectorEnv:
     def _stock(self, id_: str, values: ArrayLike) -> Floats:
         stock = np.asarray(values, dtype=float)
         if stock.shape not in ((), (self.num_envs,)):
-            raise ControlError(
-                f"initial_state of '{id_}' has shape {stock.shape}, expected () or {(self.num_envs,)}"
-            )
+            raise ControlError(f"initial_state of '{id_}' has shape {stock.shape}, expected () or {(self.num_envs,)}")
         if not np.isfinite(stock).all() or (self.dynamics.exact and (stock < 0).any()):
             raise ControlError(f"initial_state of '{id_}' is {values!r}: stocks are finite and not negative")
         return stock

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Iterator
 
-from cirl_marl.elements import Arc, Control, ControlKind, Law, Node
+from cirl_marl.elements import Arc, Compartment, Control, ControlKind, Law, Node
 from cirl_marl.network import Network
 
 SOURCE = "network built in Python"
@@ -75,7 +75,7 @@ def _arc(network: Network, arc: Arc) -> Iterator[str]:
     yield from _common(network, arc, flow)
 
 
-def _common(network: Network, compartment: Node | Arc, unit: str) -> Iterator[str]:
+def _common(network: Network, compartment: Compartment, unit: str) -> Iterator[str]:
     yield f"scale = {_quantity(compartment.scale, unit)}"
     if compartment.set_point is not None:
         yield f"set_point = {_quantity(compartment.set_point, unit)}"

@@ -41,9 +41,7 @@ def random_network(seed: int, nodes: int, arcs: int) -> Network:
     rng = np.random.default_rng(seed)
     ends = [rng.choice(nodes, 2, replace=False) for _ in range(arcs if nodes > 1 else 0)]
     laws = [LAWS[rng.integers(4)] for _ in ends]
-    orders = np.bincount(
-        [i for (i, _), law in zip(ends, laws, strict=True) if law is Law.CONTROLLED], minlength=nodes
-    )
+    orders = np.bincount([i for (i, _), law in zip(ends, laws, strict=True) if law is Law.CONTROLLED], minlength=nodes)
     sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) for i in range(nodes)]
     return Network(
         name="random",
@@ -92,11 +90,7 @@ def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_
     if law is Law.EXOGENOUS:
         steps = int(rng.integers(1, 5))
         flow = (rng.integers(0, 2, steps) * rng.uniform(0, 200, steps)).tolist()
-        times = (
-            [0.0, *np.cumsum(rng.uniform(0.01, 2, steps - 1)).tolist()]
-            if rng.integers(2) or steps > 1
-            else []
-        )
+        times = [0.0, *np.cumsum(rng.uniform(0.01, 2, steps - 1)).tolist()] if rng.integers(2) or steps > 1 else []
     return Arc(
         id=f"arc_{k}",
         donor=f"node_{i}",

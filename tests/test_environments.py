@@ -72,9 +72,7 @@ def pettingzoo_passes(make: Callable[[], ParallelEnv[Any, Any, Any]]) -> bool:
 def test_catalogue_conforms(name: str, scenario: str, observe: str | None) -> None:
     """DESIGN 5.6, the stricter suite."""
     check_parallel_env(lambda: parallel_env(name, scenario=scenario, observe=observe))
-    check_vector_env(
-        lambda: vector_env(name, num_envs=3, scenario=scenario, observe=observe, horizon=7), steps=20
-    )
+    check_vector_env(lambda: vector_env(name, num_envs=3, scenario=scenario, observe=observe, horizon=7), steps=20)
 
 
 @marked
@@ -355,45 +353,27 @@ class NoRestart(Sound):
 DEFECTS: list[Any] = [
     pytest.param(_with_entry(np.nan), "agent 'b', step 3: observation: entry .0,. is nan", True, id="nan"),
     pytest.param(_with_entry(np.inf), "agent 'b', step 3: observation: entry .0,. is inf", True, id="inf"),
-    pytest.param(
-        _with_entry(101.0), r"agent 'b', step 3.*is 101.0, outside \[-100.0, 100.0\]", True, id="range"
-    ),
-    pytest.param(
-        WrongDtype, "agent 'a', step 0: observation: dtype float64, expected float32", True, id="dtype"
-    ),
-    pytest.param(
-        WrongShape, r"agent 'a', step 0: observation: shape \(2, 1\), expected \(2,\)", True, id="shape"
-    ),
-    pytest.param(
-        IgnoredSeed, "step 0: two environments after reset with the same seed differ", True, id="reset"
-    ),
-    pytest.param(
-        LateNoise, "step 2: two environments with the same seed and actions differ", True, id="step-2"
-    ),
+    pytest.param(_with_entry(101.0), r"agent 'b', step 3.*is 101.0, outside \[-100.0, 100.0\]", True, id="range"),
+    pytest.param(WrongDtype, "agent 'a', step 0: observation: dtype float64, expected float32", True, id="dtype"),
+    pytest.param(WrongShape, r"agent 'a', step 0: observation: shape \(2, 1\), expected \(2,\)", True, id="shape"),
+    pytest.param(IgnoredSeed, "step 0: two environments after reset with the same seed differ", True, id="reset"),
+    pytest.param(LateNoise, "step 2: two environments with the same seed and actions differ", True, id="step-2"),
     pytest.param(RunOn, "step 1: one environment run twice .* differ", True, id="run-on"),
     pytest.param(SharedSpace, "'a' and 'b' share one observation space object", True, id="shared-space"),
-    pytest.param(
-        SharedActionSpace, "'a' and 'b' share one action space object", True, id="shared-action-space"
-    ),
+    pytest.param(SharedActionSpace, "'a' and 'b' share one action space object", True, id="shared-action-space"),
     pytest.param(FreshSpace, "observation_space returned another object", False, id="fresh-space"),
     pytest.param(Buffer, "observations returned at step 0 changed", True, id="buffer"),
     pytest.param(SharedMemory, "'a' and 'b' share an observation's memory", True, id="shared-memory"),
     pytest.param(_with_part(1, np.nan), "agent 'b', step 3: reward nan is not finite", True, id="reward-nan"),
-    pytest.param(
-        _with_part(1, "much"), "agent 'b', step 3: reward 'much' is not a number", True, id="reward-str"
-    ),
+    pytest.param(_with_part(1, "much"), "agent 'b', step 3: reward 'much' is not a number", True, id="reward-str"),
     pytest.param(_with_part(2, 0), "agent 'b', step 3: termination 0 is not a bool", True, id="termination"),
-    pytest.param(
-        _with_part(3, None), "agent 'b', step 3: truncation None is not a bool", True, id="truncation"
-    ),
+    pytest.param(_with_part(3, None), "agent 'b', step 3: truncation None is not a bool", True, id="truncation"),
     pytest.param(MissingKey, r"step 1: infos have keys \['a'\]", False, id="missing-key"),
     pytest.param(ExtraKey, r"step 1: rewards have keys \['a', 'b', 'c'\]", False, id="extra-key"),
     pytest.param(Growing, r"step 3: agents \['b'\] joined", False, id="growing"),
     pytest.param(Mutating, "step 1: the actions were changed", True, id="mutating"),
     pytest.param(Undead, "step 8: done is True, but env.agents", False, id="undead"),
-    pytest.param(
-        NoRestart, "step 0: one environment reset twice with the same seed differ", True, id="no-restart"
-    ),
+    pytest.param(NoRestart, "step 0: one environment reset twice with the same seed differ", True, id="no-restart"),
 ]
 
 

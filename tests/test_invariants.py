@@ -96,9 +96,7 @@ def assert_batch_is_lone(network: Network, seed: int, reward: str) -> None:
         for i, env in enumerate(alone):
             observations, rewards, _, truncations, infos = env.step(lone(actions, i))
             for row, agent in enumerate(batch.agents):
-                np.testing.assert_array_equal(
-                    observations[agent], outcome.observation[batch.layout.slices[agent], i]
-                )
+                np.testing.assert_array_equal(observations[agent], outcome.observation[batch.layout.slices[agent], i])
                 assert rewards[agent] == outcome.reward[row, i]
                 assert infos[agent]["circularity"] == outcome.circularity[i]
                 assert infos[agent]["service_level"] == outcome.service_level[i]
@@ -147,9 +145,7 @@ def test_random_networks_conform(network: Network, seed: int) -> None:
     check_vector_env(lambda: VectorEnv(network, num_envs=2), steps=6, seed=seed)
 
 
-@given(
-    network=st.from_type(Network), seed=st.integers(0, 2**31), mode=st.sampled_from(["neighbours", "full"])
-)
+@given(network=st.from_type(Network), seed=st.integers(0, 2**31), mode=st.sampled_from(["neighbours", "full"]))
 def test_wider_observations_conform(network: Network, seed: int, mode: str) -> None:
     """DESIGN 5.6 in the other observation modes."""
     check_vector_env(lambda: VectorEnv(network, num_envs=2, observe=mode), steps=6, seed=seed)
@@ -227,8 +223,6 @@ def test_circularity_follows_from_the_roles(network: Network, seed: int) -> None
     signed = network.with_options(objective={"net_zero": "signed"})
     flow = np.random.default_rng(seed).random((len(network.arcs), 2))
     assert (network.circularity(np.zeros_like(flow)) == 0).all()
-    np.testing.assert_allclose(
-        signed.circularity(3 * flow), 3 * signed.circularity(flow), rtol=1e-12, atol=1e-12
-    )
+    np.testing.assert_allclose(signed.circularity(3 * flow), 3 * signed.circularity(flow), rtol=1e-12, atol=1e-12)
     through = network.objective.net_zero == "abs"
     assert not through or (network.circularity(flow) <= signed.circularity(flow) + 1e-12).all()

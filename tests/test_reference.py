@@ -84,9 +84,7 @@ def test_equilibrium_of_copper_net() -> None:
     """At u = 1 kt/d the set-points are the equilibrium, and λ = −5.28 kt."""
     network = load_network("copper_net", scenario="paper")
     env = VectorEnv(network, num_envs=1)
-    env.reset(
-        0, options={"initial_state": {n.id: n.set_point for n in network.nodes if n.set_point is not None}}
-    )
+    env.reset(0, options={"initial_state": {n.id: n.set_point for n in network.nodes if n.set_point is not None}})
     before = env.physical.stock[:-1].copy()
     outcome = env.advance(np.array([[1e-6]]))
     tracked = [network.node_index[node] for node in network.observation.nodes]

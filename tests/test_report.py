@@ -105,9 +105,7 @@ def test_catalogue_is_readable(name: str) -> None:
             assert (np.abs(layout.positions - label) > (layout.box + text) / 2).any(axis=1).all()
             others = np.delete(layout.routes.labels, arc, axis=0)
             assert (np.abs(others - label) > text).any(axis=1).all()
-        for curve, donor, recipient in zip(
-            layout.routes.curves, network.donors, network.recipients, strict=True
-        ):
+        for curve, donor, recipient in zip(layout.routes.curves, network.donors, network.recipients, strict=True):
             others = np.delete(layout.positions, [donor, recipient], axis=0)
             assert (np.abs(curve[:, None] - others) > layout.box / 2).any(axis=-1).all()
 
@@ -146,9 +144,7 @@ def test_opposite_arcs_keep_apart() -> None:
     network = cirl_marl.load_network("carbo_net")
     routes = layout_of(network, 1.4).routes
     assert routes is not None
-    there, back = (
-        routes.curves[network.arc_index[arc]] for arc in ("urban_to_adjacent", "adjacent_to_urban")
-    )
+    there, back = (routes.curves[network.arc_index[arc]] for arc in ("urban_to_adjacent", "adjacent_to_urban"))
     assert np.hypot(*(there[:, None] - back).T).min() > 1.5
 
 
@@ -156,9 +152,7 @@ def test_before_and_after(tmp_path: Path) -> None:
     """Two states stand side by side, with the wider arrow where the flow is larger."""
     network = cirl_marl.load_network("carbo_net")
     stock, flow = some_flows(network)
-    path = save_before_after(
-        tmp_path / "two.png", network, (stock, flow), (stock, 0.2 * flow), ("now", "then")
-    )
+    path = save_before_after(tmp_path / "two.png", network, (stock, flow), (stock, 0.2 * flow), ("now", "then"))
     image = read(path)[..., :3]
     vermilion = np.abs(image - np.array([0xD5, 0x5E, 0x00]) / 255).max(axis=-1) < 0.05
     half = image.shape[1] // 2
@@ -283,9 +277,7 @@ def test_learning_curves(tmp_path: Path, agents: int) -> None:
             read(path)
 
 
-@pytest.mark.parametrize(
-    "network", [lambda: cirl_marl.load_network("copper_net"), lambda: random_network(40, 90)]
-)
+@pytest.mark.parametrize("network", [lambda: cirl_marl.load_network("copper_net"), lambda: random_network(40, 90)])
 @pytest.mark.parametrize("steps", [1, 60])
 def test_trajectory(tmp_path: Path, network: Callable[[], Network], steps: int) -> None:
     """Stocks, flows and λ are drawn over time, for few compartments and many."""

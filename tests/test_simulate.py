@@ -138,9 +138,7 @@ def test_intervals_compose(network: Network) -> None:
     whole = ample(replace(network, arcs=arcs), 0.3)
     assume(stays_positive(whole, 0.3))
     mass = start(whole)[:-1].sum()
-    np.testing.assert_allclose(
-        advanced(whole), advanced(ample(whole, 0.15), steps=2), rtol=0, atol=1e-12 * mass
-    )
+    np.testing.assert_allclose(advanced(whole), advanced(ample(whole, 0.15), steps=2), rtol=0, atol=1e-12 * mass)
 
 
 def test_euler_is_of_first_order() -> None:
@@ -154,10 +152,7 @@ def test_euler_is_of_first_order() -> None:
     exact = advanced(network)
     errors = [
         np.abs(
-            advanced(
-                replace(network, episode=Episode(solver="euler", solver_step=step, control_interval=1.0))
-            )
-            - exact
+            advanced(replace(network, episode=Episode(solver="euler", solver_step=step, control_interval=1.0))) - exact
         ).max()
         for step in (1 / 64, 1 / 128, 1 / 256)
     ]
@@ -182,9 +177,7 @@ def test_overdrawn_donor_is_emptied(rate: float) -> None:
 
 def test_competing_orders_share_the_donor() -> None:
     """Orders that exceed the donor's stock are cut in the same proportion."""
-    network = small(
-        {"a": 12.0, "b": 0.0, "c": 0.0}, [order("much", "a", "b", 300.0), order("little", "a", "c", 100.0)]
-    )
+    network = small({"a": 12.0, "b": 0.0, "c": 0.0}, [order("much", "a", "b", 300.0), order("little", "a", "c", 100.0)])
     np.testing.assert_allclose(advanced(network), [0.0, 9.0, 3.0], rtol=1e-11, atol=1e-10)
 
 
@@ -199,9 +192,7 @@ def test_recipient_on_exhausted_reservoir() -> None:
     arc = Arc(id="pull", donor="reserve", recipient="plant", law=Law.RECIPIENT, rate=0.5)
     nodes = (
         Node(id="reserve", role=Role.NONRENEWABLE_RESERVOIR, initial=(3.0, 3.0)),
-        Node(
-            id="plant", initial=(10.0, 10.0), control=Control(kind=ControlKind.RATE, low=0, neutral=1, high=1)
-        ),
+        Node(id="plant", initial=(10.0, 10.0), control=Control(kind=ControlKind.RATE, low=0, neutral=1, high=1)),
     )
     network = Network(name="small", nodes=nodes, arcs=(arc,), episode=Episode(horizon=4))
     env = VectorEnv(network, num_envs=1)
@@ -216,9 +207,7 @@ def test_recipient_on_exhausted_reservoir() -> None:
     assert env.state()[0, :2].sum() == pytest.approx(13.0, rel=1e-14)
 
 
-@given(
-    gaps=st.lists(st.floats(0.01, 2), max_size=6), interval=st.floats(0.05, 2), seed=st.integers(0, 2**32 - 1)
-)
+@given(gaps=st.lists(st.floats(0.01, 2), max_size=6), interval=st.floats(0.05, 2), seed=st.integers(0, 2**32 - 1))
 def test_series_means_are_exact(gaps: list[float], interval: float, seed: int) -> None:
     """What an exogenous series moves in an interval is its integral over it."""
     times = np.array([0.0, *np.cumsum(gaps)])
@@ -238,8 +227,7 @@ def test_hundred_thousand_compartments() -> None:
     rates, stocks, ends = rng.uniform(0.1, 0.9, size), rng.uniform(0, 10, size), rng.integers(1, size, size)
     valve = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
     nodes = tuple(
-        Node(id=f"n{i}", initial=(float(x), float(x)), control=valve if i < 3 else None)
-        for i, x in enumerate(stocks)
+        Node(id=f"n{i}", initial=(float(x), float(x)), control=valve if i < 3 else None) for i, x in enumerate(stocks)
     )
     arcs = tuple(
         Arc(id=f"a{i}", donor=f"n{i}", recipient=f"n{(i + int(hop)) % size}", rate=float(rate))
@@ -264,6 +252,15 @@ def test_recipient_passes_on_only_what_it_got() -> None:
         Arc(id="out", donor="plant", recipient="sink", rate=0.09),
     ]
     stock = advanced(small({"reserve": 0.0, "plant": 10.0, "sink": 0.0}, arcs))
-    np.testing.assert_allclose(
-        stock, [0.0, 10 * math.exp(-0.09), -10 * math.expm1(-0.09)], rtol=1e-11, atol=1e-12
-    )
+    np.testing.assert_allclose(stock, [0.0, 10 * math.exp(-0.09), -10 * math.expm1(-0.09)], rtol=1e-11, atol=1e-12)
+
+
+def test_exhausted_reservoir_stays_exhausted() -> None:
+    """Emptied again and again, a stock may become subnormal, where shares do not round as they should."""
+    rates = (1.4115465964017506, 3.65622291933343, 2.845279648320207)
+    arcs = [Arc(id=f"a{k}", donor="r", recipient=f"p{k}", law=Law.RECIPIENT, rate=r) for k, r in enumerate(rates)]
+    for stock in (3.0, 1e-289, 1e-300, 1.5e-322, 5e-324):
+        nodes = {"r": stock, "p0": 10.0, "p1": 0.5, "p2": 3.0}
+        after = advanced(small(nodes, arcs, interval=0.48504374067280137, horizon=40), steps=40)
+        assert 0 <= after[0] <= stock
+        assert after.sum() == pytest.approx(13.5 + stock, rel=1e-14)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import inspect
 from collections.abc import Mapping
@@ -89,7 +90,7 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         RecipeError: for unknown parameters or values that the algorithm refuses.
     """
     checked_parameters(name, parameters)
-    arguments = dict(parameters)
+    arguments = copy.deepcopy(dict(parameters))  # the library writes into policy_kwargs
     rate = arguments.get("learning_rate")
     if isinstance(rate, Mapping):
         arguments["learning_rate"] = get_linear_fn(rate["linear_from"], rate["linear_to"], 1.0)

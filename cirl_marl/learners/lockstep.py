@@ -23,7 +23,7 @@ from cirl_marl.vector_env import Infos, VectorEnv
 StepHook = Callable[[Infos, NDArray[np.bool_]], None]
 
 
-class Interrupted(Exception):  # noqa: N818 (it is a request, not an error)
+class Interrupted(Exception):
     """Raised by a step hook to end training early; what was learnt is kept."""
 
 

@@ -85,9 +85,7 @@ class RunConfig:
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> RunConfig:
         """Read what ``as_dict`` returned."""
-        return cls(
-            **{**plain, "agents": tuple(plain["agents"]), "recipe": Recipe.model_validate(plain["recipe"])}
-        )
+        return cls(**{**plain, "agents": tuple(plain["agents"]), "recipe": Recipe.model_validate(plain["recipe"])})
 
 
 class RunDirectory:
@@ -147,7 +145,7 @@ class RunDirectory:
         name = self.status["checkpoint"]
         if name is None:
             raise RunError(f"{self.path}: nothing was saved in this run yet (state: {self.status['state']})")
-        folder = self.path / "checkpoints" / name
+        folder: Path = self.path / "checkpoints" / name
         missing = [agent for agent in self.config.agents if not (folder / f"{agent}.zip").is_file()]
         if missing:
             raise RunError(f"{folder}: the checkpoint lacks the policies of {', '.join(missing)}")
@@ -169,15 +167,13 @@ class RunDirectory:
 
     def save_checkpoint(self, joint_steps: int, write: Callable[[Path], None], state: str, reason: str = "") -> None:
         """Let ``write`` fill a new checkpoint folder, then make it the one that counts and drop the older ones."""
-        folder = self.path / "checkpoints" / f"{joint_steps:09d}"
-        previous = self.status["checkpoint"]
-        if previous != folder.name:
-            partial = folder.with_name(folder.name + ".partial")
-            shutil.rmtree(partial, ignore_errors=True)
-            shutil.rmtree(folder, ignore_errors=True)
-            partial.mkdir(parents=True)
-            write(partial)
-            partial.replace(folder)
+        folder = self.path / "checkpoints" / f"{joint_steps:09d}-{state}"
+        partial = folder.with_name(folder.name + ".partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        write(partial)
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.replace(folder)
         self.set_status(state, joint_steps, folder.name, reason)
         for other in folder.parent.iterdir():
             if other != folder:

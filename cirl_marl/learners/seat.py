@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn
 
-from cirl_marl.elements import Arc, Node
+from cirl_marl.elements import Compartment
 from cirl_marl.errors import CirlError
 from cirl_marl.vector_env import VectorEnv
 
@@ -29,7 +29,7 @@ class AgentView:
         self.index = index
 
     @property
-    def compartment(self) -> Node | Arc:
+    def compartment(self) -> Compartment:
         """The compartment that the agent is."""
         return self.env.network.compartments[self.agent]
 
@@ -46,8 +46,8 @@ class Seat(VecEnv):
     """The B copies of the joint environment as one agent sees them.
 
     Time limits reach the learner as Stable-Baselines3 expects them: ``done`` with ``TimeLimit.truncated`` and the true
-    last observation in ``terminal_observation``. A ``reset`` while the joint episode runs (ARS asks for one) cannot stop
-    the others: it returns the current observation.
+    last observation in ``terminal_observation``. A ``reset`` while the joint episode runs (ARS asks for one) cannot
+    stop the others: it returns the current observation.
 
     Attributes:
         agent: whose seat it is.
@@ -84,24 +84,24 @@ class Seat(VecEnv):
         """Do nothing: every copy of the joint environment has its own seed already."""
         return [seed] * self.num_envs
 
-    def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Return an attribute of the agent's view in the given copies."""
         return [getattr(view, attr_name) for view in self._chosen(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Set an attribute of the agent's view in the given copies."""
         for view in self._chosen(indices):
             setattr(view, attr_name, value)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: None | int | Iterable[int] = None, **method_kwargs: Any
+        self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of the agent's view in the given copies."""
         return [getattr(view, method_name)(*method_args, **method_kwargs) for view in self._chosen(indices)]
 
-    def env_is_wrapped(self, wrapper_class: type, indices: None | int | Iterable[int] = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:
         """Return False for each copy: no Gymnasium wrapper is involved."""
         return [False for _ in self._chosen(indices)]
 
-    def _chosen(self, indices: None | int | Iterable[int]) -> list[AgentView]:
+    def _chosen(self, indices: int | Iterable[int] | None) -> list[AgentView]:
         return [self.views[i] for i in self._get_indices(indices)]

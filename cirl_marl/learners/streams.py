@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
+from numpy.random.mtrand import get_bit_generator, set_bit_generator
 from stable_baselines3.common.utils import set_random_seed
 
 
@@ -30,7 +31,7 @@ class Streams:
             self._leave()
             return
         with global_streams_kept():
-            np.random.set_bit_generator(np.random.MT19937())
+            set_bit_generator(np.random.MT19937())
             set_random_seed(seed)
             torch.set_grad_enabled(True)
             self._leave()
@@ -53,15 +54,15 @@ class Streams:
     def _leave(self) -> None:
         self._torch = torch.get_rng_state()
         self._grad = torch.is_grad_enabled()
-        self._numpy = np.random.get_bit_generator()
-        self._numpy_state = np.random.get_state(legacy=False) if self.keep_gaussian else None
+        self._numpy = get_bit_generator()
+        self._numpy_state = np.random.get_state(legacy=False) if self.keep_gaussian else None  # noqa: NPY002 (Stable-Baselines3 draws from it)
 
     def _enter(self) -> None:
         torch.set_rng_state(self._torch)
         torch.set_grad_enabled(self._grad)
-        np.random.set_bit_generator(self._numpy)
+        set_bit_generator(self._numpy)
         if self._numpy_state is not None:
-            np.random.set_state(self._numpy_state)
+            np.random.set_state(self._numpy_state)  # noqa: NPY002
 
 
 @contextmanager

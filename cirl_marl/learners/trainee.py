@@ -83,7 +83,7 @@ class Trainee:
         return self
 
     def budget(self, steps: int) -> int:
-        """Joint steps after which it is stopped if it has not stopped itself; only ARS, which counts otherwise, needs it."""
+        """Joint steps after which it is stopped; only ARS, which counts otherwise, does not stop by itself."""
         if isinstance(self.model, ARS):
             return math.ceil(steps * self.spec.share_of_steps / self.seat.num_envs)
         return 2**62

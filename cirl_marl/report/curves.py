@@ -131,9 +131,7 @@ def save_trajectory(
     figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
     above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.25, 0.8))
     _draw_largest(above, time, stock, [node.id for node in network.nodes], "Stocks", mass)
-    _draw_largest(
-        middle, time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}"
-    )
+    _draw_largest(middle, time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}")
     below.plot(time, circularity, color=SERIES[0], linewidth=1.8, marker=_dots(time))
     dressed(below, title="Circularity", ylabel=f"λ / {mass}")
     _set_time(below, time, network)
@@ -208,9 +206,7 @@ def _smoothed(values: Floats, window: int) -> Floats:
     return mean
 
 
-def _draw_largest(
-    axes: Axes, time: Floats, values: Floats, names: Sequence[str], title: str, unit: str
-) -> None:
+def _draw_largest(axes: Axes, time: Floats, values: Floats, names: Sequence[str], title: str, unit: str) -> None:
     """Draw the rows that change most, with a legend beside the panel."""
     change = np.ptp(values, axis=1) if values.size else np.zeros(len(values))
     kept = np.sort(np.argsort(-change, kind="stable")[:SHOWN])

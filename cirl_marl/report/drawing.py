@@ -135,9 +135,7 @@ def _colours(network: Network) -> list[str]:
     return [WARNING if sign > 0 else GOOD if sign < 0 else NEUTRAL for sign in network.sustainability]
 
 
-def _draw_arrows(
-    axes: Axes, network: Network, routes: Routes, flow: Floats, share: Floats, em: float
-) -> None:
+def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, share: Floats, em: float) -> None:
     colours = _colours(network)
     shapes = [
         _arrow(curve if value >= 0 else curve[::-1], WIDEST * size)
@@ -173,14 +171,10 @@ def _draw_boxes(axes: Axes, network: Network, layout: Layout, stock: Floats, em:
     for node, (x, y), amount, name in zip(network.nodes, layout.positions, stock, layout.names, strict=True):
         corner, colour = (x - width / 2, y - height / 2), ROLE_COLOURS[node.role]
         look = f"round,pad=0,rounding_size={0.5}"
-        axes.add_patch(
-            FancyBboxPatch(corner, width, height, look, fc=_tint(colour, 0.25), ec="none", zorder=3)
-        )
+        axes.add_patch(FancyBboxPatch(corner, width, height, look, fc=_tint(colour, 0.25), ec="none", zorder=3))
         level = Rectangle(corner, width, height * _fill(amount, node.scale), fc=colour, ec="none", zorder=3.1)
         axes.add_patch(level)
-        edge = FancyBboxPatch(
-            corner, width, height, look, fc="none", ec=_darker(colour), lw=0.1 * em, zorder=3.2
-        )
+        edge = FancyBboxPatch(corner, width, height, look, fc="none", ec=_darker(colour), lw=0.1 * em, zorder=3.2)
         axes.add_patch(edge)
         level.set_clip_path(edge)
         top = y + 0.6 * len(name)
@@ -232,7 +226,5 @@ def _write_title(axes: Axes, network: Network, flow: Floats, title: str) -> None
         value = number(float(network.circularity(flow)))
     heading = title or network.title or spoken(network.name)
     below = f"λ = {value} {network.mass_unit}    flows in {network.mass_unit}/{network.time_unit}"
-    axes.text(
-        0.5, 1.075, heading, transform=axes.transAxes, fontsize=11, fontweight="bold", color=INK, ha="center"
-    )
+    axes.text(0.5, 1.075, heading, transform=axes.transAxes, fontsize=11, fontweight="bold", color=INK, ha="center")
     axes.text(0.5, 1.02, below, transform=axes.transAxes, fontsize=9.5, color=MUTED, ha="center")

@@ -100,9 +100,7 @@ def layered(network: Network, pitch: Pitch, aspect: float) -> Floats:
     height = np.zeros(count)
     for level in range(int(depth.max()) + 1):
         _spread(height, np.flatnonzero(depth == level))
-    neighbours = np.bincount(network.donors, minlength=count) + np.bincount(
-        network.recipients, minlength=count
-    )
+    neighbours = np.bincount(network.donors, minlength=count) + np.bincount(network.recipients, minlength=count)
     for _ in range(4):
         total = np.bincount(network.donors, height[network.recipients], count)
         total += np.bincount(network.recipients, height[network.donors], count)
@@ -138,9 +136,7 @@ def _in_columns(depth: Integers, height: Floats, rows: int) -> Floats:
 
 def _without_gaps(cells: Floats) -> Floats:
     """Close empty rows and columns."""
-    return np.stack([np.unique(cells[:, axis], return_inverse=True)[1] for axis in (0, 1)], axis=1).astype(
-        float
-    )
+    return np.stack([np.unique(cells[:, axis], return_inverse=True)[1] for axis in (0, 1)], axis=1).astype(float)
 
 
 class _Search:
@@ -170,8 +166,7 @@ class _Search:
         order = np.lexsort((seed[:, 1], seed[:, 0]))
         starts = [np.argsort(order)]
         starts += [
-            random.permutation(len(self._grid))[: self._count]
-            for _ in range(RESTARTS // max(1, self._count // 8))
+            random.permutation(len(self._grid))[: self._count] for _ in range(RESTARTS // max(1, self._count // 8))
         ]
         found = [self._descend(start) for start in starts]
         cells = min(found, key=lambda pair: pair[0])[1]
@@ -204,9 +199,7 @@ class _Search:
         points = cells * self._unit
         start, end = points[:, self._edges[:, 0]], points[:, self._edges[:, 1]]
         length = np.hypot(*np.moveaxis(end - start, -1, 0))
-        crossings = _cross(
-            start[:, self._first], end[:, self._first], start[:, self._second], end[:, self._second]
-        )
+        crossings = _cross(start[:, self._first], end[:, self._first], start[:, self._second], end[:, self._second])
         backwards = np.maximum(cells[:, self._donors, 0] - cells[:, self._recipients, 0], 0)
         span = cells[..., 0] * self._pull + cells[..., 1] * self._upward
         middle = np.abs(cells[..., 1] - (self._rows - 1) / 2)

@@ -39,11 +39,7 @@ def bezier(start: Floats, end: Floats, bend: Floats, points: int) -> Floats:
     right = np.stack([along[..., 1], -along[..., 0]], axis=-1)
     control = (start + end) / 2 + right * np.asarray(bend)[..., None]
     share = np.linspace(0, 1, points)[:, None]
-    return (
-        (1 - share) ** 2 * start[:, None]
-        + 2 * share * (1 - share) * control[:, None]
-        + share**2 * end[:, None]
-    )
+    return (1 - share) ** 2 * start[:, None] + 2 * share * (1 - share) * control[:, None] + share**2 * end[:, None]
 
 
 def route(positions: Floats, donors: Integers, recipients: Integers, box: Floats) -> Routes:

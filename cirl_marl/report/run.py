@@ -11,7 +11,7 @@ import numpy as np
 from cirl_marl.controllers import Controller, Neutral, Random
 from cirl_marl.controllers.trained import Trained
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.evaluate import EVALUATION_SEEDS, Rollout, rollout, summary
+from cirl_marl.evaluate import EVALUATION_SEEDS, Rollout, interval_ends, rollout, summary
 from cirl_marl.learners.run import RunDirectory, write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
 from cirl_marl.report.digraph import save_before_after
@@ -79,7 +79,7 @@ def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv)
         (after.final_stock, after.mean_flow),
         ("neutral", "trained"),
     )
-    time = (np.arange(network.episode.horizon) + 1.0) * network.episode.control_interval
+    time = interval_ends(network)
     circularity = folder / "circularity.png"
     save_circularity(
         circularity,

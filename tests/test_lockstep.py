@@ -1,0 +1,252 @@
+"""The bridge between one coupled environment and many learners: seats, lockstep, random streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from cirl_marl import LearnerError, VectorEnv
+from cirl_marl.learners.lockstep import Interrupted, Lockstep
+from cirl_marl.learners.seat import Seat
+from cirl_marl.learners.streams import Streams
+
+HORIZON = 5
+COPIES = 3
+
+
+def make_lockstep(agents: list[str] | None = None) -> Lockstep:
+    """Seat the agents of a short copper_net."""
+    env = VectorEnv("copper_net", num_envs=COPIES, agents=agents, horizon=HORIZON)
+    return Lockstep(env, seeds=[11, 12, 13])
+
+
+def scripted(seat: Seat, steps: int, seen: list[VecEnvStepReturn], value: float = 0.0) -> Callable[[], None]:
+    """Return a learner that takes a fixed action for some steps and notes what comes back."""
+
+    def run() -> None:
+        seat.reset()
+        for _ in range(steps):
+            seen.append(seat.step(np.full((COPIES, 1), value, dtype=np.float32)))
+
+    return run
+
+
+def hold(seat: Seat) -> Callable[[], None]:
+    """Return an actor that holds action 0 for ever."""
+
+    def run() -> None:
+        while True:
+            seat.step(np.zeros((COPIES, 1), dtype=np.float32))
+
+    return run
+
+
+def run_scripted(lockstep: Lockstep, steps: dict[str, int], **options: Any) -> dict[str, list[VecEnvStepReturn]]:
+    """Run scripted learners for the given numbers of steps."""
+    seen: dict[str, list[VecEnvStepReturn]] = {agent: [] for agent in lockstep.seats}
+    lockstep.run(
+        learners={a: scripted(s, steps[a], seen[a]) for a, s in lockstep.seats.items()},
+        actors={a: hold(s) for a, s in lockstep.seats.items()},
+        streams={a: Streams(i) for i, a in enumerate(lockstep.seats)},
+        budgets=dict.fromkeys(lockstep.seats, 10**6),
+        **options,
+    )
+    return seen
+
+
+def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
+    """Every seat sees exactly what ``VectorEnv`` gives its agent, and the true last observation at a time limit."""
+    lockstep = make_lockstep()
+    first = {agent: seat.latest for agent, seat in lockstep.seats.items()}
+    seen = run_scripted(lockstep, dict.fromkeys(lockstep.seats, HORIZON + 2))
+    env = VectorEnv("copper_net", num_envs=COPIES, horizon=HORIZON)
+    by_hand = env.reset(seed=[11, 12, 13])
+    actions = {agent: np.zeros((COPIES, 1)) for agent in env.agents}
+    assert all(np.array_equal(np.asarray(first[agent]), by_hand[agent]) for agent in env.agents)
+    for t in range(HORIZON + 2):
+        observations, rewards, _, truncations, infos = env.step(actions)
+        for agent in env.agents:
+            observation, reward, done, info = seen[agent][t]
+            assert np.array_equal(np.asarray(observation), observations[agent])
+            assert np.array_equal(reward, rewards[agent].astype(np.float32))
+            assert np.array_equal(done, truncations[agent])
+            for copy in range(COPIES):
+                assert info[copy].get("TimeLimit.truncated", False) == bool(done[copy])
+                if done[copy]:
+                    final = infos[agent]["final_observation"][copy]
+                    assert np.array_equal(info[copy]["terminal_observation"], final)
+                    assert not np.array_equal(final, observations[agent][copy])
+
+
+def test_copies_have_their_own_seeds() -> None:
+    """SuperSuit's bridge gives all copies one stream; here no two copies start alike."""
+    lockstep = make_lockstep()
+    starts = np.asarray(lockstep.seats["use"].latest)
+    assert len(np.unique(starts[:, 0])) == COPIES
+
+
+def test_seeded_algorithm_can_be_built_on_a_seat() -> None:
+    """With SuperSuit's bridge ``PPO(seed=…)`` raises; here it works and does not reseed the environment."""
+    lockstep = make_lockstep()
+    before = np.asarray(lockstep.seats["use"].latest).copy()
+    with Streams(0).active():
+        model = PPO("MlpPolicy", lockstep.seats["use"], seed=3, device="cpu")
+    assert model.seed == 3
+    assert np.array_equal(np.asarray(lockstep.seats["use"].latest), before)
+
+
+def test_truncation_bootstraps() -> None:
+    """SuperSuit's bridge never reports truncation; here PPO adds the value of the final observation."""
+    lockstep = make_lockstep(["use"])
+    seat = lockstep.seats["use"]
+    streams = Streams(0)
+    with streams.active():
+        model = PPO("MlpPolicy", seat, n_steps=HORIZON, batch_size=HORIZON * COPIES, seed=0, device="cpu", gamma=0.9)
+    finals: list[np.ndarray] = []
+    plain: list[np.ndarray] = []
+
+    def note(infos: Any, done: np.ndarray) -> None:
+        if done.any():
+            finals.append(infos["use"]["final_observation"].copy())
+            plain.append(infos["use"]["local_reward"].copy())
+
+    rewards: list[np.ndarray] = []
+    values: list[np.ndarray] = []
+
+    def learn() -> None:
+        learner = model.learn(HORIZON * COPIES)
+        rewards.append(learner.rollout_buffer.rewards[-1].copy())
+
+    original = model.train
+
+    def keep_values() -> None:
+        with torch.no_grad():
+            final = torch.as_tensor(finals[0])
+            values.append(model.policy.predict_values(final).numpy()[:, 0])
+        original()
+
+    model.train = keep_values  # type: ignore[method-assign]
+    last: list[np.ndarray] = []
+
+    def hook(infos: Any, done: np.ndarray) -> None:
+        note(infos, done)
+        if done.any():
+            last.append(np.asarray(lockstep._outcomes["use"][1]).copy())
+
+    lockstep.run({"use": learn}, {"use": hold(seat)}, {"use": streams}, {"use": 10**6}, hook)
+    assert np.allclose(rewards[0], last[0] + 0.9 * values[0], atol=1e-4)
+    assert np.all(np.abs(values[0]) > 0)
+
+
+def test_learners_of_different_length_finish_and_go_on_acting() -> None:
+    """A learner that is done acts until the last one is done."""
+    lockstep = make_lockstep(["mine", "use", "sorting"])
+    seen = run_scripted(lockstep, {"mine": 3, "use": 11, "sorting": 7})
+    assert {agent: len(steps) for agent, steps in seen.items()} == {"mine": 3, "use": 11, "sorting": 7}
+    assert lockstep.joint_steps == 11
+
+
+def test_failing_learner_is_named() -> None:
+    """The error says whose learner failed and when; the others are ended."""
+    lockstep = make_lockstep(["mine", "use"])
+    ended: list[str] = []
+
+    def fails() -> None:
+        for _ in range(4):
+            lockstep.seats["mine"].step(np.zeros((COPIES, 1), dtype=np.float32))
+        raise ValueError("exploded")
+
+    def steady() -> None:
+        try:
+            hold(lockstep.seats["use"])()
+        finally:
+            ended.append("use")
+
+    with pytest.raises(LearnerError, match=r"agent 'mine' failed at joint step 4: ValueError\('exploded'\)"):
+        lockstep.run(
+            {"mine": fails, "use": steady},
+            {a: hold(s) for a, s in lockstep.seats.items()},
+            {"mine": Streams(0), "use": Streams(1)},
+            {"mine": 10**6, "use": 10**6},
+        )
+    assert ended == ["use"]
+
+
+def test_hook_can_stop_everything() -> None:
+    """``Interrupted`` ends all learners cleanly."""
+    lockstep = make_lockstep(["mine", "use"])
+
+    def stop(infos: Any, done: np.ndarray) -> None:
+        if lockstep.joint_steps == 4:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        run_scripted(lockstep, {"mine": 100, "use": 100}, hook=stop)
+    assert lockstep.joint_steps == 4
+
+
+def test_rewards_are_each_agents_own() -> None:
+    """PPO changes its rewards in place; nobody else may see that."""
+    lockstep = make_lockstep(["mine", "use"])
+    seen = run_scripted(lockstep, {"mine": 2, "use": 2})
+    assert not np.shares_memory(seen["mine"][0][1], seen["use"][0][1])
+    assert not np.shares_memory(np.asarray(seen["mine"][0][0]), np.asarray(seen["mine"][1][0]))
+
+
+def test_env_method_and_attributes_reach_the_agent() -> None:
+    """HER calls ``env_method``; it reaches the agent's view of the chosen copies, and through it the environment."""
+    lockstep = make_lockstep()
+    seat = lockstep.seats["use"]
+    rewards = seat.env_method("local_reward", indices=[0, 2])
+    expected = lockstep.env.local_rewards()["use"]
+    assert rewards == [expected[0], expected[2]]
+    assert seat.get_attr("compartment")[0] is lockstep.env.network.compartments["use"]
+    assert seat.get_attr("network", indices=1) == [lockstep.env.network]
+    seat.set_attr("note", "here", indices=[1])
+    assert seat.get_attr("note", indices=[1]) == ["here"]
+    assert seat.env_is_wrapped(object) == [False] * COPIES
+    with pytest.raises(AttributeError):
+        seat.env_method("no_such_method")
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_streams_are_private(keep: bool) -> None:
+    """Draws in one set of streams do not show in another, nor in the caller's, and the gradient mode stays apart."""
+    torch.manual_seed(5)
+    np.random.seed(5)  # noqa: NPY002 (the legacy stream is the subject)
+    expected = (torch.rand(3), np.random.rand(3))  # noqa: NPY002
+    torch.manual_seed(5)
+    np.random.seed(5)  # noqa: NPY002
+    one, other = Streams(1, keep_gaussian=keep), Streams(2, keep_gaussian=keep)
+    with one.active():
+        first = torch.rand(2)
+        torch.set_grad_enabled(False)
+    with other.active():
+        torch.rand(100)
+        np.random.rand(100)  # noqa: NPY002
+        assert torch.is_grad_enabled()
+    with one.active():
+        second = torch.rand(2)
+        assert not torch.is_grad_enabled()
+    with Streams(1).active():
+        assert torch.equal(torch.rand(4), torch.cat([first, second]))
+    assert torch.equal(torch.rand(3), expected[0])
+    assert np.array_equal(np.random.rand(3), expected[1])  # noqa: NPY002
+
+
+def test_cached_gaussian_survives_a_switch() -> None:
+    """NumPy hands out Gaussians in pairs; the second of a pair is not lost with ``keep_gaussian``."""
+    with Streams(1).active():
+        expected = [np.random.normal() for _ in range(4)]  # noqa: NPY002
+    streams = Streams(1, keep_gaussian=True)
+    drawn = []
+    for _ in range(4):
+        with streams.active():
+            drawn.append(np.random.normal())  # noqa: NPY002
+    assert drawn == expected

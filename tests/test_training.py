@@ -1,0 +1,339 @@
+"""Training runs: determinism, every algorithm at once, failure, interruption, resumption, what is kept."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+import cirl_marl
+from cirl_marl import Arc, Control, ControlKind, LearnerError, Network, Node, RunError, VectorEnv
+from cirl_marl.controllers.trained import Trained
+from cirl_marl.elements import Episode, Law
+from cirl_marl.learners import Recipe, RunDirectory, Training, resume, train
+from cirl_marl.learners.recipe import Learner, Match, Run
+from cirl_marl.learners.seat import Seat
+from cirl_marl.learners.trainee import derived_seed
+
+PPO_PARAMETERS: dict[str, Any] = {"n_steps": 10, "batch_size": 20, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
+OFF_POLICY = {
+    "buffer_size": 1000,
+    "learning_starts": 10,
+    "batch_size": 8,
+    "train_freq": 2,
+    "policy_kwargs": {"net_arch": [8]},
+}
+MIXED: dict[str, dict[str, Any]] = {
+    "PPO": PPO_PARAMETERS,
+    "A2C": {"n_steps": 7, "policy_kwargs": {"net_arch": [8]}},
+    "SAC": OFF_POLICY,
+    "TD3": OFF_POLICY | {"action_noise": {"kind": "normal", "sigma": 0.1}},
+    "DDPG": OFF_POLICY | {"action_noise": {"kind": "ornstein_uhlenbeck", "sigma": 0.1}},
+    "TQC": OFF_POLICY,
+    "CrossQ": OFF_POLICY,
+    "ARS": {"n_delta": 2},
+    "TRPO": {"n_steps": 10, "batch_size": 20, "policy_kwargs": {"net_arch": [8]}},
+    "RecurrentPPO": {
+        "n_steps": 10,
+        "batch_size": 20,
+        "policy_kwargs": {"net_arch": [8], "lstm_hidden_size": 4},
+    },
+}
+
+
+def recipe(learner: Learner, match: list[Match] | None = None) -> Recipe:
+    """Return a small recipe."""
+    return Recipe(name="test", title="test", run=Run(steps=80, envs=2), learner=learner, match=match or [])
+
+
+def ppo_recipe(**changes: Any) -> Recipe:
+    """Return a small PPO recipe."""
+    return recipe(Learner(algorithm="PPO", parameters=PPO_PARAMETERS, **changes))
+
+
+def mixed_recipe() -> Recipe:
+    """Return a recipe in which the first agents of copper_net learn with ten different algorithms."""
+    agents = cirl_marl.load_network("copper_net").agents
+    matches = [
+        Match(agents=[agent], algorithm=name, parameters=MIXED[name], policy=policy_of(name))
+        for agent, name in zip(agents, MIXED, strict=False)
+    ]
+    return recipe(Learner(algorithm="PPO", parameters=PPO_PARAMETERS), matches)
+
+
+def policy_of(name: str) -> str:
+    """Return the policy class that an algorithm needs."""
+    return "MlpLstmPolicy" if name == "RecurrentPPO" else "MlpPolicy"
+
+
+def weights(training: Training) -> dict[str, torch.Tensor]:
+    """Return every parameter of every policy."""
+    return {
+        f"{agent}.{name}": value.clone()
+        for agent, trainee in training.trainees.items()
+        for name, value in trainee.model.policy.state_dict().items()
+    }
+
+
+def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+    """Require bit-identical parameters."""
+    assert one.keys() == other.keys()
+    assert [name for name in one if not torch.equal(one[name], other[name])] == []
+
+
+def test_ten_algorithms_in_one_run_are_reproducible() -> None:
+    """The same seed gives bit-identical weights, for on-policy, off-policy and evolutionary learners side by side."""
+    first = train("copper_net", mixed_recipe(), seed=4, horizon=10)
+    names = {type(trainee.model).__name__ for trainee in first.trainees.values()}
+    assert names == set(MIXED)
+    again = train("copper_net", mixed_recipe(), seed=4, horizon=10)
+    assert_same(weights(first), weights(again))
+    other = train("copper_net", mixed_recipe(), seed=5, horizon=10)
+    assert any(not torch.equal(value, weights(other)[name]) for name, value in weights(first).items())
+
+
+def test_every_algorithm_learns_something() -> None:
+    """Training changes the weights of each learner, so none of them was starved or left out."""
+    settings = {"seed": 0, "horizon": 10}
+    before = train("copper_net", mixed_recipe(), steps=1, **settings)  # type: ignore[arg-type]
+    after = train("copper_net", mixed_recipe(), steps=200, **settings)  # type: ignore[arg-type]
+    start, end = weights(before), weights(after)
+    for agent in after.env.agents:
+        changed = [name for name in start if name.startswith(f"{agent}.") and not torch.equal(start[name], end[name])]
+        assert changed, f"{agent} ({type(after.trainees[agent].model).__name__}) did not change"
+
+
+class Draws(BaseCallback):
+    """A callback that draws from its own generator and evaluates in another environment."""
+
+    def __init__(self) -> None:
+        """Make the other environment."""
+        super().__init__()
+        self.env = VectorEnv("copper_net", num_envs=2, horizon=5)
+        self.calls = 0
+
+    def _on_step(self) -> bool:
+        self.calls += 1
+        self.env.reset(seed=0)
+        assert self.model is not None
+        self.model.predict(np.zeros((2, *self.training_env.observation_space.shape)), deterministic=True)  # type: ignore[misc]
+        return True
+
+
+def test_callbacks_and_evaluations_do_not_change_what_is_learnt() -> None:
+    """Weights are the same with a callback attached and with global draws between joint steps."""
+    plain = train("copper_net", ppo_recipe(), seed=1, horizon=10)
+    callback = Draws()
+
+    def report(_: object) -> None:
+        np.random.rand(3)  # noqa: NPY002 (the legacy stream is the subject)
+        torch.rand(3)
+
+    watched = train("copper_net", ppo_recipe(), seed=1, horizon=10, callbacks={"use": callback}, report=report)
+    assert callback.calls == 40
+    assert_same(weights(plain), weights(watched))
+
+
+def two_chains() -> Network:
+    """Two chains without a connection, one agent in each."""
+    valve = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
+    nodes, arcs = [], []
+    for name in ("a", "b"):
+        nodes += [
+            Node(id=f"{name}_from", initial=(5.0, 10.0), set_point=3.0),
+            Node(id=f"{name}_to", initial=(0.0, 1.0)),
+        ]
+        arcs.append(
+            Arc(
+                id=name,
+                donor=f"{name}_from",
+                recipient=f"{name}_to",
+                law=Law.DONOR,
+                rate=0.3,
+                control=valve,
+                set_point=1.0,
+            )
+        )
+    return Network(
+        name="two_chains",
+        nodes=tuple(nodes),
+        arcs=tuple(arcs),
+        episode=Episode(control_interval=0.5, horizon=10),
+    )
+
+
+class Alone(Seat):
+    """The seat of a lone agent that steps its environment itself."""
+
+    def __init__(self, env: VectorEnv, seeds: list[int]) -> None:
+        """Seat the only agent of ``env``."""
+        self.joint = env
+        super().__init__(env, env.agents[0], self._step_alone)
+        self.latest = np.ascontiguousarray(env.reset(seed=seeds)[self.agent])
+
+    def _step_alone(self, _: Seat) -> VecEnvStepReturn:
+        assert self.action is not None
+        observations, rewards, _terminations, truncations, infos = self.joint.step({self.agent: self.action})
+        self.latest = np.ascontiguousarray(observations[self.agent])
+        done = truncations[self.agent]
+        details: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for copy in np.flatnonzero(done):
+            final = infos[self.agent]["final_observation"][copy].copy()
+            details[copy] = {"TimeLimit.truncated": True, "terminal_observation": final}
+        return self.latest, rewards[self.agent].astype(np.float32), done, details
+
+
+def test_lockstep_equals_plain_learning_where_agents_do_not_meet() -> None:
+    """On chains that are not connected, learning together gives the bits of plain ``PPO.learn()`` alone."""
+    together = train(two_chains(), ppo_recipe(), seed=3, reward="local")
+    alone = train(two_chains(), ppo_recipe(), seed=3, reward="local", agents=["a"])
+    lone = {name: value for name, value in weights(together).items() if name.startswith("a.")}
+    assert_same(lone, weights(alone))
+
+    env = VectorEnv(two_chains(), num_envs=2, reward="local", agents=["a"])
+    seat = Alone(env, [derived_seed(3, "copies", i) for i in range(2)])
+    model = PPO("MlpPolicy", VecNormalize(seat, gamma=0.99), seed=derived_seed(3, "a"), device="cpu", **PPO_PARAMETERS)
+    model.learn(80)
+    assert_same(lone, {f"a.{name}": value for name, value in model.policy.state_dict().items()})
+
+
+def test_different_rollouts_and_shares_finish_cleanly() -> None:
+    """Learners with different ``n_steps`` and different budgets end without waiting for each other."""
+    matches = [
+        Match(agents=["mine"], algorithm="PPO", parameters=PPO_PARAMETERS | {"n_steps": 3, "batch_size": 6}),
+        Match(agents=["use"], algorithm="A2C", parameters={"n_steps": 4}, share_of_steps=0.3),
+        Match(agents=["sorting"], algorithm="ARS", parameters={"n_delta": 1}, share_of_steps=0.5),
+    ]
+    training = train("copper_net", recipe(Learner(algorithm="PPO", parameters=PPO_PARAMETERS), matches), horizon=5)
+    steps = {agent: trainee.model.num_timesteps for agent, trainee in training.trainees.items()}
+    assert steps["mine"] == 84  # 14 rollouts of 3 steps in 2 copies: the first count of at least 80
+    assert steps["use"] == 24
+    assert steps["refinery"] == 80
+    assert training.lockstep.joint_steps == 42
+
+
+class Explodes(BaseCallback):
+    """A callback that fails at its tenth step."""
+
+    def _on_step(self) -> bool:
+        if self.n_calls == 10:
+            raise RuntimeError("no more")
+        return True
+
+
+def test_failure_names_the_agent_and_keeps_what_was_learnt(tmp_path: Path) -> None:
+    """The error names agent and step; the run says why it failed and its policies can be used."""
+    with pytest.raises(LearnerError, match=r"agent 'use' failed at joint step 10.*no more"):
+        train("copper_net", ppo_recipe(), directory=tmp_path / "run", horizon=5, callbacks={"use": Explodes()})
+    run = RunDirectory(tmp_path / "run")
+    assert run.status["state"] == "failed"
+    assert "agent 'use'" in run.status["reason"]
+    env = run.make_env(2)
+    controller = Trained(run)
+    controller.start(env, 0)
+    assert set(controller.act(env.reset(seed=0))) == set(env.agents)
+
+
+def test_interruption_saves_and_resumption_finishes(tmp_path: Path) -> None:
+    """Ctrl-C saves everything; the run goes on from there, and a finished run is not run again."""
+    directory = tmp_path / "run"
+
+    def interrupt(progress: Any) -> None:
+        if progress.env_steps == 30:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", mixed_recipe(), directory=directory, horizon=5, report=interrupt)
+    status = RunDirectory(directory).status
+    assert (status["state"], status["joint_steps"]) == ("interrupted", 15)
+    assert not list(directory.rglob("*.partial*"))
+    training = resume(directory)
+    assert RunDirectory(directory).status["state"] == "complete"
+    assert training.joint_steps >= 40
+    assert training.trainees["refinery"].model.num_timesteps >= 80
+    rows = RunDirectory(directory).metrics()["joint_step"]
+    assert rows == sorted(set(rows))
+    assert rows[0] == 5
+    with pytest.raises(RunError, match="complete"):
+        resume(directory)
+
+
+def test_run_directory_holds_what_is_needed(tmp_path: Path) -> None:
+    """Saved policies, with their normalisers, act exactly like those in memory."""
+    training = train("carbo_net", ppo_recipe(), directory=tmp_path / "run", horizon=5)
+    run = RunDirectory(tmp_path / "run")
+    assert run.config == training.config
+    env = run.make_env(3)
+    observations = env.reset(seed=9)
+    controller = Trained(run)
+    controller.start(env, 0)
+    actions = controller.act(observations)
+    for agent, trainee in training.trainees.items():
+        assert isinstance(trainee.env, VecNormalize)
+        seen = trainee.env.normalize_obs(np.ascontiguousarray(observations[agent]))
+        assert np.array_equal(actions[agent], trainee.model.predict(seen, deterministic=True)[0])
+    versions = json.loads((run.path / "versions.json").read_text())
+    assert versions["stable-baselines3"]
+    metrics = run.metrics()
+    assert metrics["env_steps"][-1] == 80
+    assert all(np.isfinite(metrics[f"return:{agent}"]).all() for agent in env.agents)
+    assert all(list((run.path / "tensorboard" / agent).glob("events*")) for agent in env.agents)
+
+
+def test_network_built_in_python_can_be_kept(tmp_path: Path) -> None:
+    """A run of a network without a file holds a definition that reads back as the same network."""
+    train(two_chains(), ppo_recipe(), directory=tmp_path / "run", reward="local")
+    network = RunDirectory(tmp_path / "run").make_env(1).network
+    assert (network.nodes, network.arcs, network.episode) == (
+        two_chains().nodes,
+        two_chains().arcs,
+        two_chains().episode,
+    )
+
+
+def test_half_written_runs_are_refused(tmp_path: Path) -> None:
+    """Whatever is missing from a run directory is named; nothing is overwritten."""
+    directory = tmp_path / "run"
+    train("copper_net", ppo_recipe(), directory=directory, horizon=5)
+    with pytest.raises(RunError, match="not empty"):
+        train("copper_net", ppo_recipe(), directory=directory, horizon=5)
+    with pytest.raises(RunError, match="no such run directory"):
+        Trained(tmp_path / "elsewhere")
+    for name in ("config.json", "status.json", "network.toml"):
+        broken = tmp_path / f"without_{name}"
+        shutil.copytree(directory, broken)
+        (broken / name).unlink()
+        with pytest.raises(RunError, match=name):
+            Trained(broken)
+    checkpoint = RunDirectory(directory).checkpoint
+    (checkpoint / "use.zip").write_bytes(b"PK half a file")
+    with pytest.raises(RunError, match=r"use\.zip"):
+        Trained(directory)
+    (checkpoint / "mine.zip").unlink()
+    with pytest.raises(RunError, match="lacks the policies of mine"):
+        Trained(directory)
+    (directory / "status.json").write_text('{"state": "run')
+    with pytest.raises(RunError, match=r"status.json: cannot be read"):
+        Trained(directory)
+
+
+def test_torch_threads_and_streams_are_left_alone() -> None:
+    """Training leaves the caller's threads and random streams as they were."""
+    torch.manual_seed(1)
+    expected = torch.rand(2)
+    torch.manual_seed(1)
+    threads = torch.get_num_threads()
+    train("copper_net", ppo_recipe(), horizon=5)
+    assert torch.get_num_threads() == threads
+    assert torch.equal(torch.rand(2), expected)
