@@ -28,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-console = Console()
+console = Console(width=None if sys.stdout.isatty() else 140)
 errors = Console(stderr=True)
 
 NetworkName = Annotated[str, typer.Argument(metavar="NETWORK", help="Name in the catalogue, or a .toml file.")]
@@ -291,30 +291,40 @@ def _training_bar() -> Iterator[Any]:
         TextColumn("service {task.fields[service]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    live = console.is_terminal
+    with Progress(*columns, console=console, disable=not live) as progress:
         task = progress.add_task("training", total=None, speed=0.0, circularity="…", service="…")
-        last = clock.perf_counter()
+        shown = clock.perf_counter()
+        state: Any = None
 
-        def update(state: Any) -> None:
-            nonlocal last
-            now = clock.perf_counter()
-            if state.episode:
-                circularity, service = f"{state.circularity:.4g}", f"{state.service_level:.3f}"
-                progress.update(task, circularity=circularity, service=service)
-            if now - last > 0.2 or state.env_steps >= state.total:
-                speed = state.env_steps / max(state.seconds, 1e-9)
-                progress.update(task, completed=min(state.env_steps, state.total), total=state.total, speed=speed)
-            if not console.is_terminal and (now - last > 10 or state.env_steps >= state.total > state.env_steps - 1):
-                speed = state.env_steps / max(state.seconds, 1e-9)
-                console.print(
-                    f"{min(state.env_steps, state.total)}/{state.total} steps, {speed:,.0f} joint steps/s, "
-                    f"λ {state.circularity:.4g}, service {state.service_level:.3f}"
-                )
-                last = now
-            elif console.is_terminal and now - last > 0.2:
-                last = now
+        def update(now: Any) -> None:
+            nonlocal shown, state
+            state = now
+            if now.episode:
+                episode = {"circularity": f"{now.circularity:.4g}", "service": f"{now.service_level:.3f}"}
+                progress.update(task, **episode)
+            if clock.perf_counter() - shown > (0.2 if live else 10.0):
+                shown = clock.perf_counter()
+                progress.update(task, completed=now.env_steps, total=now.total, speed=_speed(now))
+                if not live:
+                    _say(now)
 
         yield update
+        if state is not None:
+            progress.update(task, completed=state.total, total=state.total, speed=_speed(state))
+            if not live:
+                _say(state)
+
+
+def _speed(state: Any) -> float:
+    return float(state.env_steps / max(state.seconds, 1e-9))
+
+
+def _say(state: Any) -> None:
+    console.print(
+        f"{min(state.env_steps, state.total):,}/{state.total:,} steps, {_speed(state):,.0f} joint steps/s, "
+        f"λ {state.circularity:.4g}, service {state.service_level:.3f}"
+    )
 
 
 def _plain(error: BaseException) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import difflib
 import tomllib
 import types
 import typing
@@ -114,8 +116,31 @@ def _build(document: Mapping[str, Any], scenario: str) -> Network:
     try:
         table = NetworkTable.model_validate(document)
     except ValidationError as error:
-        raise NetworkError(name, mistakes_of(error, NetworkTable)) from None
+        mistakes = mistakes_of(error, NetworkTable)
+        raise NetworkError(name, [*mistakes, *_further_mistakes(document, error, scenario)]) from None
     return _Converter(table).network(scenario)
+
+
+def _further_mistakes(document: Mapping[str, Any], error: ValidationError, scenario: str) -> list[str]:
+    """Look for mistakes behind the given ones, with misspelt values mended and unknown keys left out."""
+    mended = copy.deepcopy(dict(document))
+    for item in error.errors():
+        *path, last = [part for part in item["loc"] if part != "[key]"]
+        table: Any = mended
+        for part in path:
+            table = table[part]
+        if item["type"] == "extra_forbidden":
+            del table[last]
+        elif item["type"] in ("enum", "literal_error"):
+            choices = _choices(str(item["ctx"]["expected"]))
+            table[last] = next(iter(difflib.get_close_matches(str(item["input"]), choices, n=1)), choices[0])
+        else:
+            return []
+    try:
+        _build(mended, scenario)
+    except NetworkError as further:
+        return list(further.problems)
+    return []
 
 
 class _Converter:

@@ -12,7 +12,7 @@ from cirl_marl.catalogue import recipe_path
 from cirl_marl.definition import mistakes_of, read_toml
 from cirl_marl.elements import Node, Role
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
-from cirl_marl.learners.algorithms import algorithm_class, checked_parameters
+from cirl_marl.learners.algorithms import algorithm_class, algorithms, checked_parameters
 from cirl_marl.network import Network
 
 
@@ -99,6 +99,15 @@ class Recipe(_Table):
             for agent in match.agents or ():
                 if agent not in agents:
                     raise RecipeError(f"recipe '{self.name}': match.agents: {unknown('agent', agent, agents)}")
+
+
+def recipe_schema() -> dict[str, Any]:
+    """Return the JSON schema of recipe files, with which editors complete and check them."""
+    schema = Recipe.model_json_schema()
+    for table in ("Learner", "Match"):
+        schema["$defs"][table]["properties"]["algorithm"]["enum"] = list(algorithms())
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    return schema
 
 
 OPTIONS = ("reward", "observe", "circularity", "horizon", "scenario")

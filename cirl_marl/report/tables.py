@@ -8,20 +8,19 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from cirl_marl.elements import Arc, Control, ControlKind, Law
+from cirl_marl.elements import Arc, Compartment, Control, ControlKind, Law
 from cirl_marl.network import Floats, Network
 
 
 def networks_table(networks: Mapping[str, Network]) -> Table:
     """One row a network: compartments, agents, services, scenarios."""
     table = Table(title="Networks")
-    for column in ("name", "what it is", "compartments", "agents", "services", "scenarios"):
-        table.add_column(column)
+    _columns(table, "name", "what it is", "compartments", "agents", "services", "scenarios")
     for name, network in networks.items():
         table.add_row(
             name,
             network.title,
-            f"{len(network.compartments)} ({len(network.nodes)} nodes, {len(network.arcs)} arcs)",
+            str(len(network.compartments)),
             str(len(network.agents)),
             ", ".join(service.id for service in network.services) or "none",
             ", ".join([network.scenario_name, *network.scenarios]),
@@ -32,56 +31,54 @@ def networks_table(networks: Mapping[str, Network]) -> Table:
 def nodes_table(network: Network, stock: Floats) -> Table:
     """One row a node: role, stock at the start, set-point, control."""
     table = Table(title=f"{network.title or network.name}: nodes ({network.mass_unit})")
-    for column in ("node", "role", "initial range", "stock", "set-point", "control"):
-        table.add_column(column, justify="right" if column in ("stock", "set-point") else "left")
+    _columns(table, "node", "role", "initial range", "stock", "set-point", "control")
     for node, held in zip(network.nodes, stock, strict=True):
         low, high = node.initial
         span = f"{low:g}" if low == high else f"{low:g} – {high:g}"
-        target = "" if node.set_point is None else f"{node.set_point:g}"
         acting = node.control if node.id in network.agents else None
-        table.add_row(node.id, node.role.value, span, f"{held:.5g}", target, control_text(network, acting))
+        table.add_row(node.id, node.role.value, span, f"{held:.5g}", _target(node), control_text(network, acting))
     return table
 
 
 def arcs_table(network: Network, flow: Floats) -> Table:
-    """One row an arc: ends, law, flow at the start, its sign in λ, set-point, control."""
+    """One row an arc: law, flow at the start, its sign in λ, set-point, control."""
     table = Table(title=f"arcs ({network.mass_unit}/{network.time_unit})")
-    for column in ("arc", "from", "to", "law", "flow", "in λ", "set-point", "control"):
-        table.add_column(column, justify="right" if column in ("flow", "set-point") else "left")
+    _columns(table, "arc", "law", "flow", "in λ", "set-point", "control")
     signs = {1.0: "−", -1.0: "+", 0.0: ""}
     for k, arc in enumerate(network.arcs):
-        target = "" if arc.set_point is None else f"{arc.set_point:g}"
+        sign = signs[float(network.sustainability[k])]
         acting = arc.control if arc.id in network.agents else None
-        table.add_row(
-            arc.id,
-            arc.donor,
-            arc.recipient,
-            law_text(network, arc),
-            f"{flow[k]:.5g}",
-            signs[float(network.sustainability[k])],
-            target,
-            control_text(network, acting),
-        )
+        table.add_row(arc.id, law_text(arc), f"{flow[k]:.5g}", sign, _target(arc), control_text(network, acting))
     return table
 
 
-def law_text(network: Network, arc: Arc) -> str:
+def _columns(table: Table, name: str, *others: str) -> None:
+    table.add_column(name, no_wrap=True)
+    for other in others:
+        table.add_column(other, justify="right" if other in ("stock", "flow", "set-point") else "left")
+
+
+def _target(compartment: Compartment) -> str:
+    return "" if compartment.set_point is None else f"{compartment.set_point:g}"
+
+
+def law_text(arc: Arc) -> str:
     """Say the flow law of an arc as a formula."""
     if arc.law is Law.DONOR:
-        return f"{arc.rate:g}/{network.time_unit} × {arc.donor}"
+        return f"{arc.rate:g} x({arc.donor})"
     if arc.law is Law.RECIPIENT:
-        return f"{arc.rate:g}/{network.time_unit} × {arc.recipient}"
+        return f"{arc.rate:g} x({arc.recipient})"
     if arc.law is Law.CONTROLLED:
         return "u"
     return "series" if arc.times else f"{arc.flow[0]:g}"
 
 
 def control_text(network: Network, control: Control | None) -> str:
-    """Say what an agent sets and within which bounds."""
+    """Say what an agent sets: bounds, with the neutral value between them."""
     if control is None:
         return ""
     unit = f" {network.mass_unit}/{network.time_unit}" if control.kind is ControlKind.FLOW else ""
-    return f"{control.kind.value} {control.low:g} … {control.high:g}{unit}, neutral {control.neutral:g}"
+    return f"{control.kind.value} {control.low:g} | {control.neutral:g} | {control.high:g}{unit}"
 
 
 def evaluation_table(figures: Mapping[str, Any]) -> Table:

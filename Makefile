@@ -1,0 +1,52 @@
+# Two commands on a bare machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: demo test lint types wheel unit study speed clean
+
+demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
+	rm -rf runs/demo
+	$(BIN)/cirl train copper_net --agents independent_ppo --seed 0 --out runs/demo
+
+test: lint types wheel unit  ## everything that continuous integration needs
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev
+	$(BIN)/mypy
+
+unit: $(VENV)/.dev
+	$(BIN)/python -m pytest -q -n 2
+
+wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clean environment
+	rm -rf dist build/clean
+	$(BIN)/python -m build --wheel --outdir dist . > /dev/null
+	$(BIN)/check-wheel-contents dist
+	$(PYTHON) -m venv build/clean
+	build/clean/bin/python -m pip install --disable-pip-version-check --quiet -c constraints.txt dist/*.whl
+	$(PYTHON) tests/installed.py build/clean
+
+study: $(VENV)/.runtime  ## five seeds of the default recipe on each network (about half an hour)
+	$(BIN)/python benchmarks/learning.py --markdown docs/learning.md
+
+speed: $(VENV)/.runtime  ## table of speed ratios
+	$(PIP) install --quiet -c constraints.txt -e '.[benchmarks]'
+	$(BIN)/python benchmarks/speed.py
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.runtime: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(PIP) install --quiet -c constraints.txt -e .
+	touch $@
+
+$(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(PIP) install --quiet -c constraints.txt -e '.[dev,human]'
+	touch $@ $(VENV)/.runtime
+
+clean:
+	rm -rf $(VENV) dist build runs .mypy_cache .ruff_cache .pytest_cache .hypothesis

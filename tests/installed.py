@@ -1,0 +1,37 @@
+"""Use the installed wheel as a stranger would: from another folder, in an environment that holds nothing else of ours."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+
+def main(environment: Path) -> None:
+    """Run the command line of ``environment`` in an empty folder and check that it works."""
+    cirl = str((environment / "bin" / "cirl").resolve())
+    python = str((environment / "bin" / "python").resolve().parent / "python")
+    with tempfile.TemporaryDirectory() as folder:
+
+        def run(*command: str) -> str:
+            done = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
+            return done.stdout
+
+        where = run(python, "-c", "import cirl_marl; print(cirl_marl.__file__)").strip()
+        if not Path(where).resolve().is_relative_to(environment.resolve()):
+            raise SystemExit(f"the package was imported from {where}, not from {environment}")
+        for network in ("copper_net", "carbo_net"):
+            if network not in run(cirl, "networks"):
+                raise SystemExit(f"the installed catalogue lacks {network}")
+        run(cirl, "show", "copper_net")
+        run(cirl, "simulate", "carbo_net", "--control", "random")
+        run(cirl, "train", "copper_net", "--steps", "6000", "--envs", "32", "--out", "run")
+        run(cirl, "evaluate", "run")
+        for name in ("copper_net.png", "carbo_net_random.csv", "run/evaluation.json", "run/pictures/circularity.png"):
+            if not (Path(folder) / name).is_file():
+                raise SystemExit(f"{name} was not written")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,122 @@
+"""The command line, in process: what it prints, what it writes, how it fails."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import pytest
+
+from cirl_marl import cli
+from cirl_marl.catalogue import folder
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run every test in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run ``cirl`` with ``arguments`` and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["cirl", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return int(ended.value.code or 0)
+
+
+def test_networks_and_show(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The catalogue is listed; a network's tables, λ and picture appear."""
+    assert run(monkeypatch, "networks") == 0
+    listed = capsys.readouterr().out
+    assert all(word in listed for word in ("copper_net", "carbo_net", "independent_ppo"))
+    assert run(monkeypatch, "show", "copper_net") == 0
+    shown = capsys.readouterr().out
+    assert "λ of the start state: -93.6 kt" in shown
+    assert all(word in shown for word in ("mine_to_refinery", "nonrenewable_reservoir", "copper_in_use"))
+    assert Path("copper_net.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_check_names_every_mistake(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Mistakes of different kinds in one file are all named, with key and nearest name; the exit code is 2."""
+    good = (folder("envs") / "copper_net.toml").read_text()
+    bad = good.replace('law = "controlled"', 'law = "controled"').replace(
+        'unit = "kt/day", source = "neutral', 'unit = "kg", source = "neutral'
+    )
+    bad = bad.replace('to = "landfill"', 'to = "landfil"').replace("reference_interval", "reference_intervall")
+    bad = bad.replace(
+        "[nodes.mine]", "reference_interval = { value = 1, unit = 'day', source = 's' }\n\n[nodes.mine]", 0
+    )
+    Path("bad.toml").write_text(bad)
+    assert run(monkeypatch, "check", "bad.toml", str(folder("envs") / "carbo_net.toml")) == 2
+    captured = capsys.readouterr()
+    assert "no mistakes" in captured.out
+    for part in (
+        "bad.toml",
+        "'controled'. Did you mean 'controlled'?",
+        "'reference_intervall'. Did you mean 'reference_interval'?",
+    ):
+        assert part in captured.err
+    Path("bad.toml").write_text(bad.replace("reference_intervall", "reference_interval"))
+    assert run(monkeypatch, "check", "bad.toml") == 2
+    found = capsys.readouterr().err
+    assert "'controled'. Did you mean 'controlled'?" in found
+    assert "arcs.use_to_collection.control: unit 'kg' is inconsistent" in found
+    assert run(monkeypatch, "check", "missing.toml") == 2
+    assert "missing.toml: no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("control", ["neutral", "random", "constant"])
+def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every interval is a row with λ, service, stocks and flows."""
+    extra = ["--set", "mine=-0.5"] if control == "constant" else []
+    assert run(monkeypatch, "simulate", "copper_net", "--control", control, "--steps", "7", "--out", "out", *extra) == 0
+    with Path(f"out/copper_net_{control}.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 7
+    assert float(rows[-1]["time (day)"]) == 1.75
+    assert {"circularity (kt)", "service level", "stock of use (kt)", "flow of mine_to_refinery (kt/day)"} <= set(
+        rows[0]
+    )
+    assert Path(f"out/copper_net_{control}.png").is_file()
+
+
+def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A run is trained, evaluated on fresh seeds, drawn, and evaluated again."""
+    arguments = ["--steps", "6000", "--envs", "32", "--seed", "3", "--out", "run", "--episodes", "4"]
+    assert run(monkeypatch, "train", "carbo_net", *arguments) == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("joint steps/s", "trained", "neutral", "random", "gain over neutral"))
+    for name in ("evaluation.json", "metrics.csv", "config.json", "versions.json"):
+        assert Path("run", name).is_file()
+    pictures = {path.name for path in Path("run/pictures").iterdir()}
+    assert pictures == {"flows_before_after.png", "circularity.png", "learning_curves.png"}
+    assert run(monkeypatch, "evaluate", "run", "--episodes", "4", "--seed", "7") == 0
+    assert "local return of each agent" in capsys.readouterr().out
+    assert run(monkeypatch, "report", "run", "--episodes", "4") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["show", "coper_net"], "unknown network 'coper_net'. Did you mean 'copper_net'?"),
+        (["show", "copper_net", "--scenario", "papr"], "unknown scenario 'papr'. Did you mean 'paper'?"),
+        (["train", "copper_net", "--agents", "independent_pp"], "Did you mean 'independent_ppo'?"),
+        (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
+        (["train"], "needs either NETWORK or --resume RUN"),
+        (["train", "--resume", "nowhere"], "nowhere: no such run directory"),
+        (["evaluate", "nowhere"], "nowhere: no such run directory"),
+        (["simulate", "copper_net", "--control", "nutral"], "Did you mean 'neutral'?"),
+        (["simulate", "copper_net", "--control", "constant", "--set", "mien=0"], "Did you mean 'mine'?"),
+        (["simulate", "copper_net", "--control", "constant", "--set", "mine=nan"], "must lie in [-1, 1]"),
+        (["simulate", "copper_net", "--set", "mine=0"], "goes with --control constant"),
+    ],
+)
+def test_bad_input_ends_with_code_2(
+    arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The message names what is wrong and what would be right; nothing is written."""
+    assert run(monkeypatch, *arguments) == 2
+    assert message in capsys.readouterr().err
+    assert list(Path().iterdir()) == []

@@ -1,0 +1,40 @@
+"""The default scenarios pose a problem worth learning: neither stopping nor doing as today is best."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cirl_marl import VectorEnv
+from cirl_marl.controllers import Constant, Controller, Neutral
+from cirl_marl.evaluate import Rollout, rollout
+
+BETTER = {
+    "copper_net": {"mine": -0.5, "use_to_landfill": -1.0, "use_to_collection": 0.5, "use": -0.5},
+    "carbo_net": {"urban_to_capture": 0.8, "fossil_reserve": 0.2},
+}
+"""A few constant settings, found by hand, that beat neutral control in λ̄ and in service."""
+
+
+def run(network: str, controller: Controller) -> Rollout:
+    """Return 16 episodes of the default scenario."""
+    return rollout(VectorEnv(network, num_envs=16), controller)
+
+
+@pytest.mark.parametrize("network", sorted(BETTER))
+def test_stopping_everything_is_not_the_best_policy(network: str) -> None:
+    """It has the best λ̄ of the three but fails the service, and its return is the worst."""
+    env = VectorEnv(network, num_envs=1)
+    stop = run(network, Constant(dict.fromkeys(env.agents, -1.0)))
+    neutral, better = run(network, Neutral()), run(network, Constant(BETTER[network]))
+    assert stop.episode_circularity.mean() > neutral.episode_circularity.mean()
+    assert stop.episode_service.mean() < neutral.episode_service.mean()
+    assert stop.returns.mean() < neutral.returns.mean() < better.returns.mean()
+
+
+@pytest.mark.parametrize("network", sorted(BETTER))
+def test_there_is_room_above_neutral(network: str) -> None:
+    """Constant settings raise λ̄ and do not lower the service level: the two goals can be reached together."""
+    neutral, better = run(network, Neutral()), run(network, Constant(BETTER[network]))
+    assert np.all(better.episode_circularity > neutral.episode_circularity)
+    assert better.episode_service.mean() >= neutral.episode_service.mean()

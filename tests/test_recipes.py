@@ -1,0 +1,103 @@
+"""Learner recipes: the catalogue is valid, mistakes are named, the published schema is up to date."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+import cirl_marl
+from cirl_marl import DefinitionError, RecipeError
+from cirl_marl.catalogue import folder
+from cirl_marl.learners import load_recipe, train
+from cirl_marl.learners.algorithms import algorithms, parameters_of
+from cirl_marl.learners.recipe import recipe_schema
+
+GOOD = """
+name = "mine"
+title = "a recipe"
+[learner]
+algorithm = "PPO"
+parameters = { n_steps = 8 }
+"""
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    """Write a recipe file."""
+    path = tmp_path / "recipe.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("name", cirl_marl.recipes())
+def test_catalogue_is_valid(name: str) -> None:
+    """Each recipe reads, fits its schema, and gives every agent of every network a learner."""
+    recipe = load_recipe(name)
+    assert recipe.name == name
+    document = tomllib.loads((folder("agents") / f"{name}.toml").read_text())
+    jsonschema.validate(document, recipe_schema())
+    for network in map(cirl_marl.load_network, cirl_marl.networks()):
+        recipe.check(network, network.agents)
+        assert all(recipe.learner_of(agent, network).algorithm in algorithms() for agent in network.agents)
+
+
+def test_mixed_recipe_mixes() -> None:
+    """Different kinds of compartments get different algorithms."""
+    recipe, network = load_recipe("mixed_by_kind"), cirl_marl.load_network("copper_net")
+    chosen = {agent: recipe.learner_of(agent, network).algorithm for agent in network.agents}
+    assert (chosen["mine"], chosen["use"], chosen["use_to_collection"]) == ("SAC", "PPO", "TRPO")
+
+
+def test_published_schema_is_up_to_date() -> None:
+    """``agents/recipe.schema.json`` is what the code gives."""
+    published = json.loads((folder("agents") / "recipe.schema.json").read_text())
+    assert published == recipe_schema()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"PPO"', '"PPPO"', "learner.algorithm: unknown algorithm 'PPPO'. Did you mean 'PPO'?"),
+        ("n_steps", "n_step", "unknown parameter of PPO 'n_step'. Did you mean 'n_steps'?"),
+        ("[learner]", "[lerner]", "unknown key 'lerner'. Did you mean 'learner'?"),
+        ("title", "titel", "unknown key 'titel'. Did you mean 'title'?"),
+        ("[learner]", '[environment]\nrewrad = "local"\n[learner]', "unknown option 'rewrad'. Did you mean 'reward'?"),
+        ('"PPO"\nparameters = { n_steps = 8', '"SAC"\nparameters = { action_noise = 3', "needs kind and sigma, got 3"),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
+            '"SAC"\nparameters = { action_noise = { kind = "nrmal", sigma = 1 }',
+            "unknown kind 'nrmal'. Did you mean 'normal'?",
+        ),
+        ("[learner]", "[run]\nsteps = 0\n[learner]", "run.steps: Input should be greater than 0, got 0"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    """Each mistake is an error that names file, key, value and the nearest valid name."""
+    assert load_recipe(write(tmp_path, GOOD)).name == "mine"
+    path = write(tmp_path, GOOD.replace(old, new))
+    with pytest.raises(DefinitionError) as raised:
+        load_recipe(path)
+    assert str(path) in str(raised.value)
+    assert message in str(raised.value)
+
+
+def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
+    """Unknown agents, and values that the algorithm refuses, are errors before anything is trained or written."""
+    path = write(tmp_path, GOOD + '[[match]]\nagents = ["mien"]\nalgorithm = "A2C"\n')
+    with pytest.raises(RecipeError, match="unknown agent 'mien'. Did you mean 'mine'"):
+        train("copper_net", path, directory=tmp_path / "run")
+    with pytest.raises(RecipeError, match="PPO refuses its parameters"):
+        train("copper_net", write(tmp_path, GOOD.replace("n_steps = 8", "n_steps = 1")), envs=1)
+    with pytest.raises(cirl_marl.CirlError, match="unknown option 'observ'. Did you mean 'observe'"):
+        train("copper_net", write(tmp_path, GOOD), observ="full")
+    assert not (tmp_path / "run").exists()
+
+
+def test_parameters_are_those_of_the_library() -> None:
+    """Recipes may set what the constructors take, and nothing that the training sets itself."""
+    assert {"learning_rate", "gamma", "n_steps"} <= set(parameters_of("PPO"))
+    assert not {"env", "seed", "device"} & set(parameters_of("SAC"))
+    assert {"PPO", "A2C", "SAC", "TD3", "DDPG", "TQC", "ARS", "TRPO"} <= set(algorithms())
