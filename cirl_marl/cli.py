@@ -301,8 +301,8 @@ def _training_bar() -> Iterator[Any]:
             nonlocal shown, state
             state = now
             if now.episode:
-                episode = {"circularity": f"{now.circularity:.4g}", "service": f"{now.service_level:.3f}"}
-                progress.update(task, **episode)
+                circularity, service = f"{now.circularity:.4g}", f"{now.service_level:.3f}"
+                progress.update(task, circularity=circularity, service=service)
             if clock.perf_counter() - shown > (0.2 if live else 10.0):
                 shown = clock.perf_counter()
                 progress.update(task, completed=now.env_steps, total=now.total, speed=_speed(now))

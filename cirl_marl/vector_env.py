@@ -290,7 +290,7 @@ class VectorEnv:
         return dict(zip(self.network.compartments, rewards, strict=True))
 
     def state(self) -> Floats:
-        """Return the whole physical state, shape (B, nodes + 1): stocks in mass units, then the elapsed share of time."""
+        """Return the whole state, shape (B, nodes + 1): stocks in mass units, then the elapsed share of time."""
         state = self.physical
         return np.concatenate([state.stock[:-1].T, (state.step / self.network.episode.horizon)[:, None]], axis=1)
 

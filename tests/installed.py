@@ -1,4 +1,4 @@
-"""Use the installed wheel as a stranger would: from another folder, in an environment that holds nothing else of ours."""
+"""Use the installed wheel as a stranger would: from another folder, in an environment of its own."""
 
 from __future__ import annotations
 

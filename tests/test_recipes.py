@@ -87,11 +87,11 @@ def test_mistakes_are_named(tmp_path: Path, old: str, new: str, message: str) ->
 def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
     """Unknown agents, and values that the algorithm refuses, are errors before anything is trained or written."""
     path = write(tmp_path, GOOD + '[[match]]\nagents = ["mien"]\nalgorithm = "A2C"\n')
-    with pytest.raises(RecipeError, match="unknown agent 'mien'. Did you mean 'mine'"):
+    with pytest.raises(RecipeError, match=r"unknown agent 'mien'\. Did you mean 'mine'"):
         train("copper_net", path, directory=tmp_path / "run")
     with pytest.raises(RecipeError, match="PPO refuses its parameters"):
         train("copper_net", write(tmp_path, GOOD.replace("n_steps = 8", "n_steps = 1")), envs=1)
-    with pytest.raises(cirl_marl.CirlError, match="unknown option 'observ'. Did you mean 'observe'"):
+    with pytest.raises(cirl_marl.CirlError, match=r"unknown option 'observ'\. Did you mean 'observe'"):
         train("copper_net", write(tmp_path, GOOD), observ="full")
     assert not (tmp_path / "run").exists()
 
