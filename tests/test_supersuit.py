@@ -1,4 +1,4 @@
-"""SuperSuit: its wrappers work on our environments; the three defects of its vector bridge are shown, and not shared."""
+"""SuperSuit: its wrappers work on our environments; the defects of its vector bridge are shown, and not shared."""
 
 from __future__ import annotations
 
