@@ -34,7 +34,8 @@ from cirl_marl.network import Network
 from cirl_marl.parallel_env import NetworkParallelEnv, aec_env, parallel_env, vector_env
 from cirl_marl.registration import register
 from cirl_marl.single_env import SingleAgentEnv, single_agent_env
-from cirl_marl.vector_env import Snapshot, VectorEnv
+from cirl_marl.state import Snapshot
+from cirl_marl.vector_env import VectorEnv
 
 __version__ = "0.1.0"
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cirl_marl.compartments.model import CompartmentModel
 
 
 class Role(StrEnum):
@@ -24,13 +28,18 @@ class Law(StrEnum):
     RECIPIENT = "recipient"
     CONTROLLED = "controlled"
     EXOGENOUS = "exogenous"
+    COMPARTMENT = "compartment"
 
 
 class ControlKind(StrEnum):
-    """What an agent sets: a factor on flows (``rate``, a valve) or the flow itself (``flow``)."""
+    """What an agent sets.
+
+    A factor on flows (``rate``, a valve), the flow itself (``flow``) or an input of the model (``input``).
+    """
 
     RATE = "rate"
     FLOW = "flow"
+    INPUT = "input"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +47,7 @@ class Control:
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high].
 
     Attributes:
-        kind: ``rate`` (dimensionless factor) or ``flow`` (mass/time).
+        kind: ``rate`` (dimensionless factor), ``flow`` (mass/time) or ``input`` (unit of the model's input).
         low: value at action -1.
         high: value at action +1.
         neutral: value while nobody acts on the compartment.
@@ -59,12 +68,16 @@ class Compartment:
         set_point: stock (mass) or mean flow (mass/time) aimed at; None if it has none.
         scale: reference stock or flow for observations and rewards.
         control: its actuator; None if it cannot act.
+        model: inner physics; None for a plain store or transport.
+        inner: (low, high) of the initial value of each inner state of the model, drawn uniformly.
     """
 
     id: str
     set_point: float | None = None
     scale: float = 1.0
     control: Control | None = None
+    model: CompartmentModel | None = None
+    inner: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,8 +102,10 @@ class Arc(Compartment):
     Attributes:
         donor: id of the node that gives.
         recipient: id of the node that receives.
-        law: ``donor`` f = a·x_donor, ``recipient`` f = a·x_recipient, ``controlled`` f = u, ``exogenous`` f = e(t).
-        rate: a, 1/time (donor and recipient laws).
+        law: ``donor`` f = a·x_donor, ``recipient`` f = a·x_recipient, ``controlled`` f = u, ``exogenous`` f = e(t),
+            ``compartment`` f = a·y, y the output of the model of the compartment ``by``.
+        rate: a, 1/time (donor and recipient laws) or mass/time per unit of the model's output.
+        by: the compartment whose model gives the flow (compartment law).
         flow: e, mass/time (exogenous law); with ``times`` the values of a step function, else a single value.
         times: starts of the steps of an exogenous series, time; empty for a constant.
         pollutant: whether material that enters an environment here is a pollutant.
@@ -100,6 +115,7 @@ class Arc(Compartment):
     recipient: str
     law: Law = Law.DONOR
     rate: float = 0.0
+    by: str = ""
     flow: tuple[float, ...] = (0.0,)
     times: tuple[float, ...] = ()
     pollutant: bool = True
@@ -142,9 +158,10 @@ class Episode:
     Attributes:
         control_interval: h, time between two decisions.
         horizon: decisions per episode.
-        solver: ``exact`` (physical mode: zero-order-hold solution, stocks stay non-negative) or ``euler``
-            (the explicit step of the published environments; stocks may become negative).
-        solver_step: step of the Euler solver, time; a whole fraction of ``control_interval``.
+        solver: ``exact`` (zero-order-hold solution, for networks without inner physics), ``rk4`` (classical
+            Runge-Kutta, for those with it), both keeping stocks non-negative; or ``euler`` (the explicit step of the
+            published environments; stocks may become negative).
+        solver_step: step of the ``rk4`` and ``euler`` solvers, time; a whole fraction of ``control_interval``.
     """
 
     control_interval: float = 1.0
@@ -181,14 +198,14 @@ class Observation:
 
     Attributes:
         mode: ``local``, ``neighbours``, ``full``, or ``stocks`` (the stocks of ``nodes`` in that order).
-        nodes: ids of the observed nodes in mode ``stocks``.
+        nodes: in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``).
     """
 
     mode: str = "local"
     nodes: tuple[str, ...] = ()
 
 
-SOLVERS = ("exact", "euler")
+SOLVERS = ("exact", "rk4", "euler")
 NET_ZERO = ("signed", "abs")
 REWARDS = ("local", "circularity", "mixed", "difference", "local_sum")
 OBSERVE = ("local", "neighbours", "full", "stocks")

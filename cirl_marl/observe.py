@@ -19,19 +19,20 @@ MODES = ("local", "neighbours", "full", "stocks")
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Rows of the signal table: stocks, flows, time, service levels, set-points of nodes and arcs.
+    """Rows of the signal table: stocks, flows, inner states, time, service levels, set-points of nodes and arcs.
 
     Stocks, flows and set-points are divided by the scale of their compartment, time by the horizon.
     """
 
     nodes: int
     arcs: int
+    states: int
     services: int
 
     @property
     def quantities(self) -> int:
-        """Number of stocks and flows together."""
-        return self.nodes + self.arcs
+        """Number of stocks, flows and inner states together."""
+        return self.nodes + self.arcs + self.states
 
     @property
     def time(self) -> int:
@@ -70,10 +71,14 @@ class ObservationLayout:
             raise CirlError(f"observe: {unknown('observation mode', mode, MODES)}")
         if mode == "stocks" and not network.observation.nodes:
             raise CirlError(f"observe: mode 'stocks' needs a scenario that lists the nodes; '{network.name}' has none")
-        self.signals = Signals(len(network.nodes), len(network.arcs), len(network.services))
+        inner = dynamics.inner
+        self.signals = Signals(len(network.nodes), len(network.arcs), len(inner.names), len(network.services))
+        first = self.signals.nodes + self.signals.arcs
+        self._inner = {owner: range(first + rows.start, first + rows.stop) for owner, rows in inner.rows.items()}
+        self._observed = {**network.node_index, **{name: first + i for i, name in enumerate(inner.names)}}
         self._network = network
         self._incident = _incident_arcs(network)
-        self._names = list(self._signal_names())
+        self._names = list(self._signal_names(inner.names))
         compartments = [c.id for c in (*network.nodes, *network.arcs)]
         self._position = {id_: i for i, id_ in enumerate(compartments)}
         self._debts: dict[str, list[int]] = {}
@@ -90,7 +95,7 @@ class ObservationLayout:
         }
         self.names = {agent: tuple(self._names[row] for row in seen) for agent, seen in zip(agents, rows, strict=True)}
         scales = np.array([c.scale for c in (*network.nodes, *network.arcs)])
-        self._inverse_scale = (1.0 / scales).reshape(-1, 1)
+        self._inverse_scale = (1.0 / np.concatenate([scales, np.ones(len(inner.names))])).reshape(-1, 1)
         set_points = np.array([c.set_point or 0.0 for c in (*network.nodes, *network.arcs)]) / scales
         self._table = np.zeros((self.signals.rows, batch), dtype=np.float32)
         self._table[self.signals.set_point(0) :] = set_points[:, None]
@@ -99,7 +104,7 @@ class ObservationLayout:
         """Return the stacked observation, shape (entries of all agents, B).
 
         Args:
-            quantities: stocks and mean flows, shape (nodes + arcs, B).
+            quantities: stocks, mean flows and inner states, shape (nodes + arcs + states, B).
             time: elapsed share of the episode, shape (B,).
             levels: service levels, shape (services, B).
         """
@@ -113,11 +118,12 @@ class ObservationLayout:
     def _rows(self, agent: str, mode: str) -> Iterator[int]:
         network, signals = self._network, self.signals
         if mode == "stocks":
-            yield from (network.node_index[node] for node in network.observation.nodes)
+            yield from (self._observed[name] for name in network.observation.nodes)
             return
         compartment = network.compartments[agent]
         own = self._position[agent]
         yield own
+        yield from self._inner.get(agent, ())
         if not isinstance(compartment, Arc):
             arcs = self._incident[own]
             neighbours = self._across(own)
@@ -143,10 +149,11 @@ class ObservationLayout:
         ends = self._network.donors, self._network.recipients
         return [int(end[k]) for k in self._incident[node] for end in ends if end[k] != node]
 
-    def _signal_names(self) -> Iterator[str]:
+    def _signal_names(self, states: Sequence[str]) -> Iterator[str]:
         network = self._network
         yield from (f"stock of {node.id}" for node in network.nodes)
         yield from (f"flow of {arc.id}" for arc in network.arcs)
+        yield from states
         yield "time"
         yield from (f"service level of {service.id}" for service in network.services)
         yield from (f"set-point of {c.id}" for c in (*network.nodes, *network.arcs))
@@ -157,14 +164,15 @@ class ObservationLayout:
         compartments = (*network.nodes, *network.arcs)
         scales = np.array([c.scale for c in compartments])
         low, high = np.zeros(signals.rows), np.ones(signals.rows)
-        if dynamics.exact:
+        known = signals.nodes + signals.arcs
+        low[:known], high[:known] = -np.inf, np.inf
+        if dynamics.physical:
             mass = sum(node.initial[1] for node in network.nodes)
             drive = np.where(dynamics.driver == signals.nodes, 1.0, mass)
+            drive[dynamics.driver > signals.nodes] = np.inf
             limits = np.concatenate([np.full(signals.nodes, mass), drive * dynamics.max_rate]) / scales
-            high[: signals.quantities] = limits * (1 + 1e-6) + 1e-6
-        else:
-            low[: signals.quantities] = -np.inf
-            high[: signals.quantities] = np.inf
+            low[:known], high[:known] = 0.0, limits * (1 + 1e-6) + 1e-6
+        low[known : signals.quantities], high[known : signals.quantities] = -np.inf, np.inf
         set_points = np.abs([c.set_point or 0.0 for c in compartments]) / scales
         low[signals.set_point(0) :] = -set_points - 1
         high[signals.set_point(0) :] = set_points + 1

@@ -14,7 +14,8 @@ from pettingzoo.utils import conversions
 
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
-from cirl_marl.vector_env import Outcome, Snapshot, VectorEnv
+from cirl_marl.state import Outcome, Snapshot
+from cirl_marl.vector_env import VectorEnv
 
 RENDER_MODES = ("rgb_array", "human")
 
@@ -30,6 +31,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
     Attributes:
         network: the network under the chosen scenario.
         possible_agents: compartments that act.
+        state_names: what the entries of ``state()`` are, but for the last, the elapsed share of the episode.
         agents: the same while an episode runs, empty after it.
     """
 
@@ -60,8 +62,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         self.agents: list[str] = []
         self.observation_spaces = dict(self._batch.observation_spaces)
         self.action_spaces = dict(self._batch.action_spaces)
-        columns = len(self.network.nodes) + 1
-        self.state_space = Box(-np.inf, np.inf, (columns,), np.float64)
+        self.state_names = self._batch.state_names
+        self.state_space = Box(-np.inf, np.inf, (len(self.state_names) + 1,), np.float64)
         self.render_mode = render_mode
         self._canvas: Any = None
 

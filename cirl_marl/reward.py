@@ -17,7 +17,8 @@ class Scoring:
 
         r_c = −((q − set_point)/scale)² − Σ_s weight_s · shortfall_s,    s over the services that c owes
 
-    where shortfall = 1 − level, and the level of a service with band [low, high] is min(1, q/low, high/q).
+    plus the reward of its model, if it has one. Here shortfall = 1 − level, and the level of a service with band
+    [low, high] is min(1, q/low, high/q).
 
     Args of all methods are compartment-major, shape (rows, B).
     """
@@ -32,15 +33,17 @@ class Scoring:
         self._set_point = np.array([c.set_point for c in tracked], dtype=float).reshape(-1, 1)
         self._inverse_scale = 1.0 / np.array([c.scale for c in tracked], dtype=float).reshape(-1, 1)
         services = network.services
-        self._measure = _measurement(network, position)
+        self._measure = _measurement(network, position, sum(len(c.inner) for c in compartments))
         self._low = np.array([s.low for s in services]).reshape(-1, 1)
         self._high = np.array([s.high for s in services]).reshape(-1, 1)
         self._bounded = bool(np.isfinite(self._high).any())
-        terms = len(chosen) + len(services)
+        modelled = [position[c.id] for c in compartments if c.model is not None]
+        terms = len(chosen) + len(services) + len(modelled)
         debts = [(position[d], len(chosen) + i, s.weight) for i, s in enumerate(services) for d in s.debtors]
-        owners = np.array([*self._tracked, *(owner for owner, _, _ in debts)], dtype=np.intp)
-        columns = np.array([*range(len(chosen)), *(term for _, term, _ in debts)], dtype=np.intp)
-        weights = np.array([*[1.0] * len(chosen), *(weight for _, _, weight in debts)])
+        inner = range(len(chosen) + len(services), terms)
+        owners = np.array([*self._tracked, *(owner for owner, _, _ in debts), *modelled], dtype=np.intp)
+        columns = np.array([*range(len(chosen)), *(term for _, term, _ in debts), *inner], dtype=np.intp)
+        weights = np.array([*[1.0] * len(chosen), *(weight for _, _, weight in debts), *[-1.0] * len(modelled)])
         self._everyone = RowSum(owners, columns, -weights, (len(compartments), terms))
         self._agents = self._everyone.chosen([position[agent] for agent in agents])
         self._all = RowSum([0] * terms, range(terms), self._everyone.column_sums(), (1, terms))
@@ -57,13 +60,13 @@ class Scoring:
         np.minimum(level, 1.0, out=level)
         return np.maximum(level, 0.0, out=level)
 
-    def terms(self, quantities: Floats, levels: Floats) -> Floats:
-        """Return squared scaled distances and service shortfalls, shape (terms, B)."""
+    def terms(self, quantities: Floats, levels: Floats, inner: Floats) -> Floats:
+        """Return squared scaled distances, service shortfalls and the models' rewards, shape (terms, B)."""
         distance = quantities.take(self._tracked, axis=0)
         distance -= self._set_point
         distance *= self._inverse_scale
         distance *= distance
-        return np.concatenate([distance, 1.0 - levels])
+        return np.concatenate([distance, 1.0 - levels, inner])
 
     def local(self, terms: Floats) -> Floats:
         """Return the local reward of each agent, shape (agents, B)."""
@@ -87,8 +90,8 @@ class Scoring:
         return total
 
 
-def _measurement(network: Network, position: dict[str, int]) -> RowSum:
-    """Matrix that reads each service off the stocks and flows, shape (services, nodes + arcs)."""
+def _measurement(network: Network, position: dict[str, int], states: int) -> RowSum:
+    """Matrix that reads each service off the quantities, shape (services, nodes + arcs + states)."""
     rows, columns = [], []
     for row, service in enumerate(network.services):
         if service.quantity == "outflow":
@@ -98,5 +101,5 @@ def _measurement(network: Network, position: dict[str, int]) -> RowSum:
             read = [position[service.provider]]
         rows += [row] * len(read)
         columns += read
-    shape = (len(network.services), len(position))
+    shape = (len(network.services), len(position) + states)
     return RowSum(rows, columns, np.ones(len(rows)), shape)

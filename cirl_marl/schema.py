@@ -49,7 +49,9 @@ class Series(Table):
 class ControlTable(Table):
     """What the agent of this compartment sets."""
 
-    kind: ControlKind = Field(description="'rate': a factor on the flow(s); 'flow': the flow itself")
+    kind: ControlKind = Field(
+        description="'rate': a factor on the flow(s); 'flow': the flow itself; 'input': of the model"
+    )
     low: Number = Field(description="value at action -1")
     neutral: Number = Field(description="value while nobody acts")
     high: Number = Field(description="value at action +1")
@@ -57,10 +59,29 @@ class ControlTable(Table):
     source: Source
 
 
+class InnerRange(Table):
+    """Initial range of an inner state, in the unit that its name carries."""
+
+    low: Number
+    high: Number
+    source: Source
+
+
+class ModelTable(Table):
+    """Inner physics of a compartment."""
+
+    kind: str = Field(description="name of a compartment model")
+    form: str | None = Field(None, description="form of the equations, such as 'published' or 'sound'")
+    parameters: dict[str, Number] = Field({}, description="parameters that differ from the model's own, by name")
+    source: Source
+    initial: dict[str, InnerRange] = Field(description="initial range of each inner state")
+
+
 class NodeTable(Table):
     """A compartment that stores material."""
 
     title: str = ""
+    model: ModelTable | None = None
     role: Role
     initial: Range
     set_point: Quantity | None = None
@@ -72,10 +93,14 @@ class ArcTable(Table):
     """A compartment that moves material."""
 
     title: str = ""
+    model: ModelTable | None = None
+    by: str = Field("", description="compartment whose model gives the flow (compartment law)")
     from_: str = Field(alias="from", description="id of the node that gives")
     to: str = Field(description="id of the node that receives")
     law: Law
-    rate: Quantity | None = Field(None, description="a of the donor and recipient laws, 1/time")
+    rate: Quantity | None = Field(
+        None, description="a of the donor and recipient laws, 1/time; or flow per unit of a model's output"
+    )
     flow: Quantity | None = Field(None, description="constant flow of the exogenous law")
     series: Series | None = Field(None, description="time series of the exogenous law")
     set_point: Quantity | None = None
@@ -110,7 +135,7 @@ class EpisodeTable(Table):
 
     control_interval: Quantity
     horizon: Quantity = Field(description="decisions per episode, unit '1'")
-    solver: Literal["exact", "euler"] = "exact"
+    solver: Literal["exact", "rk4", "euler"] = "exact"
     solver_step: Quantity | None = None
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 from cirl_marl.parallel_env import NetworkParallelEnv
-from cirl_marl.vector_env import Snapshot
+from cirl_marl.state import Snapshot
 
 
 class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -29,7 +29,13 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
-        self, network: str | Path | Network, agent: str | None = None, *, scenario: str | None = None, **options: Any
+        self,
+        network: str | Path | Network,
+        agent: str | None = None,
+        *,
+        scenario: str | None = None,
+        legacy_episode: bool = False,
+        **options: Any,
     ) -> None:
         """Make the environment.
 
@@ -37,6 +43,10 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             network: catalogue name, path of a definition file, or a network.
             agent: who acts; None if the scenario has exactly one agent.
             scenario: scenario of the definition.
+            legacy_episode: reproduce the step counter of the published classes. It is checked at the start of a step
+                and survives ``reset``: when it has reached the horizon, the state is drawn anew, one step is taken from
+                there, and its time limit is reported as termination. So the first episode has horizon + 1 steps, and
+                each later one horizon − 1 and one more from an unrelated state.
             **options: those of ``parallel_env``, but for ``agents``.
 
         Raises:
@@ -52,12 +62,15 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 f"give agent=, one of {', '.join(self.parallel.possible_agents)}"
             )
         self.agent = self.parallel.possible_agents[0]
+        self._legacy = legacy_episode
+        self._elapsed = 0
         self.render_mode = self.parallel.render_mode
         self.observation_space = self.parallel.observation_space(self.agent)
         self.action_space = self.parallel.action_space(self.agent)
         network_ = self.parallel.network
-        observed = network_.observation.nodes or [node.id for node in network_.nodes]
-        self._order = np.array([network_.node_index[node] for node in observed], dtype=np.intp)
+        names = self.parallel.state_names
+        observed = network_.observation.nodes or names
+        self._order = np.array([names.index(name) for name in observed], dtype=np.intp)
 
     @property
     def network(self) -> Network:
@@ -74,10 +87,16 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Hold the action, shape (1,) in [−1, 1], for one control interval."""
+        over = self._legacy and self._elapsed >= self.network.episode.horizon
+        if over:
+            self.parallel.reset()
+            self._elapsed = 0
+        self._elapsed += 1
         observations, rewards, terminations, truncations, infos = self.parallel.step({self.agent: action})
         info = {**infos[self.agent], "state": self._paper_state()}
         agent = self.agent
-        return observations[agent], rewards[agent], terminations[agent], truncations[agent], info
+        truncated = truncations[agent] and not self._legacy
+        return observations[agent], rewards[agent], terminations[agent] or over, truncated, info
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the whole environment state, random streams included."""

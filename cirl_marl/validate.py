@@ -84,7 +84,9 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
         yield f"{where}: a cycle of zero delay: it returns to its own donor '{arc.donor}' without passing a stock"
     if not math.isfinite(arc.rate) or arc.rate < 0:
         yield f"{where}: rate {arc.rate} must be finite and not negative"
-    if arc.law in (Law.DONOR, Law.RECIPIENT) and arc.rate == 0:
+    if arc.law is Law.COMPARTMENT:
+        yield from _model_flow_problems(where, arc, network)
+    if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and arc.rate == 0:
         yield f"{where}: law '{arc.law}' needs a positive rate"
     if not arc.flow or any(not math.isfinite(f) or f < 0 for f in arc.flow):
         yield f"{where}: flow {arc.flow} must be finite and not negative"
@@ -102,14 +104,34 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
         yield f"{where}: control.low {control.low} would reverse the flow; use a second arc"
 
 
+def _model_flow_problems(where: str, arc: Arc, network: Network) -> Iterator[str]:
+    ends = (arc.id, arc.donor, arc.recipient)
+    giving = [
+        c.id
+        for c in (*network.nodes, *network.arcs)
+        if c.id in ends and c.model is not None and hasattr(c.model, "outflow")
+    ]
+    if arc.by not in giving:
+        yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
+
+
 def _common_problems(where: str, compartment: Compartment) -> Iterator[str]:
     if not math.isfinite(compartment.scale) or compartment.scale <= 0:
         yield f"{where}: scale {compartment.scale} must be positive and finite"
     if compartment.set_point is not None and not math.isfinite(compartment.set_point):
         yield f"{where}: set_point {compartment.set_point} must be finite"
+    states = compartment.model.state_names if compartment.model is not None else ()
+    if len(compartment.inner) != len(states):
+        yield f"{where}: {len(compartment.inner)} initial ranges for the inner states {list(states)}"
+    for low, high in compartment.inner:
+        if not (math.isfinite(low) and math.isfinite(high)) or low > high:
+            yield f"{where}: initial range [{low}, {high}] of an inner state is empty or not finite"
     control = compartment.control
     if control is None:
         return
+    takes_input = compartment.model is not None and len(compartment.model.input_names) == 1
+    if control.kind is ControlKind.INPUT and not takes_input:
+        yield f"{where}: control.kind 'input' needs a model with one input"
     if not all(map(math.isfinite, (control.low, control.neutral, control.high))):
         yield f"{where}: control bounds must be finite"
     elif not control.low <= control.neutral <= control.high or control.low == control.high:
@@ -160,24 +182,29 @@ def _setting_problems(network: Network) -> Iterator[str]:
         yield f"horizon {episode.horizon} must be at least 1 step"
     if not 0 <= objective.circularity_weight <= 1:
         yield f"circularity_weight {objective.circularity_weight} must lie in [0, 1]"
-    if episode.solver == "euler":
-        yield from _euler_problems(episode)
+    if episode.solver != "exact":
+        yield from _step_problems(episode)
+    elif any(compartment.model is not None for compartment in (*network.nodes, *network.arcs)):
+        yield "solver 'exact' knows no inner physics: a network with models needs solver 'rk4' or 'euler'"
     tracked = [c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None]
     for name in objective.tracked:
         if name not in tracked:
             yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
     if (network.observation.mode == "stocks") != bool(network.observation.nodes):
         yield "observation: mode 'stocks', and only that mode, lists its nodes"
-    ids = [node.id for node in network.nodes]
-    for node in network.observation.nodes:
-        if node not in ids:
-            yield f"observation: {unknown('node', node, ids)}"
+    signals: list[str] = [node.id for node in network.nodes]
+    for compartment in (*network.nodes, *network.arcs):
+        if compartment.model is not None:
+            signals.extend(f"{compartment.id}.{name}" for name in compartment.model.state_names)
+    for name in network.observation.nodes:
+        if name not in signals:
+            yield f"observation: {unknown('node or inner state', name, signals)}"
 
 
-def _euler_problems(episode: Episode) -> Iterator[str]:
+def _step_problems(episode: Episode) -> Iterator[str]:
     step = episode.solver_step
     if step is None or not step > 0:
-        yield f"solver 'euler' needs a positive solver_step, got {step}"
+        yield f"solver '{episode.solver}' needs a positive solver_step, got {step}"
         return
     ratio = episode.control_interval / step
     if not math.isclose(ratio, round(ratio), rel_tol=1e-9) or round(ratio) < 1:

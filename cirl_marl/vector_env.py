@@ -5,82 +5,27 @@ Every other view (PettingZoo, Gymnasium, the seats of the learners) stands on th
 
 from __future__ import annotations
 
-import copy
-import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
+from cirl_marl.actuators import Actuators
 from cirl_marl.catalogue import load_network
 from cirl_marl.elements import REWARDS
 from cirl_marl.errors import CirlError, ControlError, unknown
-from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network import Floats, Network
 from cirl_marl.observe import ObservationLayout
 from cirl_marl.reward import Scoring
 from cirl_marl.simulate import Dynamics
+from cirl_marl.starts import Starts
+from cirl_marl.state import Outcome, Snapshot, State
 
 Infos = dict[str, dict[str, Any]]
 COUNTERFACTUAL_CELLS = 4_000_000
 """Largest number of stocks that difference rewards re-simulate at once."""
-
-
-@dataclass(frozen=True, slots=True)
-class State:
-    """The physical state of B environments and the sums that an episode reports.
-
-    Attributes:
-        stock: stocks and the unit row, shape (nodes + 1, B), mass.
-        flow: mean flows of the last control interval, shape (arcs, B), mass/time.
-        step: control intervals done, shape (B,).
-        circularity: sum over the episode of the interval means of λ, shape (B,), mass.
-        service: sum over the episode of the service level, shape (B,).
-    """
-
-    stock: Floats
-    flow: Floats
-    step: Integers
-    circularity: Floats
-    service: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """Everything needed to go on from here, bit for bit: physical state and random streams."""
-
-    state: State
-    streams: tuple[Mapping[str, Any], ...]
-    agents: tuple[str, ...]
-    network: str
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What one control interval brought, agents stacked along axis 0.
-
-    Attributes:
-        observation: shape (entries of all agents, B), float32.
-        reward: shape (agents, B).
-        local: local rewards, shape (agents, B).
-        circularity: λ at the end of the interval, shape (B,), mass.
-        circularity_mean: mean of λ over the interval, shape (B,), mass.
-        service_level: shape (B,).
-        flow: mean flows, shape (arcs, B), mass/time.
-        truncated: time limit reached, shape (B,).
-    """
-
-    observation: NDArray[np.float32]
-    reward: Floats
-    local: Floats
-    circularity: Floats
-    circularity_mean: Floats
-    service_level: Floats
-    flow: Floats
-    truncated: NDArray[np.bool_]
 
 
 class VectorEnv:
@@ -96,6 +41,7 @@ class VectorEnv:
         reward_mode: one of ``local``, ``circularity``, ``mixed``, ``difference``, ``local_sum``.
         observation_spaces: by agent.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
+        state_names: nodes, then ``compartment.state`` of the inner states, in the order of ``state()``.
     """
 
     def __init__(
@@ -133,31 +79,24 @@ class VectorEnv:
             raise CirlError(f"num_envs must be at least 1, got {num_envs}")
         self.network = found
         self.num_envs = num_envs
-        self.agents = self._checked_agents(agents)
         self.reward_mode = _choice("reward", reward or found.objective.reward, REWARDS)
         self._team = _choice("circularity", circularity, ("end", "mean"))
         self.dynamics = Dynamics(found)
+        self._actuators = Actuators(self.dynamics, agents, num_envs)
+        self.agents = self._actuators.agents
+        self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
         self.scoring = Scoring(found, self.agents)
         self.observation_spaces = self.layout.spaces
-        self.action_spaces = {agent: Box(-1.0, 1.0, (1,), np.float32) for agent in self.agents}
-        order = {id_: i for i, id_ in enumerate(found.controllable)}
-        self._acting: Integers = np.array([order[agent] for agent in self.agents], dtype=np.intp)
-        self._all_act = self._acting.tolist() == list(range(len(order)))
-        low, high = self.dynamics.control_low[self._acting], self.dynamics.control_high[self._acting]
-        self._middle, self._half = ((high + low) / 2)[:, None], ((high - low) / 2)[:, None]
-        self._random: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
-        self._low = np.array([node.initial[0] for node in found.nodes])
-        self._width = np.array([node.initial[1] - node.initial[0] for node in found.nodes])
-        self._rows = range(len(self.agents))
+        self._starts = Starts(found, self.dynamics, num_envs)
+        self.state_names = self._starts.names
         self._state: State | None = None
         _keep_freed_memory()
 
     @property
     def neutral_action(self) -> dict[str, Floats]:
         """Normalised action of each agent that leaves it neutral, shape (1,) each."""
-        neutral = (self.dynamics.neutral[self._acting] - self._middle[:, 0]) / self._half[:, 0]
-        return {agent: neutral[i : i + 1] for i, agent in enumerate(self.agents)}
+        return self._actuators.neutral_action
 
     @property
     def physical(self) -> State:
@@ -178,19 +117,14 @@ class VectorEnv:
         Args:
             seed: an integer s seeds copy i with s + i; a sequence gives each copy its own; None goes on with the
                 streams.
-            options: ``{"initial_state": …}``: a mapping node → stock (a number or shape (num_envs,)), the rest being
-                drawn; or, in a scenario that observes ``stocks``, an array in the order of the observation.
+            options: ``{"initial_state": …}``: a mapping of node → stock and ``compartment.state`` → inner state (a
+                number or shape (num_envs,)), the rest being drawn; or, in a scenario that observes ``stocks``, an array
+                in the order of the observation.
 
         Raises:
             ControlError: for a seed, option or state that cannot be used; the environment is left as it was.
         """
-        streams = self._random if seed is None else self._streams(seed)
-        given = self._given_state(options)
-        self._random = streams
-        stock = self._draw(range(self.num_envs))
-        for node, values in given.items():
-            stock[node] = values
-        self._state = self._fresh(stock)
+        self._state = self._fresh(self._starts.begin(seed, options))
         return self.by_agent(self._observe(self._state))
 
     def step(
@@ -230,19 +164,7 @@ class VectorEnv:
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (agents, B); the checks of ``step`` apply."""
-        stacked = np.empty((len(self.agents), self.num_envs))
-        if len(actions) != len(self.agents):
-            raise ControlError(self._wrong_agents(actions))
-        for i, agent in enumerate(self.agents):
-            if agent not in actions:
-                raise ControlError(self._wrong_agents(actions))
-            action = np.asarray(actions[agent])
-            if action.shape != (self.num_envs, 1):
-                raise ControlError(f"action of agent '{agent}' has shape {action.shape}, expected {(self.num_envs, 1)}")
-            if action.dtype.kind not in "biuf":
-                raise ControlError(f"action of agent '{agent}' is {actions[agent]!r}; it must hold numbers in [-1, 1]")
-            stacked[i] = action[:, 0]
-        return stacked
+        return self._actuators.stack(actions)
 
     def advance(self, actions: Floats) -> Outcome:
         """Hold stacked actions, shape (agents, B), for one control interval; no copy is restarted.
@@ -251,53 +173,46 @@ class VectorEnv:
             ControlError: for NaN, values outside [−1, 1], or an episode that is over.
         """
         state, dynamics = self.physical, self.dynamics
-        if not (actions.max() <= 1.0 and actions.min() >= -1.0):
-            raise ControlError(self._wrong_values(actions))
         horizon = self.network.episode.horizon
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
-        controls = self.controls(actions)
-        transition = dynamics.advance(state.stock, dynamics.rate(controls, state.step))
+        controls = self._actuators.controls(actions)
+        transition = dynamics.advance(state.stock, state.inner, controls, state.step)
         flow = transition.moved / self.network.episode.control_interval
-        quantities = np.concatenate([transition.stock[:-1], flow])
+        quantities = np.concatenate([transition.stock[:-1], flow, transition.inner])
         levels = self.scoring.levels(quantities)
         service = self.scoring.service_level(levels)
-        terms = self.scoring.terms(quantities, levels)
+        terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
         local = self.scoring.local(terms)
-        circularity = self.network.circularity(dynamics.flow(transition.stock, transition.rate))
+        circularity = self.network.circularity(transition.flow)
         mean = self.network.circularity(flow)
         team = circularity if self._team == "end" else mean
         reward = self._reward(team, local, terms, state, controls)
         step = state.step + 1
-        self._state = State(transition.stock, flow, step, state.circularity + mean, state.service + service)
+        self._state = State(
+            transition.stock, transition.inner, flow, step, state.circularity + mean, state.service + service
+        )
         observation = self.layout.observe(quantities, step / horizon, levels)
         return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon)
 
-    def controls(self, actions: Floats) -> Floats:
-        """Map stacked actions, shape (agents, B), to the physical values of every control, shape (controls, B)."""
-        acting = actions * self._half
-        acting += self._middle
-        if self._all_act:
-            return acting
-        controls = np.repeat(self.dynamics.neutral[:, None], actions.shape[1], axis=1)
-        controls[self._acting] = acting
-        return controls
-
     def local_rewards(self) -> dict[str, Floats]:
         """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
-        quantities = self._quantities(self.physical)
-        rewards = self.scoring.local_of_all(self.scoring.terms(quantities, self.scoring.levels(quantities)))
+        state = self.physical
+        quantities = self._quantities(state)
+        neutral = np.repeat(self.dynamics.neutral[:, None], self.num_envs, axis=1)
+        inner = self.dynamics.inner.rewards(state.inner, state.inner, neutral)
+        rewards = self.scoring.local_of_all(self.scoring.terms(quantities, self.scoring.levels(quantities), inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
 
     def state(self) -> Floats:
-        """Return the whole state, shape (B, nodes + 1): stocks in mass units, then the elapsed share of time."""
+        """Return the whole state, shape (B, nodes + states + 1): stocks, inner states, elapsed share of time."""
         state = self.physical
-        return np.concatenate([state.stock[:-1].T, (state.step / self.network.episode.horizon)[:, None]], axis=1)
+        time = state.step / self.network.episode.horizon
+        return np.concatenate([state.stock[:-1], state.inner, time[None]]).T
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the state and the random streams; environments are not changed."""
-        streams = tuple(copy.deepcopy(dict(stream.bit_generator.state)) for stream in self._random)
-        return Snapshot(_copied(self.physical), streams, self.agents, self._identity)
+        return Snapshot(self.physical.copied(), self._starts.saved_streams(), self.agents, self._identity)
 
     def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
         """Go back to a snapshot and return the observations there.
@@ -309,9 +224,8 @@ class VectorEnv:
         ours = (self._identity, self.num_envs, self.agents)
         if theirs != ours:
             raise ControlError(f"the snapshot (network, copies, agents) {theirs} does not fit {ours}")
-        for stream, saved in zip(self._random, snapshot.streams, strict=True):
-            stream.bit_generator.state = copy.deepcopy(dict(saved))
-        self._state = _copied(snapshot.state)
+        self._starts.restore_streams(snapshot.streams)
+        self._state = snapshot.state.copied()
         return self.by_agent(self._observe(self._state))
 
     def close(self) -> None:
@@ -358,19 +272,20 @@ class VectorEnv:
         dynamics, batch = self.dynamics, self.num_envs
         chunk = max(1, COUNTERFACTUAL_CELLS // state.stock.size)
         results = []
-        for start in range(0, len(self._acting), chunk):
-            rows = self._acting[start : start + chunk]
+        for start in range(0, len(self._actuators.acting), chunk):
+            rows = self._actuators.acting[start : start + chunk]
             count = len(rows)
             imagined = np.tile(controls, (1, count))
             for i, row in enumerate(rows):
                 imagined[row, i * batch : (i + 1) * batch] = dynamics.neutral[row]
-            rate = dynamics.rate(imagined, np.tile(state.step, count))
-            transition = dynamics.advance(np.tile(state.stock, (1, count)), rate)
-            flow = (
-                dynamics.flow(transition.stock, transition.rate)
-                if self._team == "end"
-                else transition.moved / self.network.episode.control_interval
+            transition = dynamics.advance(
+                np.tile(state.stock, (1, count)),
+                np.tile(state.inner, (1, count)),
+                imagined,
+                np.tile(state.step, count),
             )
+            mean = transition.moved / self.network.episode.control_interval
+            flow = transition.flow if self._team == "end" else mean
             results.append(self.network.circularity(flow).reshape(count, batch))
         return np.concatenate(results)
 
@@ -388,12 +303,13 @@ class VectorEnv:
     def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in the copies that ended and return the observation of all."""
         which = np.flatnonzero(ended)
-        stock = self.physical.stock[:-1].copy()
-        stock[:, which] = self._draw(which)
-        fresh = self._fresh(stock)
         old = self.physical
+        drawn = np.concatenate([old.stock[:-1], old.inner])
+        drawn[:, which] = self._starts.draw(which)
+        fresh = self._fresh(drawn)
         self._state = State(
             fresh.stock,
+            fresh.inner,
             np.where(ended, fresh.flow, old.flow),
             np.where(ended, 0, old.step),
             np.where(ended, 0.0, old.circularity),
@@ -401,110 +317,23 @@ class VectorEnv:
         )
         return self._observe(self._state)
 
-    def _fresh(self, stock: Floats) -> State:
+    def _fresh(self, drawn: Floats) -> State:
         """State at the start of an episode; the flows are those that neutral control would give."""
-        dynamics, batch = self.dynamics, stock.shape[1]
-        extended = dynamics.extend(stock)
+        dynamics, batch, nodes = self.dynamics, drawn.shape[1], len(self.network.nodes)
+        stock, inner = dynamics.extend(drawn[:nodes]), np.ascontiguousarray(drawn[nodes:])
         step = np.zeros(batch, dtype=np.intp)
-        rate = dynamics.rate(np.repeat(dynamics.neutral[:, None], batch, axis=1), step)
+        neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
+        flow = dynamics.flow_at(stock, inner, neutral, dynamics.rate(neutral, step))
         zeros = np.zeros(batch)
-        return State(extended, dynamics.flow(extended, rate), step, zeros, zeros)
+        return State(stock, inner, flow, step, zeros, zeros)
 
     def _quantities(self, state: State) -> Floats:
-        return np.concatenate([state.stock[:-1], state.flow])
+        return np.concatenate([state.stock[:-1], state.flow, state.inner])
 
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
         return self.layout.observe(quantities, time, self.scoring.levels(quantities))
-
-    def _draw(self, which: Sequence[int] | range | Integers) -> Floats:
-        """Draw initial stocks of some copies, each from its own stream, shape (nodes, len(which))."""
-        uniform = np.empty((len(self._low), len(which)))
-        for column, i in enumerate(which):
-            uniform[:, column] = self._random[i].random(len(self._low))
-        uniform *= self._width[:, None]
-        uniform += self._low[:, None]
-        return uniform
-
-    def _streams(self, seed: int | Sequence[int]) -> list[np.random.Generator]:
-        if isinstance(seed, int | np.integer):
-            seeds = [int(seed) + i for i in range(self.num_envs)]
-        else:
-            seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else []
-        if len(seeds) != self.num_envs or any(not isinstance(s, int | np.integer) or s < 0 for s in seeds):
-            raise ControlError(f"seed {seed!r} must be a non-negative integer, or {self.num_envs} of them")
-        return [np.random.default_rng(s) for s in seeds]
-
-    def _given_state(self, options: Mapping[str, Any] | None) -> dict[int, Floats]:
-        """Return the given initial stocks by node position."""
-        options = options or {}
-        for key in options:  # other keys are for wrappers: PettingZoo's own test passes one; a misspelt one is an error
-            if key != "initial_state" and difflib.get_close_matches(str(key), ["initial_state"]):
-                raise ControlError(f"reset options: {unknown('option', key, ['initial_state'])}")
-        given = options.get("initial_state", {})
-        if not isinstance(given, Mapping):
-            nodes = self.network.observation.nodes
-            values = np.asarray(given, dtype=float)
-            if not nodes or values.shape != (len(nodes),):
-                raise ControlError(
-                    f"initial_state has shape {values.shape}: give a mapping node → stock"
-                    + (f", or the stocks of {', '.join(nodes)} in this order" if nodes else "")
-                )
-            given = dict(zip(nodes, values, strict=True))
-        checked = {self._node(id_): self._stock(id_, values) for id_, values in given.items()}
-        limit = sum(node.initial[1] for node in self.network.nodes)
-        most = self._low + self._width
-        if self.dynamics.exact and checked:
-            total = sum(float(np.max(checked.get(i, most[i]))) for i in range(len(most)))
-            if total > limit * (1 + 1e-9):
-                raise ControlError(
-                    f"initial_state: {total:.6g} {self.network.mass_unit} in all, but the observation space of "
-                    f"'{self.network.name}' covers {limit:.6g}; widen the initial ranges of the definition"
-                )
-        return checked
-
-    def _node(self, id_: str) -> int:
-        if id_ not in self.network.node_index:
-            raise ControlError(f"initial_state: {unknown('node', id_, self.network.node_index)}")
-        return self.network.node_index[id_]
-
-    def _stock(self, id_: str, values: ArrayLike) -> Floats:
-        stock = np.asarray(values, dtype=float)
-        if stock.shape not in ((), (self.num_envs,)):
-            raise ControlError(f"initial_state of '{id_}' has shape {stock.shape}, expected () or {(self.num_envs,)}")
-        if not np.isfinite(stock).all() or (self.dynamics.exact and (stock < 0).any()):
-            raise ControlError(f"initial_state of '{id_}' is {values!r}: stocks are finite and not negative")
-        return stock
-
-    def _checked_agents(self, agents: Sequence[str] | None) -> tuple[str, ...]:
-        network = self.network
-        if agents is None:
-            chosen = network.agents
-        elif isinstance(agents, str):
-            raise CirlError(f"agents must be a sequence of ids, not the string '{agents}'")
-        else:
-            chosen = tuple(agents)
-        for agent in chosen:
-            if agent not in network.controllable:
-                raise CirlError(f"network '{network.name}': {unknown('agent', agent, network.controllable)}")
-        if not chosen or len(set(chosen)) != len(chosen):
-            raise CirlError(f"network '{network.name}': agents {list(chosen)} must be distinct and at least one")
-        return chosen
-
-    def _wrong_agents(self, actions: Mapping[str, object]) -> str:
-        for agent in actions:
-            if agent not in self.agents:
-                return f"actions: {unknown('agent', agent, self.agents)}"
-        return f"actions are missing for {[agent for agent in self.agents if agent not in actions]}"
-
-    def _wrong_values(self, actions: Floats) -> str:
-        wrong = ~((actions >= -1.0) & (actions <= 1.0))
-        agent, copy_ = np.argwhere(wrong)[0]
-        return (
-            f"action of agent '{self.agents[agent]}' in copy {copy_} is {actions[agent, copy_]}; "
-            "it must be a number in [-1, 1]"
-        )
 
 
 def _choice(what: str, value: str, known: Sequence[str]) -> str:
@@ -520,7 +349,3 @@ def _keep_freed_memory() -> None:
     faults than on arithmetic. The block is never touched, so it costs nothing; other allocators ignore it.
     """
     np.empty(30 * 2**20, dtype=np.uint8)
-
-
-def _copied(state: State) -> State:
-    return replace(state, **{name: getattr(state, name).copy() for name in State.__slots__})

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Iterator
+from typing import Any
 
 from cirl_marl.elements import Arc, Compartment, Control, ControlKind, Law, Node
 from cirl_marl.network import Network
@@ -62,7 +64,9 @@ def _arc(network: Network, arc: Arc) -> Iterator[str]:
     flow = _flow(network)
     yield f"[arcs.{arc.id}]\nfrom = {_text(arc.donor)}\nto = {_text(arc.recipient)}\nlaw = {_text(arc.law.value)}"
     yield f"pollutant = {json.dumps(arc.pollutant)}"
-    if arc.law in (Law.DONOR, Law.RECIPIENT):
+    if arc.law is Law.COMPARTMENT:
+        yield f"by = {_text(arc.by)}\nrate = {_quantity(arc.rate, _flow(network))}"
+    elif arc.law in (Law.DONOR, Law.RECIPIENT):
         yield f"rate = {_quantity(arc.rate, f'1/({network.time_unit})')}"
     elif arc.law is Law.EXOGENOUS and not arc.times:
         yield f"flow = {_quantity(arc.flow[0], flow)}"
@@ -79,6 +83,8 @@ def _common(network: Network, compartment: Compartment, unit: str) -> Iterator[s
     yield f"scale = {_quantity(compartment.scale, unit)}"
     if compartment.set_point is not None:
         yield f"set_point = {_quantity(compartment.set_point, unit)}"
+    if compartment.model is not None:
+        yield f"model = {_model(compartment)}"
     if compartment.control is not None:
         yield f"control = {_control(network, compartment.control)}"
 
@@ -88,6 +94,21 @@ def _control(network: Network, control: Control) -> str:
     return (
         f"{{ kind = {_text(control.kind.value)}, low = {float(control.low)!r}, neutral = {float(control.neutral)!r}, "
         f"high = {float(control.high)!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
+    )
+
+
+def _model(compartment: Compartment) -> str:
+    model: Any = compartment.model
+    values = dataclasses.asdict(model)
+    form = f"form = {_text(values.pop('form'))}, " if "form" in values else ""
+    parameters = ", ".join(f"{name} = {float(value)!r}" for name, value in values.items())
+    initial = ", ".join(
+        f"{name} = {{ low = {low!r}, high = {high!r}, source = {_text(SOURCE)} }}"
+        for name, (low, high) in zip(model.state_names, compartment.inner, strict=True)
+    )
+    return (
+        f"{{ kind = {_text(model.kind)}, {form}parameters = {{ {parameters} }}, source = {_text(SOURCE)}, "
+        f"initial = {{ {initial} }} }}"
     )
 
 

@@ -520,7 +520,7 @@ def test_bad_options_of_the_views() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"usage": 1.0}, "unknown node 'usage'. Did you mean 'use'"),
+        ({"usage": 1.0}, "unknown node or inner state 'usage'. Did you mean 'use'"),
         ({"use": -1.0}, "'use' is -1.0"),
         ({"use": np.nan}, "'use' is nan"),
         ({"use": [1.0, 2.0, 3.0]}, "'use' has shape"),

@@ -18,17 +18,15 @@ LAYERS = (
         "rowsum",
         "validate",
         "network",
-        "schema",
-        "definition",
-        "writing",
-        "catalogue",
     },
-    {"compartments", "simulate", "observe", "reward", "vector_env"},
+    {"compartments"},
+    {"schema", "mistakes", "conversion", "definition", "writing", "catalogue"},
+    {"flows", "inner", "simulate", "actuators", "starts", "state", "observe", "reward", "vector_env"},
     {"parallel_env", "single_env", "registration"},
     {"controllers", "learners", "evaluate", "report", "nested", "testing"},
     {"cli"},
 )
-"""Network ← environments ← learners ← command line; a module imports from its own layer or earlier ones."""
+"""From the network to the command line; a module imports from its own layer or earlier ones."""
 
 
 def test_import_is_light() -> None:

@@ -64,7 +64,7 @@ def assert_conserves(network: Network, seed: int) -> None:
         # 1e-12 of what moved, plus what adding the flows to the stocks rounds away in each solver step
         bound = 1e-12 * moved + step * env.dynamics.substeps * EPS * largest
         assert (residual <= bound).all(), f"step {step}: residual {residual}, bound {bound}"
-        if env.dynamics.exact:
+        if env.dynamics.physical:
             assert (stock >= 0).all(), f"step {step}: stock {stock.min()}"
             assert (outcome.flow >= 0).all(), f"step {step}: flow {outcome.flow.min()}"
 

@@ -44,6 +44,9 @@ def order(id_: str, donor: str, recipient: str, most: float) -> Arc:
     return Arc(id=id_, donor=donor, recipient=recipient, law=Law.CONTROLLED, control=control)
 
 
+NO_STATES = np.empty((0, 1))
+
+
 def neutral_rate(dynamics: Dynamics, step: int = 0) -> Floats:
     """Return the rates under neutral control."""
     return dynamics.rate(dynamics.neutral[:, None], np.array([step]))
@@ -59,7 +62,7 @@ def advanced(network: Network, steps: int = 1) -> Floats:
     dynamics = Dynamics(network)
     stock = start(network)
     for step in range(steps):
-        stock = dynamics.advance(stock, neutral_rate(dynamics, step)).stock
+        stock = dynamics.advance(stock, NO_STATES, dynamics.neutral[:, None], np.array([step])).stock
     return stock[:-1, 0]
 
 
@@ -168,7 +171,7 @@ def test_overdrawn_donor_is_emptied(rate: float) -> None:
         arcs.append(Arc(id="leak", donor="a", recipient="c", rate=rate))
     network = small({"a": 10.0, "b": 0.0, "c": 0.0}, arcs)
     dynamics = Dynamics(network)
-    transition = dynamics.advance(start(network), neutral_rate(dynamics))
+    transition = dynamics.advance(start(network), NO_STATES, dynamics.neutral[:, None])
     stock = transition.stock[:-1, 0]
     assert 0 <= stock[0] <= 1e-10
     assert stock.sum() == pytest.approx(10.0, rel=1e-14)

@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cirl_marl.catalogue import recipe_path
-from cirl_marl.definition import mistakes_of, read_toml
+from cirl_marl.definition import read_toml
 from cirl_marl.elements import Node, Role
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
 from cirl_marl.learners.algorithms import algorithm_class, algorithms, checked_parameters
+from cirl_marl.mistakes import mistakes_of
 from cirl_marl.network import Network
 
 

@@ -1,0 +1,107 @@
+"""From the normalised actions of agents to the physical controls of a network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike
+
+from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.flows import FlowLaws
+from cirl_marl.network import Floats, Integers, Network
+
+
+class Actuators:
+    """Checks actions and maps them linearly from [−1, 1] to the bounds of the controls.
+
+    Attributes:
+        agents: compartments that act, in the order of every stacked array.
+        acting: row of each agent's control among all controls, shape (agents,).
+        spaces: action space of each agent.
+    """
+
+    def __init__(self, laws: FlowLaws, agents: Sequence[str] | None, num_envs: int) -> None:
+        """Let ``agents`` act, None being the network's own choice.
+
+        Raises:
+            CirlError: if one of them is unknown or named twice.
+        """
+        network = laws.network
+        self.agents = _checked(network, agents)
+        self.num_envs = num_envs
+        order = {id_: i for i, id_ in enumerate(network.controllable)}
+        self.acting: Integers = np.array([order[agent] for agent in self.agents], dtype=np.intp)
+        self.spaces = {agent: Box(-1.0, 1.0, (1,), np.float32) for agent in self.agents}
+        self._all_act = self.acting.tolist() == list(range(len(order)))
+        self._neutral = laws.neutral
+        low, high = laws.control_low[self.acting], laws.control_high[self.acting]
+        self._middle, self._half = ((high + low) / 2)[:, None], ((high - low) / 2)[:, None]
+
+    @property
+    def neutral_action(self) -> dict[str, Floats]:
+        """Normalised action of each agent that leaves it neutral, shape (1,) each."""
+        neutral = (self._neutral[self.acting] - self._middle[:, 0]) / self._half[:, 0]
+        return {agent: neutral[i : i + 1] for i, agent in enumerate(self.agents)}
+
+    def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
+        """Stack the actions of all agents, shape (agents, B); the checks of ``step`` apply."""
+        stacked = np.empty((len(self.agents), self.num_envs))
+        if len(actions) != len(self.agents):
+            raise ControlError(self._wrong_agents(actions))
+        for i, agent in enumerate(self.agents):
+            if agent not in actions:
+                raise ControlError(self._wrong_agents(actions))
+            action = np.asarray(actions[agent])
+            if action.shape != (self.num_envs, 1):
+                raise ControlError(f"action of agent '{agent}' has shape {action.shape}, expected {(self.num_envs, 1)}")
+            if action.dtype.kind not in "biuf":
+                raise ControlError(f"action of agent '{agent}' is {actions[agent]!r}; it must hold numbers in [-1, 1]")
+            stacked[i] = action[:, 0]
+        return stacked
+
+    def controls(self, actions: Floats) -> Floats:
+        """Map stacked actions, shape (agents, B), to the physical values of every control, shape (controls, B).
+
+        Raises:
+            ControlError: for NaN or values outside [−1, 1].
+        """
+        if not (actions.max() <= 1.0 and actions.min() >= -1.0):
+            raise ControlError(self._wrong_values(actions))
+        acting = actions * self._half
+        acting += self._middle
+        if self._all_act:
+            return acting
+        controls = np.repeat(self._neutral[:, None], actions.shape[1], axis=1)
+        controls[self.acting] = acting
+        return controls
+
+    def _wrong_agents(self, actions: Mapping[str, object]) -> str:
+        for agent in actions:
+            if agent not in self.agents:
+                return f"actions: {unknown('agent', agent, self.agents)}"
+        return f"actions are missing for {[agent for agent in self.agents if agent not in actions]}"
+
+    def _wrong_values(self, actions: Floats) -> str:
+        wrong = ~((actions >= -1.0) & (actions <= 1.0))
+        agent, copy_ = np.argwhere(wrong)[0]
+        return (
+            f"action of agent '{self.agents[agent]}' in copy {copy_} is {actions[agent, copy_]}; "
+            "it must be a number in [-1, 1]"
+        )
+
+
+def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:
+    if agents is None:
+        chosen = network.agents
+    elif isinstance(agents, str):
+        raise CirlError(f"agents must be a sequence of ids, not the string '{agents}'")
+    else:
+        chosen = tuple(agents)
+    for agent in chosen:
+        if agent not in network.controllable:
+            raise CirlError(f"network '{network.name}': {unknown('agent', agent, network.controllable)}")
+    if not chosen or len(set(chosen)) != len(chosen):
+        raise CirlError(f"network '{network.name}': agents {list(chosen)} must be distinct and at least one")
+    return chosen

@@ -1,0 +1,49 @@
+"""The air between those that emit and those that remove, as one well-mixed box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from cirl_marl.compartments.model import RewardState, check_positive
+from cirl_marl.rowsum import Floats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Atmosphere:
+    """Stock of CO₂ that rises by what is emitted and falls by what is removed: ṁ = ṁ12 − ṁ23 (arXiv 2502.02382).
+
+    In a network the stock is the node's and the network integrates it; the model stands alone for studies of the box
+    and gives its concentration. There is one form. No reward is published; it is −|ṁ12 − ṁ23|, zero at net zero.
+
+    Attributes:
+        volume_l: volume of the box, L.
+    """
+
+    kind: ClassVar[str] = "atmosphere"
+    state_names: ClassVar[tuple[str, ...]] = ("co2_mmol",)
+    input_names: ClassVar[tuple[str, ...]] = ("emission_mmol_day", "removal_mmol_day")
+    time_unit: ClassVar[str] = "day"
+    reward_state: ClassVar[RewardState] = "before"
+
+    volume_l: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        check_positive(self.kind, volume_l=self.volume_l)
+
+    def derivative(self, state: Floats, inputs: Floats) -> Floats:
+        """Return ṁ, mmol/d, shape (1, B)."""
+        return inputs[:1] - inputs[1:2]
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return −|ṁ12 − ṁ23|, mmol/d, shape (B,)."""
+        imbalance: Floats = np.abs(inputs[0] - inputs[1])
+        return -imbalance
+
+    def concentration_mmol_l(self, state: Floats) -> Floats:
+        """Return the concentration, mmol/L, shape (B,)."""
+        concentration: Floats = state[0] / self.volume_l
+        return concentration

@@ -1,0 +1,242 @@
+"""The incinerator: a wastebed on a grate, and the freeboard in which its gases burn out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from cirl_marl.compartments.model import PaperScenario, RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.rowsum import Floats
+
+KELVIN = 273.15
+
+PAPER = PaperScenario(
+    initial_state=(0.0, 0.0, 20.0, 0.0, 0.0, 20.0),
+    input_low=(-1e6,),
+    input_high=(1e6,),
+    horizon=100,
+    inferred_initial=((0.0, 0.0), (0.0, 0.0), (20.0, 20.0), (0.0, 0.0), (0.0, 0.0), (900.0, 1100.0)),
+    # float32 of 20·dt, 1·dt, 20 + 0.84·dt, 4·dt, 3·dt less the same in float64; the last state was float64 throughout
+    reference_start=(
+        float(np.float32(1e-3)) - 1e-3,
+        float(np.float32(5e-5)) - 5e-5,
+        20.0 + (float(np.float32(20.000042)) - 20.000042),
+        float(np.float32(2e-4)) - 2e-4,
+        float(np.float32(1.5e-4)) - 1.5e-4,
+        20.0,
+    ),
+)
+"""Incinerator: one step is 5·10⁻⁵ min. Horizon 100 and T_g(0) ~ U[900, 1100] °C are inferred: from the released 20 °C a
+step costs 9.6·10⁵, while the paper's whole episodes cost 3.2·10⁵ to 3.8·10⁵."""
+
+
+class Flows(NamedTuple):
+    """Flows and conversions, kg/min, each of shape (B,) or a number."""
+
+    feed: Floats | float
+    ash: Floats | float
+    consumed: Floats | float
+    char_made: Floats | float
+    char_burnt: Floats | float
+    char_out: Floats | float
+    gas_made: Floats | float
+    to_freeboard: Floats | float
+    flue: Floats | float
+
+
+PUBLISHED_FLOWS = Flows(
+    feed=100.0,
+    ash=10.0,
+    consumed=70.0,
+    char_made=6.0,
+    char_burnt=3.0,
+    char_out=2.0,
+    gas_made=1.0,
+    to_freeboard=2.0,
+    flue=2.0,
+)
+"""F_in, F_out, R_w, P, R_c, F_c, R_g, F_w, F_g. [published] They leave 3 kg/min of gas in the freeboard for ever."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Incinerator:
+    """Masses and temperatures of wastebed (waste M, char M_c, gas M_w, T_w) and freeboard (gas M_f, T_g).
+
+    Ṁ = F_in − F_out − R_w, Ṁ_c = P − R_c − F_c, Ṁ_w = F_aI + R_g − F_w, Ṁ_f = F_w + F_aII − F_g,
+    (c_w M + c_c M_c + C_grate)Ṫ_w = bed power,
+    (c_g M_f + C_free)Ṫ_g = F_w c_g(T_w − T_g) + F_aII c_g(T_a − T_g) + Q_g − Q_ext.
+    The control is Q_ext, heat taken from the freeboard (negative: a burner). Reward: −(1000 − T_g)² after the step.
+
+    ``published``: bed power F_in c_w **T_w** + F_aI c_g(T_a − T_w) + Q: the feed brings heat at the bed's own
+    temperature and nothing takes it out, so T_w grows for ever (743 °C at 180 min); ``c_p_m`` is assigned 25, then 5,
+    so C_grate = 5·500; all rates are constants, so masses grow for ever and R_g = 1 loses mass.
+    ``energy_balance``: bed power F_in c_w(T_a − T_w) + F_aI c_g(T_a − T_w) + Q and C_grate = 25·500, the rest as
+    published: 20.6 °C at 180 min (20.8 with the grate's 5). With Q = 0 no temperature leaves the range of what
+    flows in.
+    ``sound``: besides, rates follow what is there. F_out, R_w ∝ M and F_c, R_c ∝ M_c, equal to the published ones at
+    the reference inventories; R ∝ θ = exp(T_A(1/T_ref − 1/T_w)); P = 6/70·R_w; gas leaves after a residence time;
+    R_g = R_w − P + R_c, so mass is conserved; heat h·R_g, a share of it in the bed; bed and freeboard exchange
+    U(T_g − T_w); and Q_ext ≤ U_rec(T_g − T_a), for nothing cools below ambient. A cold bed does not ignite: start it
+    hot (M 2400, M_c 150, M_w 36, M_f 37 kg, T_w 300, T_g 1000 °C); Q_ext ≈ 6.4·10⁵ kJ/min (11 MW) then holds 1000 °C.
+
+    Source: published code of arXiv 2505.21536, "not taken from a real incinerator", after Magnanelli et al., Energy 209
+    (2020) 118426; its only units are min and °C, kg and kJ are inferred. The reference trajectory is reproduced to the
+    last digit from its second row on. Numbers of ``sound`` alone are chosen, at the scale of a 6 t/h plant.
+
+    Attributes:
+        form: ``published``, ``energy_balance`` or ``sound``.
+        feed_kg_min: F_in unless ``derivative`` is given another. [published]
+        air_bed_kg_min: F_aI. [published]
+        air_freeboard_kg_min: F_aII. [published]
+        ambient_degc: T_a of air and feed. [published; of the feed inferred]
+        waste_heat_kj_kg_k: c_w. [published]
+        char_heat_kj_kg_k: c_c. [published]
+        gas_heat_kj_kg_k: c_g. [published]
+        grate_kg: mass of the grate. [published]
+        grate_heat_kj_kg_k: c of the grate, 25; ``published`` uses the freeboard's. [published]
+        freeboard_kg: mass of the freeboard's walls. [published]
+        freeboard_heat_kj_kg_k: c of the walls. [published]
+        bed_heat_kj_min: Q, constant rates only. [published]
+        freeboard_heat_kj_min: Q_g, constant rates only. [published]
+        target_degc: set-point of T_g. [published]
+        waste_reference_kg: M at which F_out = 10 and R_w = 70. [chosen: half an hour's throughput]
+        char_reference_kg: M_c at which F_c = 2 and R_c = 3. [chosen: half an hour]
+        reference_degc: T_ref, where θ = 1. [chosen]
+        activation_k: T_A. [chosen]
+        gas_residence_min: of wastebed and freeboard gas. [chosen]
+        combustion_kj_kg: h, heat per kg turned to gas. [chosen: lower heating value of municipal waste]
+        bed_share: share of the heat released in the bed. [chosen]
+        exchange_kj_min_k: U between freeboard and bed. [chosen]
+        recovery_kj_min_k: U_rec of the heat recovery. [chosen]
+    """
+
+    kind: ClassVar[str] = "incinerator"
+    state_names: ClassVar[tuple[str, ...]] = (
+        "waste_kg",
+        "char_kg",
+        "wastebed_degc",
+        "wastebed_gas_kg",
+        "freeboard_gas_kg",
+        "freeboard_degc",
+    )
+    input_names: ClassVar[tuple[str, ...]] = ("heat_taken_kj_min",)
+    time_unit: ClassVar[str] = "min"
+    reward_state: ClassVar[RewardState] = "after"
+    paper: ClassVar[PaperScenario] = PAPER
+
+    form: Literal["published", "energy_balance", "sound"] = "sound"
+    feed_kg_min: float = 100.0
+    air_bed_kg_min: float = 5.0
+    air_freeboard_kg_min: float = 3.0
+    ambient_degc: float = 20.0
+    waste_heat_kj_kg_k: float = 1.0
+    char_heat_kj_kg_k: float = 1.0
+    gas_heat_kj_kg_k: float = 5.0
+    grate_kg: float = 500.0
+    grate_heat_kj_kg_k: float = 25.0
+    freeboard_kg: float = 120.0
+    freeboard_heat_kj_kg_k: float = 5.0
+    bed_heat_kj_min: float = 100.0
+    freeboard_heat_kj_min: float = 450.0
+    target_degc: float = 1000.0
+    waste_reference_kg: float = 2400.0
+    char_reference_kg: float = 150.0
+    reference_degc: float = 300.0
+    activation_k: float = 5000.0
+    gas_residence_min: float = 0.5
+    combustion_kj_kg: float = 10_000.0
+    bed_share: float = 0.05
+    exchange_kj_min_k: float = 20.0
+    recovery_kj_min_k: float = 1000.0
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        check_form(self.form, ("published", "energy_balance", "sound"))
+        values = {name: getattr(self, name) for name in (f.name for f in fields(self)) if name != "form"}
+        free = ("ambient_degc", "reference_degc", "target_degc")
+        needed = ("grate", "freeboard_kg", "freeboard_heat_kj_kg_k", "reference_kg", "residence")
+        positive = {name: values[name] for name in values if any(part in name for part in needed)}
+        check_positive(self.kind, **positive, reference_k=self.reference_degc + KELVIN)
+        check_not_negative(self.kind, **{name: values[name] for name in values if name not in free})
+
+    def flows(self, state: Floats, feed_kg_min: Floats | float | None = None) -> Flows:
+        """Return every flow and conversion, kg/min."""
+        feed = self.feed_kg_min if feed_kg_min is None else feed_kg_min
+        if self.form != "sound":
+            return PUBLISHED_FLOWS._replace(feed=feed)
+        waste, char, bed_degc, bed_gas, freeboard_gas, _ = state
+        inverse = 1.0 / (self.reference_degc + KELVIN) - 1.0 / (bed_degc + KELVIN)
+        faster = np.exp(self.activation_k * inverse)
+        of_waste, of_char = waste / self.waste_reference_kg, char / self.char_reference_kg
+        usual = PUBLISHED_FLOWS
+        consumed, char_burnt = usual.consumed * faster * of_waste, usual.char_burnt * faster * of_char
+        char_made = usual.char_made / usual.consumed * consumed
+        return Flows(
+            feed=feed,
+            ash=usual.ash * of_waste,
+            consumed=consumed,
+            char_made=char_made,
+            char_burnt=char_burnt,
+            char_out=usual.char_out * of_char,
+            gas_made=consumed - char_made + char_burnt,
+            to_freeboard=bed_gas / self.gas_residence_min,
+            flue=freeboard_gas / self.gas_residence_min,
+        )
+
+    def derivative(self, state: Floats, inputs: Floats, *, feed_kg_min: Floats | float | None = None) -> Floats:
+        """Return dz/dt per minute, shape (6, B).
+
+        Args:
+            state: (M, M_c, T_w, M_w, M_f, T_g), shape (6, B).
+            inputs: (Q_ext,), shape (1, B).
+            feed_kg_min: waste that arrives, shape (B,) or a number; None takes the parameter.
+        """
+        flows = self.flows(state, feed_kg_min)
+        bed_power, freeboard_power = self.powers(state, inputs, flows)
+        bed_capacity, freeboard_capacity = self.capacities(state)
+        like = np.zeros_like(state[0])
+        return np.stack(
+            [
+                like + (flows.feed - flows.ash - flows.consumed),
+                like + (-flows.char_out + flows.char_made - flows.char_burnt),
+                bed_power / bed_capacity,
+                like + (self.air_bed_kg_min - flows.to_freeboard + flows.gas_made),
+                like + (flows.to_freeboard - flows.flue + self.air_freeboard_kg_min),
+                freeboard_power / freeboard_capacity,
+            ]
+        )
+
+    def powers(self, state: Floats, inputs: Floats, flows: Flows) -> tuple[Floats, Floats]:
+        """Return what heats wastebed and freeboard, kJ/min, each of shape (B,)."""
+        bed, freeboard, taken = state[2], state[5], inputs[0]
+        gas, ambient = self.gas_heat_kj_kg_k, self.ambient_degc
+        fed = bed if self.form == "published" else ambient - bed
+        bed_power = flows.feed * self.waste_heat_kj_kg_k * fed + self.air_bed_kg_min * gas * (ambient - bed)
+        freeboard_power = flows.to_freeboard * gas * (bed - freeboard)
+        freeboard_power = freeboard_power + self.air_freeboard_kg_min * gas * (ambient - freeboard)
+        if self.form != "sound":
+            return bed_power + self.bed_heat_kj_min, freeboard_power + self.freeboard_heat_kj_min - taken
+        released = self.combustion_kj_kg * flows.gas_made
+        exchanged = self.exchange_kj_min_k * (freeboard - bed)
+        taken = np.minimum(taken, self.recovery_kj_min_k * (freeboard - ambient))
+        bed_power = bed_power + self.bed_share * released + exchanged
+        return bed_power, freeboard_power + (1.0 - self.bed_share) * released - exchanged - taken
+
+    def capacities(self, state: Floats) -> tuple[Floats, Floats]:
+        """Return the heat capacities of wastebed and freeboard, kJ/K, each of shape (B,)."""
+        grate = self.freeboard_heat_kj_kg_k if self.form == "published" else self.grate_heat_kj_kg_k
+        bed = self.waste_heat_kj_kg_k * state[0] + self.char_heat_kj_kg_k * state[1] + grate * self.grate_kg
+        free = self.gas_heat_kj_kg_k * state[4] + self.freeboard_heat_kj_kg_k * self.freeboard_kg
+        return bed, free
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return −(1000 − T_g)², K², shape (B,)."""
+        cost: Floats = (self.target_degc - state[5]) ** 2
+        return -cost
+
+    def outflow(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the flue gas that leaves the freeboard, kg/min, shape (B,)."""
+        flue: Floats = np.zeros_like(state[0]) + self.flows(state).flue
+        return flue

@@ -1,0 +1,116 @@
+"""Microalgae whose growth follows the nutrient outside the cell, after Monod."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from cirl_marl.compartments.light import light_response
+from cirl_marl.compartments.model import PaperScenario, RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.rowsum import Floats
+
+PAPER = PaperScenario(
+    initial_state=(26.0, 0.0),
+    input_low=(0.0,),
+    input_high=(150.0,),
+    horizon=200,
+    inferred_initial=((26.0, 26.0), (0.0, 5.0)),
+    reference_start=(26.0, 0.0),
+)
+"""CO2MicroalgaeMonod: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred: from S = 0 no return above 103.1 is
+possible, the paper reports up to 143.1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MicroalgaeMonod:
+    """Chemostat with biomass X and dissolved nutrient S; the control is the light I.
+
+    μ = μ_max·f(I)·S/(S + K_S), ρ = μ/Y, Ẋ = (μ − D)X, Ṡ = D(S_in − S) − ρX; both forms.
+    Nutrient is conserved: d(S + X/Y)/dt = D(S_in − S − X/Y).
+
+    ``published``: K_sI = 0, so f falls with the light and is 0/0 in darkness (here its limit 1); the reward is K_CO2·ρ,
+    an uptake per biovolume. ``sound``: Haldane light response with K_sI > 0 and its optimum at √(K_sI K_iI) = 77; the
+    reward is the uptake of the culture, K_CO2·ρ·X. The reward takes I of the step and S after it.
+
+    Source: published code of arXiv 2505.21536 and 2502.02382 (equations, parameters, bounds, start, reward); the
+    reference trajectory is reproduced to 4·10⁻¹², from its second row to 10⁻¹⁵. Constant light from (26, 0), 200 steps:
+    103.446 (I = 0), 101.638 (75), 90.823 (150).
+
+    Attributes:
+        form: ``published`` or ``sound``.
+        growth_per_day: μ_max. [published]
+        light_half_saturation: K_sI of the sound form, µmol/(m² s); the published is 0. [chosen: I* within bounds]
+        light_inhibition: K_iI, µmol/(m² s). [published]
+        nutrient_half_saturation_umol_l: K_S. [published]
+        biovolume_yield: Y, biovolume per µmol. [published]
+        dilution_per_day: D = 1/T_h. [published]
+        nutrient_in_umol_l: S_in. [published]
+        co2_per_nutrient: K_CO2, CO₂ taken up per nutrient. [published: "freely chosen"]
+    """
+
+    kind: ClassVar[str] = "microalgae_monod"
+    state_names: ClassVar[tuple[str, ...]] = ("biomass_um3_l", "nutrient_umol_l")
+    input_names: ClassVar[tuple[str, ...]] = ("light_umol_m2_s",)
+    time_unit: ClassVar[str] = "day"
+    reward_state: ClassVar[RewardState] = "after"
+    paper: ClassVar[PaperScenario] = PAPER
+
+    form: Literal["published", "sound"] = "sound"
+    growth_per_day: float = 1.2
+    light_half_saturation: float = 20.0
+    light_inhibition: float = 295.0
+    nutrient_half_saturation_umol_l: float = 0.0012
+    biovolume_yield: float = 0.5
+    dilution_per_day: float = 0.45
+    nutrient_in_umol_l: float = 100.0
+    co2_per_nutrient: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        check_form(self.form, ("published", "sound"))
+        check_positive(
+            self.kind,
+            growth_per_day=self.growth_per_day,
+            light_half_saturation=self.light_half_saturation,
+            light_inhibition=self.light_inhibition,
+            nutrient_half_saturation_umol_l=self.nutrient_half_saturation_umol_l,
+            biovolume_yield=self.biovolume_yield,
+        )
+        check_not_negative(
+            self.kind,
+            dilution_per_day=self.dilution_per_day,
+            nutrient_in_umol_l=self.nutrient_in_umol_l,
+            co2_per_nutrient=self.co2_per_nutrient,
+        )
+
+    def uptake(self, state: Floats, inputs: Floats) -> Floats:
+        """Return ρ, nutrient taken up per biovolume and day, shape (B,)."""
+        half_saturation = 0.0 if self.form == "published" else self.light_half_saturation
+        light = light_response(inputs[0], half_saturation=half_saturation, inhibition=self.light_inhibition)
+        nutrient = state[1] / (state[1] + self.nutrient_half_saturation_umol_l)
+        rho: Floats = self.growth_per_day * light * nutrient / self.biovolume_yield
+        return rho
+
+    def derivative(self, state: Floats, inputs: Floats) -> Floats:
+        """Return (Ẋ, Ṡ) per day, shape (2, B)."""
+        biomass, nutrient = state
+        rho = self.uptake(state, inputs)
+        growth = self.biovolume_yield * rho * biomass - self.dilution_per_day * biomass
+        supply = self.dilution_per_day * (self.nutrient_in_umol_l - nutrient)
+        return np.stack([growth, supply - rho * biomass])
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return K_CO2·ρ (published) or K_CO2·ρ·X in µmol/(L d) (sound), shape (B,)."""
+        per_biovolume = self.co2_per_nutrient * self.uptake(state, inputs)
+        return per_biovolume if self.form == "published" else per_biovolume * state[0]
+
+    def outflow(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the CO₂ that the culture takes *in* per litre, ṁ23 in mmol/(L d), shape (B,).
+
+        ``published`` returns K_CO2·ρ: arXiv 2502.02382 equates µmol/(µm³ d) with mmol/(L d). ``sound`` returns
+        K_CO2·ρ·X/1000.
+        """
+        taken = self.reward(state, inputs)
+        return taken if self.form == "published" else taken / 1000.0

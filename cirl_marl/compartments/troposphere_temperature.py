@@ -1,0 +1,89 @@
+"""The mean temperature of the troposphere over the city of carbo_net."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from cirl_marl.compartments.model import RewardState, check_positive
+from cirl_marl.errors import CirlError
+from cirl_marl.rowsum import Floats
+
+SECONDS_PER_DAY = 86400.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TroposphereTemperature:
+    """Radiation balance C·Ṫ = S(1 − α) − ε·σ·T⁴ with the emissivity ε = ε_n − η·x₁/V₁ of air that holds x₁ of CO₂.
+
+    The steady state is T = (S(1 − α)/(εσ))^¼: 13.454 °C at the pre-industrial x₁ = 637.2 t (closed loop) and 35.38 °C
+    at x₁ = 1432.1 t, which the uncontrolled network tends to; the time constant is about 2785 d. There is one form: the
+    published one has no defect named, but ε is linear in x₁, and below zero from 3750 t on, where it means nothing.
+    No reward is published; it is −(T − T*)².
+
+    Source: published code of arXiv 2508.16774; the model is Elsherif and Taha's, arXiv 2504.21153. T(0) = 288.33 K.
+
+    Attributes:
+        heat_capacity_j_m2_k: C. [published]
+        solar_w_m2: S, mean over the sphere, 1361/4 W/m². [published]
+        albedo: α. [published]
+        emissivity: ε_n. [published]
+        greenhouse_m3_mg: η. [published; unit inferred]
+        volume_km3: V₁; x₁/V₁ in t/km³ is mg/m³. [published; unit inferred]
+        stefan_boltzmann_w_m2_k4: σ. [published]
+        set_point_k: T*, pre-industrial. [published as T_e]
+    """
+
+    kind: ClassVar[str] = "troposphere_temperature"
+    state_names: ClassVar[tuple[str, ...]] = ("temperature_k",)
+    input_names: ClassVar[tuple[str, ...]] = ("co2_t",)
+    time_unit: ClassVar[str] = "day"
+    reward_state: ClassVar[RewardState] = "after"
+
+    heat_capacity_j_m2_k: float = 8e8
+    solar_w_m2: float = 1361.0 / 4.0
+    albedo: float = 0.3
+    emissivity: float = 0.75
+    greenhouse_m3_mg: float = 2.36e-4
+    volume_km3: float = 1.18
+    stefan_boltzmann_w_m2_k4: float = 5.67e-8
+    set_point_k: float = 287.05
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        check_positive(
+            self.kind,
+            heat_capacity_j_m2_k=self.heat_capacity_j_m2_k,
+            solar_w_m2=self.solar_w_m2,
+            emissivity=self.emissivity,
+            volume_km3=self.volume_km3,
+            stefan_boltzmann_w_m2_k4=self.stefan_boltzmann_w_m2_k4,
+        )
+        if not 0.0 <= self.albedo < 1.0:
+            raise CirlError(f"{self.kind}: albedo = {self.albedo!r}, but it must lie in [0, 1).")
+
+    def effective_emissivity(self, co2_t: Floats) -> Floats:
+        """Return ε = ε_n − η·x₁/V₁, shape as x₁."""
+        effective: Floats = self.emissivity - self.greenhouse_m3_mg * (co2_t / self.volume_km3)
+        return effective
+
+    def derivative(self, state: Floats, inputs: Floats) -> Floats:
+        """Return Ṫ, K/d, shape (1, B); ``inputs`` is (x₁,) in tonnes, shape (1, B)."""
+        absorbed = self.solar_w_m2 * (1.0 - self.albedo)
+        emitted = self.effective_emissivity(inputs) * self.stefan_boltzmann_w_m2_k4 * np.square(np.square(state))
+        rate: Floats = SECONDS_PER_DAY / self.heat_capacity_j_m2_k * (absorbed - emitted)
+        return rate
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return −(T − T*)², K², shape (B,)."""
+        cost: Floats = (state[0] - self.set_point_k) ** 2
+        return -cost
+
+    def steady_state_k(self, co2_t: Floats) -> Floats:
+        """Return T = (S(1 − α)/(εσ))^¼, K; NaN where ε ≤ 0."""
+        emissivity = self.effective_emissivity(np.asarray(co2_t, dtype=np.float64))
+        usable = np.where(emissivity > 0.0, emissivity, np.nan)
+        steady: Floats = (self.solar_w_m2 * (1.0 - self.albedo) / (usable * self.stefan_boltzmann_w_m2_k4)) ** 0.25
+        return steady

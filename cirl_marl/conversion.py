@@ -1,0 +1,190 @@
+"""From a validated definition document to a network in its own units."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from cirl_marl.compartments import model_class
+from cirl_marl.elements import Arc, Control, ControlKind, Episode, Law, Node, Objective, Observation, Service
+from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.network import Network
+from cirl_marl.schema import ArcTable, ControlTable, ModelTable, NetworkTable, NodeTable, Quantity, ServiceTable
+from cirl_marl.units import factor
+
+
+class Converter:
+    """Converts one validated document to the network's units, collecting what does not fit."""
+
+    def __init__(self, table: NetworkTable) -> None:
+        """Take the document; ``network`` converts it."""
+        self.table = table
+        self.mistakes: list[str] = []
+        mass, time = table.units.mass, table.units.time
+        self.targets = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})", "1": "1"}
+        self.factors: dict[tuple[str, str], float] = {}
+
+    def network(self, scenario: str) -> Network:
+        """Return the network.
+
+        Raises:
+            NetworkError: with every inconsistent unit and every fault of the network.
+        """
+        table = self.table
+        for key, unit, base in (("mass", table.units.mass, "kg"), ("time", table.units.time, "s")):
+            try:
+                factor(unit, base)
+            except CirlError as error:
+                raise NetworkError(table.name, [f"units.{key}: {error}"]) from None
+        episode, objective = table.episode, table.objective
+        nodes = tuple(self._node(id_, node) for id_, node in table.nodes.items())
+        arcs = tuple(self._arc(id_, arc) for id_, arc in table.arcs.items())
+        services = tuple(self._service(id_, service) for id_, service in table.services.items())
+        horizon = self._value(episode.horizon, "1", "episode.horizon")
+        if horizon != int(horizon):
+            self.mistakes.append(f"episode.horizon: {horizon} must be a whole number of control intervals")
+        settings: dict[str, Any] = {
+            "episode": Episode(
+                control_interval=self._value(episode.control_interval, "time", "episode.control_interval"),
+                horizon=int(horizon),
+                solver=episode.solver,
+                solver_step=self._optional(episode.solver_step, "time", "episode.solver_step"),
+            ),
+            "objective": Objective(
+                reference_interval=self._value(objective.reference_interval, "time", "objective.reference_interval"),
+                net_zero=objective.net_zero,
+                reward=objective.reward,
+                circularity_scale=self._value(objective.circularity_scale, "mass", "objective.circularity_scale"),
+                circularity_weight=self._value(objective.circularity_weight, "1", "objective.circularity_weight"),
+                tracked=tuple(objective.tracked),
+            ),
+        }
+        if self.mistakes:
+            raise NetworkError(table.name, self.mistakes)
+        return Network(
+            name=table.name,
+            title=table.title,
+            mass_unit=table.units.mass,
+            time_unit=table.units.time,
+            scenario_name=scenario,
+            nodes=nodes,
+            arcs=arcs,
+            services=services,
+            acting=tuple(table.agents),
+            observation=Observation(mode=table.observation.mode, nodes=tuple(table.observation.nodes)),
+            **settings,
+        )
+
+    def _node(self, id_: str, node: NodeTable) -> Node:
+        where = f"nodes.{id_}"
+        scale = self._factor(node.initial.unit, "mass", f"{where}.initial")
+        return Node(
+            id=id_,
+            role=node.role,
+            initial=(node.initial.low * scale, node.initial.high * scale),
+            set_point=self._optional(node.set_point, "mass", f"{where}.set_point"),
+            scale=self._value(node.scale or self.table.scales.stock, "mass", f"{where}.scale"),
+            control=self._control(node.control, f"{where}.control"),
+            **self._model(node.model, f"{where}.model"),
+        )
+
+    def _arc(self, id_: str, arc: ArcTable) -> Arc:
+        where = f"arcs.{id_}"
+        self._check_law(arc, where)
+        flow: tuple[float, ...] = (0.0,)
+        times: tuple[float, ...] = ()
+        if arc.flow is not None:
+            flow = (self._value(arc.flow, "flow", f"{where}.flow"),)
+        elif arc.series is not None:
+            unit = self._factor(arc.series.unit, "flow", f"{where}.series")
+            clock = self._factor(arc.series.time_unit, "time", f"{where}.series.time_unit")
+            flow = tuple(value * unit for value in arc.series.values)
+            times = tuple(time * clock for time in arc.series.times)
+        return Arc(
+            id=id_,
+            donor=arc.from_,
+            recipient=arc.to,
+            law=arc.law,
+            rate=self._optional(arc.rate, "flow" if arc.law is Law.COMPARTMENT else "rate", f"{where}.rate") or 0.0,
+            by=arc.by,
+            flow=flow,
+            times=times,
+            set_point=self._optional(arc.set_point, "flow", f"{where}.set_point"),
+            scale=self._value(arc.scale or self.table.scales.flow, "flow", f"{where}.scale"),
+            pollutant=arc.pollutant,
+            control=self._control(arc.control, f"{where}.control"),
+            **self._model(arc.model, f"{where}.model"),
+        )
+
+    def _check_law(self, arc: ArcTable, where: str) -> None:
+        needed = "flow or series" if arc.law is Law.EXOGENOUS else "" if arc.law is Law.CONTROLLED else "rate"
+        given = [key for key in ("rate", "flow", "series") if getattr(arc, key) is not None]
+        if len(given) != (1 if needed else 0) or any(key not in needed for key in given):
+            self.mistakes.append(
+                f"{where}: law '{arc.law}' needs {needed or 'no rate, flow or series'}, got {given or 'none'}"
+            )
+
+    def _service(self, id_: str, service: ServiceTable) -> Service:
+        where = f"services.{id_}"
+        kind = "mass" if service.quantity == "stock" else "flow"
+        high = self._optional(service.high, kind, f"{where}.high")
+        return Service(
+            id=id_,
+            provider=service.provider,
+            quantity=service.quantity,
+            low=self._value(service.low, kind, f"{where}.low"),
+            weight=self._value(service.weight, "1", f"{where}.weight"),
+            owed_by=tuple(service.owed_by),
+            **({} if high is None else {"high": high}),
+        )
+
+    def _model(self, table: ModelTable | None, where: str) -> dict[str, Any]:
+        """Return the model of a compartment and the initial ranges of its inner states, as keywords."""
+        if table is None:
+            return {}
+        try:
+            kind = model_class(table.kind)
+            form = {} if table.form is None else {"form": table.form}
+            known = list(inspect.signature(kind).parameters)
+            for name in (*table.parameters, *form):
+                if name not in known:
+                    raise CirlError(unknown("parameter", name, known))
+            model = kind(**table.parameters, **form)
+        except CirlError as error:
+            self.mistakes.append(f"{where}: {error}")
+            return {}
+        for name in (*table.initial, *model.state_names):
+            if name not in model.state_names or name not in table.initial:
+                known = [state for state in model.state_names if state not in table.initial]
+                self.mistakes.append(f"{where}.initial: {unknown('inner state', name, known)}")
+        ranges = [table.initial[name] for name in model.state_names if name in table.initial]
+        return {"model": model, "inner": tuple((span.low, span.high) for span in ranges)}
+
+    def _control(self, control: ControlTable | None, where: str) -> Control | None:
+        if control is None:
+            return None
+        if control.kind is ControlKind.INPUT:
+            unit = 1.0  # the name of the model's input carries the unit
+        else:
+            unit = self._factor(control.unit, "flow" if control.kind is ControlKind.FLOW else "1", where)
+        return Control(
+            kind=control.kind,
+            low=control.low * unit,
+            high=control.high * unit,
+            neutral=control.neutral * unit,
+        )
+
+    def _value(self, quantity: Quantity, kind: str, where: str) -> float:
+        return quantity.value * self._factor(quantity.unit, kind, where)
+
+    def _optional(self, quantity: Quantity | None, kind: str, where: str) -> float | None:
+        return None if quantity is None else self._value(quantity, kind, where)
+
+    def _factor(self, unit: str, kind: str, where: str) -> float:
+        if (unit, kind) not in self.factors:
+            try:
+                self.factors[unit, kind] = factor(unit, self.targets[kind])
+            except CirlError as error:
+                self.mistakes.append(f"{where}: {error}")
+                return 1.0
+        return self.factors[unit, kind]

@@ -1,0 +1,131 @@
+"""The flow laws of a network, compiled to arrays.
+
+Every law is one product, ``f_k = r_k · y[driver_k]``. The driver is the stock of the donor or of the recipient (r in
+1/time), the constant 1 for scheduled flows (r in mass/time), or the output of a compartment's model (r in mass/time per
+unit of output). Stocks are therefore kept with one more row, the *unit row*, which is 1; outputs follow it.
+
+Arrays are compartment-major, shape (compartments, batch), contiguous along the batch. Gather, multiply and sparse
+segment sum treat each column alike, so a column's bits do not depend on the batch it is in.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cirl_marl.elements import Arc, ControlKind, Law
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.rowsum import RowSum
+
+SCHEDULED = (Law.CONTROLLED, Law.EXOGENOUS)
+
+
+class FlowLaws:
+    """Drivers, rates and controls of every arc.
+
+    Attributes:
+        network: whose laws they are.
+        incidence: S with an empty unit row, shape (nodes + 1, arcs).
+        driver: row of the extended stocks that drives each arc, shape (arcs,).
+        scheduled: arcs that flow by schedule, shape (arcs,).
+        control_low: lower bounds of the controls, in the order of ``network.controllable``.
+        control_high: upper bounds.
+        neutral: values while nobody acts.
+        max_rate: r of each arc with every control at its upper bound, shape (arcs,).
+    """
+
+    def __init__(self, network: Network) -> None:
+        """Compile ``network``."""
+        self.network = network
+        nodes, arcs = len(network.nodes), len(network.arcs)
+        donors, recipients = network.donors, network.recipients
+        columns = np.arange(arcs)
+        self.incidence = RowSum(
+            np.concatenate([donors, recipients]),
+            np.tile(columns, 2),
+            np.repeat([-1.0, 1.0], arcs),
+            (nodes + 1, arcs),
+        )
+        laws = np.array([arc.law for arc in network.arcs])
+        self.scheduled = np.isin(laws, SCHEDULED)
+        self.driver: Integers = np.where(self.scheduled, nodes, np.where(laws == Law.RECIPIENT, recipients, donors))
+        modelled = [c.id for c in network.compartments.values() if c.model is not None]
+        for k in np.flatnonzero(laws == Law.COMPARTMENT):
+            self.driver[k] = nodes + 1 + modelled.index(network.arcs[k].by)
+        self._compile_controls()
+        self._series_arcs: Integers = np.flatnonzero([bool(arc.times) for arc in network.arcs])
+        self._series = np.array([_interval_means(network.arcs[k], network) for k in self._series_arcs])
+        self._series = self._series.reshape(len(self._series_arcs), network.episode.horizon)
+        self.max_rate: Floats = self.rate(self.control_high[:, None])[:, 0]
+        if len(self._series_arcs):
+            self.max_rate[self._series_arcs] *= self._series.max(axis=1)
+
+    def rate(self, controls: Floats, step: Integers | None = None) -> Floats:
+        """Return r of each arc for given controls.
+
+        Args:
+            controls: physical values in the order of ``network.controllable``, shape (controls, B).
+            step: index of the control interval in each environment, shape (B,); picks the value of time series.
+
+        Returns:
+            r, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
+        """
+        extended = np.concatenate([controls, np.ones((1, controls.shape[1]))])
+        rate: Floats = extended.take(self._own_control, axis=0)
+        rate *= self._base
+        rate *= extended.take(self._donor_control, axis=0)
+        if step is not None and len(self._series_arcs):
+            rate[self._series_arcs] *= self._series[:, step]
+        return rate
+
+    def flow(self, stock: Floats, rate: Floats) -> Floats:
+        """Return the instantaneous flows f = r ∘ y[driver], shape (arcs, B), mass/time."""
+        flow: Floats = stock.take(self.driver, axis=0)
+        flow *= rate
+        return flow
+
+    def extend(self, stock: Floats) -> Floats:
+        """Append the unit row to stocks of shape (nodes, B)."""
+        return np.concatenate([stock, np.ones((1, stock.shape[1]))])
+
+    def _compile_controls(self) -> None:
+        """Find for each arc the rows of the control array that act on it; the row past the last is 1."""
+        network = self.network
+        controls = [c.control for c in network.compartments.values() if c.control is not None]
+        position = {
+            id_: i
+            for i, (id_, control) in enumerate(zip(network.controllable, controls, strict=True))
+            if control.kind is not ControlKind.INPUT
+        }
+        none = len(controls)
+        self.control_low: Floats = np.array([c.low for c in controls], dtype=float)
+        self.control_high: Floats = np.array([c.high for c in controls], dtype=float)
+        self.neutral: Floats = np.array([c.neutral for c in controls], dtype=float)
+
+        def acting_on(arc: Arc) -> tuple[int, int]:
+            donor = network.compartments[arc.donor]
+            own, valve = position.get(arc.id, none), position.get(arc.donor, none)
+            if donor.control is not None and donor.control.kind is ControlKind.FLOW:
+                return (valve, none) if arc.law is Law.CONTROLLED else (own, none)
+            return own, valve
+
+        rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
+        self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
+        self._base: Floats = np.array([_base_rate(arc) for arc in network.arcs]).reshape(-1, 1)
+
+
+def _base_rate(arc: Arc) -> float:
+    if arc.law not in SCHEDULED:
+        return arc.rate
+    if arc.law is Law.EXOGENOUS and not arc.times:
+        return arc.flow[0]
+    return 1.0
+
+
+def _interval_means(arc: Arc, network: Network) -> Floats:
+    """Mean of a step function over each control interval; the last value holds on."""
+    edges = np.arange(network.episode.horizon + 1) * network.episode.control_interval
+    times, values = np.array(arc.times), np.array(arc.flow)
+    total = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(times))])
+    index = np.searchsorted(times, edges, side="right") - 1
+    means: Floats = np.diff(total[index] + values[index] * (edges - times[index])) / np.diff(edges)
+    return means

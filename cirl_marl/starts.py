@@ -1,0 +1,119 @@
+"""Where episodes start: drawn from one random stream per copy, or given by the caller."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cirl_marl.errors import ControlError, unknown
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.simulate import Dynamics
+
+
+class Starts:
+    """Initial stocks and inner states of B copies, each with a random stream of its own.
+
+    Attributes:
+        names: nodes, then ``compartment.state`` of the inner states; the rows of every array here.
+        streams: one generator per copy.
+    """
+
+    def __init__(self, network: Network, dynamics: Dynamics, num_envs: int) -> None:
+        """Compile the initial ranges; the streams are seeded from the operating system."""
+        inner = dynamics.inner
+        self.names = (*network.node_index, *inner.names)
+        self.streams = [np.random.default_rng() for _ in range(num_envs)]
+        self._network = network
+        self._physical = dynamics.physical
+        self._low = np.concatenate([[node.initial[0] for node in network.nodes], inner.low])
+        self._width = np.concatenate([[node.initial[1] for node in network.nodes], inner.high]) - self._low
+
+    def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
+        """Return the state in which every copy starts, shape (rows, B); see ``VectorEnv.reset``.
+
+        Raises:
+            ControlError: for a seed, option or state that cannot be used; the streams are left as they were.
+        """
+        streams = self.streams if seed is None else self._seeded(seed)
+        given = self._given(options or {})
+        self.streams = streams
+        drawn = self.draw(range(len(streams)))
+        for row, values in given.items():
+            drawn[row] = values
+        return drawn
+
+    def draw(self, which: Sequence[int] | range | Integers) -> Floats:
+        """Draw initial stocks and inner states of some copies, each from its own stream, shape (rows, len(which))."""
+        uniform = np.empty((len(self._low), len(which)))
+        for column, i in enumerate(which):
+            uniform[:, column] = self.streams[i].random(len(self._low))
+        uniform *= self._width[:, None]
+        uniform += self._low[:, None]
+        return uniform
+
+    def saved_streams(self) -> tuple[Mapping[str, Any], ...]:
+        """Return a copy of the state of every stream."""
+        return tuple(copy.deepcopy(dict(stream.bit_generator.state)) for stream in self.streams)
+
+    def restore_streams(self, saved: Sequence[Mapping[str, Any]]) -> None:
+        """Put every stream back."""
+        for stream, state in zip(self.streams, saved, strict=True):
+            stream.bit_generator.state = copy.deepcopy(dict(state))
+
+    def _seeded(self, seed: int | Sequence[int]) -> list[np.random.Generator]:
+        copies = len(self.streams)
+        if isinstance(seed, int | np.integer):
+            seeds = [int(seed) + i for i in range(copies)]
+        else:
+            seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else []
+        if len(seeds) != copies or any(not isinstance(s, int | np.integer) or s < 0 for s in seeds):
+            raise ControlError(f"seed {seed!r} must be a non-negative integer, or {copies} of them")
+        return [np.random.default_rng(s) for s in seeds]
+
+    def _given(self, options: Mapping[str, Any]) -> dict[int, Floats]:
+        """Return the given initial stocks and inner states by their row."""
+        for key in options:  # other keys are for wrappers: PettingZoo's own test passes one; a misspelt one is an error
+            if key != "initial_state" and difflib.get_close_matches(str(key), ["initial_state"]):
+                raise ControlError(f"reset options: {unknown('option', key, ['initial_state'])}")
+        given = options.get("initial_state", {})
+        if not isinstance(given, Mapping):
+            nodes = self._network.observation.nodes
+            values = np.asarray(given, dtype=float)
+            if not nodes or values.shape != (len(nodes),):
+                raise ControlError(
+                    f"initial_state has shape {values.shape}: give a mapping node → stock"
+                    + (f", or the stocks of {', '.join(nodes)} in this order" if nodes else "")
+                )
+            given = dict(zip(nodes, values, strict=True))
+        checked = {self._row(id_): self._initial(id_, values) for id_, values in given.items()}
+        most = (self._low + self._width)[: len(self._network.nodes)]
+        limit = float(most.sum())
+        if self._physical and checked:
+            total = sum(float(np.max(checked.get(i, most[i]))) for i in range(len(most)))
+            if total > limit * (1 + 1e-9):
+                raise ControlError(
+                    f"initial_state: {total:.6g} {self._network.mass_unit} in all, but the observation space of "
+                    f"'{self._network.name}' covers {limit:.6g}; widen the initial ranges of the definition"
+                )
+        return checked
+
+    def _row(self, id_: str) -> int:
+        if id_ not in self.names:
+            raise ControlError(f"initial_state: {unknown('node or inner state', id_, self.names)}")
+        return self.names.index(id_)
+
+    def _initial(self, id_: str, values: ArrayLike) -> Floats:
+        stock = np.asarray(values, dtype=float)
+        if stock.shape not in ((), (len(self.streams),)):
+            raise ControlError(
+                f"initial_state of '{id_}' has shape {stock.shape}, expected () or {(len(self.streams),)}"
+            )
+        is_stock = self._physical and id_ in self._network.node_index
+        if not np.isfinite(stock).all() or (is_stock and (stock < 0).any()):
+            raise ControlError(f"initial_state of '{id_}' is {values!r}: stocks are finite and not negative")
+        return stock

@@ -1,0 +1,72 @@
+"""What an environment is in, what it was in, and what one step brought."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.network import Floats, Integers
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The physical state of B environments and the sums that an episode reports.
+
+    Attributes:
+        stock: stocks and the unit row, shape (nodes + 1, B), mass.
+        inner: inner states of the compartments' models, shape (states, B).
+        flow: mean flows of the last control interval, shape (arcs, B), mass/time.
+        step: control intervals done, shape (B,).
+        circularity: sum over the episode of the interval means of λ, shape (B,), mass.
+        service: sum over the episode of the service level, shape (B,).
+    """
+
+    stock: Floats
+    inner: Floats
+    flow: Floats
+    step: Integers
+    circularity: Floats
+    service: Floats
+
+    def copied(self) -> State:
+        """Return the state with arrays of its own."""
+        return replace(self, **{each.name: getattr(self, each.name).copy() for each in fields(self)})
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """Everything needed to go on from here, bit for bit: physical state and random streams."""
+
+    state: State
+    streams: tuple[Mapping[str, Any], ...]
+    agents: tuple[str, ...]
+    network: str
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one control interval brought, agents stacked along axis 0.
+
+    Attributes:
+        observation: shape (entries of all agents, B), float32.
+        reward: shape (agents, B).
+        local: local rewards, shape (agents, B).
+        circularity: λ at the end of the interval, shape (B,), mass.
+        circularity_mean: mean of λ over the interval, shape (B,), mass.
+        service_level: shape (B,).
+        flow: mean flows, shape (arcs, B), mass/time.
+        truncated: time limit reached, shape (B,).
+    """
+
+    observation: NDArray[np.float32]
+    reward: Floats
+    local: Floats
+    circularity: Floats
+    circularity_mean: Floats
+    service_level: Floats
+    flow: Floats
+    truncated: NDArray[np.bool_]
