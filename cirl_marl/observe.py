@@ -51,7 +51,7 @@ class Signals:
     @property
     def rows(self) -> int:
         """Number of rows."""
-        return self.set_point(self.quantities)
+        return self.set_point(self.nodes + self.arcs)
 
 
 class ObservationLayout:

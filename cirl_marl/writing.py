@@ -56,7 +56,7 @@ def _node(network: Network, node: Node) -> Iterator[str]:
     low, high = node.initial
     unit = _text(network.mass_unit)
     yield f"[nodes.{node.id}]\nrole = {_text(node.role.value)}"
-    yield f"initial = {{ low = {low!r}, high = {high!r}, unit = {unit}, source = {_text(SOURCE)} }}"
+    yield f"initial = {{ low = {float(low)!r}, high = {float(high)!r}, unit = {unit}, source = {_text(SOURCE)} }}"
     yield from _common(network, node, network.mass_unit)
 
 
@@ -103,7 +103,7 @@ def _model(compartment: Compartment) -> str:
     form = f"form = {_text(values.pop('form'))}, " if "form" in values else ""
     parameters = ", ".join(f"{name} = {float(value)!r}" for name, value in values.items())
     initial = ", ".join(
-        f"{name} = {{ low = {low!r}, high = {high!r}, source = {_text(SOURCE)} }}"
+        f"{name} = {{ low = {float(low)!r}, high = {float(high)!r}, source = {_text(SOURCE)} }}"
         for name, (low, high) in zip(model.state_names, compartment.inner, strict=True)
     )
     return (
@@ -117,7 +117,7 @@ def _flow(network: Network) -> str:
 
 
 def _quantity(value: float, unit: str) -> str:
-    return f"{{ value = {value!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
+    return f"{{ value = {float(value)!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
 
 
 def _list(names: tuple[str, ...]) -> str:
