@@ -69,10 +69,11 @@ class FlowLaws:
         Returns:
             r, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
         """
-        extended = np.concatenate([controls, np.ones((1, controls.shape[1]))])
-        rate: Floats = extended.take(self._own_control, axis=0)
+        if self._partial:  # some arc lacks a control: let a row of ones stand in for it
+            controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
+        rate: Floats = controls.take(self._own_control, axis=0)
         rate *= self._base
-        rate *= extended.take(self._donor_control, axis=0)
+        rate *= controls.take(self._donor_control, axis=0)
         if step is not None and len(self._series_arcs):
             rate[self._series_arcs] *= self._series[:, step]
         return rate
@@ -110,6 +111,7 @@ class FlowLaws:
 
         rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
         self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
+        self._partial = bool((rows == none).any())
         self._base: Floats = np.array([_base_rate(arc) for arc in network.arcs]).reshape(-1, 1)
 
 

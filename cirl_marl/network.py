@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from cirl_marl.elements import SINKS, Arc, Compartment, Episode, Node, Objective, Observation, Role, Service
 from cirl_marl.errors import CirlError, NetworkError, unknown
@@ -102,6 +104,24 @@ class Network:
         """
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
         return replace(self, **changes)
+
+    def in_local_order(self) -> Network:
+        """Return the same network with neighbours next to each other: nodes by reverse Cuthill-McKee, arcs by donor.
+
+        It changes the order of every array and nothing else, but for round-off. A step of a large network whose
+        compartments come in random order spends most of its time waiting for memory; in this order it does not.
+        """
+        size = len(self.nodes)
+        links = sparse.csr_array((np.ones(len(self.arcs)), (self.donors, self.recipients)), shape=(size, size))
+        order = csgraph.reverse_cuthill_mckee(sparse.csr_array(links + links.T), symmetric_mode=True)
+        place = np.empty(size, dtype=np.intp)
+        place[order] = np.arange(size)
+        arcs = np.lexsort((place[self.recipients], place[self.donors]))
+        return replace(
+            self,
+            nodes=tuple(self.nodes[i] for i in order),
+            arcs=tuple(self.arcs[k] for k in arcs),
+        )
 
     @cached_property
     def compartments(self) -> Mapping[str, Compartment]:

@@ -62,11 +62,16 @@ class Scoring:
 
     def terms(self, quantities: Floats, levels: Floats, inner: Floats) -> Floats:
         """Return squared scaled distances, service shortfalls and the models' rewards, shape (terms, B)."""
-        distance = quantities.take(self._tracked, axis=0)
+        tracked, services = len(self._tracked), len(levels)
+        terms = np.empty((tracked + services + len(inner), quantities.shape[1]))
+        distance = terms[:tracked]
+        quantities.take(self._tracked, axis=0, out=distance, mode="clip")
         distance -= self._set_point
         distance *= self._inverse_scale
         distance *= distance
-        return np.concatenate([distance, 1.0 - levels, inner])
+        np.subtract(1.0, levels, out=terms[tracked : tracked + services])
+        terms[tracked + services :] = inner
+        return terms
 
     def local(self, terms: Floats) -> Floats:
         """Return the local reward of each agent, shape (agents, B)."""

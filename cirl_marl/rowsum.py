@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-# The kernel behind scipy's ``csr_array @ dense``. For the small matrices here
-# the operator spends most of its time on dispatch and on a fresh result; the kernel adds to an array already there.
-from scipy.sparse._sparsetools import csr_matvecs
+# The kernels behind scipy's ``csc_array @ dense``. For the small matrices here the operator spends most of its time on
+# dispatch and on a fresh result; the kernels add to an array that is already there. Columns of an incidence matrix have
+# two entries each, which suits processors better than rows of random length.
+from scipy.sparse._sparsetools import csc_matvec, csc_matvecs
 
 Floats = NDArray[np.float64]
 
@@ -22,11 +23,11 @@ class RowSum:
 
     def __init__(self, rows: ArrayLike, columns: ArrayLike, weights: ArrayLike, shape: tuple[int, int]) -> None:
         """Build W from its entries; entries at the same place are added."""
-        matrix = sparse.csr_array((weights, (rows, columns)), shape=shape, dtype=np.float64)
+        matrix = sparse.csc_array((weights, (rows, columns)), shape=shape, dtype=np.float64)
         matrix.sort_indices()
         self.shape = shape
-        self._rows = matrix.indptr
-        self._columns = matrix.indices
+        self._starts = matrix.indptr
+        self._rows = matrix.indices
         self._weights: Floats = matrix.data
 
     def __call__(self, values: Floats) -> Floats:
@@ -37,31 +38,26 @@ class RowSum:
     def add_to(self, result: Floats, values: Floats) -> Floats:
         """Add W x to ``result``, shape (rows, B), in place, and return it; both arrays are C-contiguous."""
         rows, columns = self.shape
-        csr_matvecs(
-            rows,
-            columns,
-            values.shape[1],
-            self._rows,
-            self._columns,
-            self._weights,
-            values.reshape(-1),
-            result.reshape(-1, copy=False),
-        )
+        batch = values.shape[1]
+        if batch == 1:
+            csc_matvec(rows, columns, self._starts, self._rows, self._weights, values, result)
+        else:
+            csc_matvecs(rows, columns, batch, self._starts, self._rows, self._weights, values, result)
         return result
 
     def scaled(self, factor: float) -> RowSum:
         """Return factor·W."""
         other = object.__new__(RowSum)
-        other.shape, other._rows, other._columns = self.shape, self._rows, self._columns
+        other.shape, other._starts, other._rows = self.shape, self._starts, self._rows
         other._weights = self._weights * factor
         return other
 
     def column_sums(self) -> Floats:
         """Return Σ_i W_ik for each column k."""
-        sums: Floats = np.bincount(self._columns, weights=self._weights, minlength=self.shape[1]).astype(float)
-        return sums
+        sums: Floats = np.add.reduceat(np.append(self._weights, 0.0), self._starts[:-1])
+        return np.where(np.diff(self._starts) > 0, sums, 0.0)
 
     def chosen(self, rows: list[int]) -> RowSum:
         """Return the matrix of the given rows of W."""
-        matrix = sparse.csr_array((self._weights, self._columns, self._rows), shape=self.shape)[rows].tocoo()
+        matrix = sparse.csc_array((self._weights, self._rows, self._starts), shape=self.shape)[rows].tocoo()
         return RowSum(matrix.row, matrix.col, matrix.data, (len(rows), self.shape[1]))

@@ -228,9 +228,9 @@ class Dynamics(FlowLaws):
 
 
 def _series_terms(size: float) -> int:
-    """Smallest K ≥ 2 with size^K/K! ≤ TRUNCATION, size = ‖A‖₁·h."""
+    """Smallest K ≥ 2 with size^K/(K + 1)! ≤ TRUNCATION, the first neglected term of the mean; size = ‖A‖₁·h."""
     term, k = size, 1
-    while term > TRUNCATION or k < 2:
+    while term > TRUNCATION * (k + 1) or k < 2:
         k += 1
         term *= size / k
     return k

@@ -1,0 +1,190 @@
+"""What is measured but stands in no catalogue: random networks of any size, and an environment that costs nothing.
+
+With it come VMAS's ``simple_spread``, the yardstick from outside, and the two ways to let learners learn in the free
+environment: together in lockstep, and each alone.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from cirl_marl.elements import Arc, Control, ControlKind, Episode, Node
+from cirl_marl.learners.lockstep import Lockstep
+from cirl_marl.learners.recipe import Recipe
+from cirl_marl.learners.seat import Seat
+from cirl_marl.learners.trainee import Trainee
+from cirl_marl.network import Network
+from cirl_marl.vector_env import Infos, VectorEnv
+
+TURNOVER = 0.2
+"""Share of its stock that a node with outflows sends on in one control interval, as the faster nodes of copper_net."""
+
+Weights = list[NDArray[np.float32]]
+
+SCENES = 64
+"""Steps after which the outcomes of ``FreeEnv`` repeat."""
+
+
+def random_network(arcs: int, seed: int = 0) -> Network:
+    """Return a network of ``arcs`` nodes and as many arcs between nodes drawn uniformly, so that the mean degree is 2.
+
+    Nothing is near anything else: donor and recipient of an arc are anywhere in memory, which is the worst case for
+    caches. Every node that has outflows turns over the same share, so the solver takes the same number of terms
+    whatever the size. The first node has a valve, since an environment needs an agent.
+    """
+    random = np.random.default_rng(seed)
+    donors = random.integers(arcs, size=arcs)
+    recipients = (donors + random.integers(1, arcs, size=arcs)) % arcs
+    rates = TURNOVER / np.bincount(donors)[donors]
+    ends = zip(donors.tolist(), recipients.tolist(), rates.tolist(), strict=True)
+    valve = Control(kind=ControlKind.RATE, low=0.5, high=1.0, neutral=1.0)
+    return Network(
+        name=f"random_{arcs}",
+        nodes=tuple(Node(id=f"n{i}", initial=(0.5, 1.5), control=None if i else valve) for i in range(arcs)),
+        arcs=tuple(
+            Arc(id=f"a{k}", donor=f"n{donor}", recipient=f"n{recipient}", rate=rate)
+            for k, (donor, recipient, rate) in enumerate(ends)
+        ),
+        episode=Episode(control_interval=1.0, horizon=1_000_000),
+    )
+
+
+def simple_spread(copies: int, agents: int) -> Callable[[], object] | None:
+    """Return what steps VMAS's ``simple_spread`` once, with random continuous actions; None if VMAS is missing."""
+    try:
+        vmas = importlib.import_module("vmas")
+    except ImportError:
+        return None
+    env = vmas.make_env("simple_spread", num_envs=copies, n_agents=agents, device="cpu", seed=0)
+    actions = list(torch.rand(agents, copies, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1)
+    return lambda: env.step(actions)
+
+
+class FreeEnv(VectorEnv):
+    """Agents, spaces and episode length of a network, but nothing is simulated: outcomes were drawn beforehand.
+
+    No agent's outcome depends on any action, so a learner meets the same steps here as in its ``lone_seat``.
+    """
+
+    def __init__(self, network: str, num_envs: int) -> None:
+        """Draw ``SCENES`` outcomes for each agent."""
+        super().__init__(network, num_envs=num_envs)
+        random = np.random.default_rng(0)
+        self._seen: dict[str, list[NDArray[np.float32]]] = {}
+        self._paid: dict[str, NDArray[np.float64]] = {}
+        for agent, space in self.observation_spaces.items():
+            shape = (SCENES, num_envs, *space.shape)
+            self._seen[agent] = list(random.uniform(size=shape).astype(np.float32))
+            self._paid[agent] = random.normal(size=(SCENES, num_envs))
+        self._step = 0
+
+    def observation(self, agent: str, step: int) -> NDArray[np.float32]:
+        """Return what ``agent`` sees after ``step`` steps, shape (B, entries)."""
+        return self._seen[agent][step % SCENES]
+
+    def reward(self, agent: str, step: int) -> NDArray[np.float64]:
+        """Return what the last of ``step`` steps paid ``agent``, shape (B,)."""
+        paid: NDArray[np.float64] = self._paid[agent][step % SCENES]
+        return paid
+
+    def ended(self, step: int) -> NDArray[np.bool_]:
+        """Return whether the episodes end after ``step`` steps: all at once, at the horizon."""
+        return np.full(self.num_envs, step % self.network.episode.horizon == 0)
+
+    def reset(
+        self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
+    ) -> dict[str, NDArray[np.float32]]:
+        """Go back to the first outcome."""
+        self._step = 0
+        return {agent: self.observation(agent, 0) for agent in self.agents}
+
+    def step(
+        self, actions: Mapping[str, ArrayLike]
+    ) -> tuple[
+        dict[str, NDArray[np.float32]],
+        dict[str, NDArray[np.float64]],
+        dict[str, NDArray[np.bool_]],
+        dict[str, NDArray[np.bool_]],
+        Infos,
+    ]:
+        """Return the next outcome, whatever the actions."""
+        self._step += 1
+        ended = self.ended(self._step)
+        observations = {agent: self.observation(agent, self._step) for agent in self.agents}
+        over = bool(ended[0])
+        return (
+            observations,
+            {agent: self.reward(agent, self._step) for agent in self.agents},
+            dict.fromkeys(self.agents, np.zeros_like(ended)),
+            dict.fromkeys(self.agents, ended),
+            {agent: {"final_observation": seen} if over else {} for agent, seen in observations.items()},
+        )
+
+
+def lone_seat(env: FreeEnv, agent: str) -> Seat:
+    """Return a seat that nobody else waits for: a ``VecEnv`` with the outcomes that ``env`` has for ``agent``."""
+    step = 0
+
+    def exchange(seat: Seat) -> VecEnvStepReturn:
+        nonlocal step
+        step += 1
+        seen, ended = env.observation(agent, step), env.ended(step)
+        infos: list[dict[str, Any]] = [{} for _ in range(env.num_envs)]
+        for i in np.flatnonzero(ended):
+            infos[i] = {
+                "TimeLimit.truncated": True,
+                "terminal_observation": seen[i].copy(),
+                "episode": {"r": 0.0, "l": env.network.episode.horizon, "t": 0.0},
+            }
+        seat.latest = seen
+        return seen, env.reward(agent, step).astype(np.float32), ended, infos
+
+    seat = Seat(env, agent, exchange)
+    seat.latest = env.observation(agent, 0)
+    return seat
+
+
+def learn_together(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weights]:
+    """Let every agent learn for ``steps`` in lockstep; return the seconds it took, without set-up, and the weights."""
+    hub = Lockstep(env, range(env.num_envs))
+    trainees = {agent: _trainee(seat, recipe, env) for agent, seat in hub.seats.items()}
+    began = time.perf_counter()
+    hub.run(
+        learners={agent: _learning(trainee, steps) for agent, trainee in trainees.items()},
+        actors={agent: trainee.act for agent, trainee in trainees.items()},
+        streams={agent: trainee.streams for agent, trainee in trainees.items()},
+        budgets={agent: trainee.budget(steps) for agent, trainee in trainees.items()},
+    )
+    return time.perf_counter() - began, _weights(trainees.values())
+
+
+def learn_alone(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weights]:
+    """Call the algorithm's own ``learn()`` for one agent after another; return what ``learn_together`` does."""
+    trainees = [_trainee(lone_seat(env, agent), recipe, env) for agent in env.agents]
+    seconds = 0.0
+    for trainee in trainees:
+        with trainee.streams.active():
+            began = time.perf_counter()
+            trainee.model.learn(steps)
+            seconds += time.perf_counter() - began
+    return seconds, _weights(trainees)
+
+
+def _trainee(seat: Seat, recipe: Recipe, env: FreeEnv) -> Trainee:
+    return Trainee(seat, recipe.learner_of(seat.agent, env.network), 0).build(None)
+
+
+def _learning(trainee: Trainee, steps: int) -> Callable[[], None]:
+    return lambda: trainee.learn(steps, None)
+
+
+def _weights(trainees: Iterable[Trainee]) -> Weights:
+    return [value.numpy().copy() for trainee in trainees for value in trainee.model.policy.state_dict().values()]

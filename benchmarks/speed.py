@@ -1,0 +1,299 @@
+"""How fast is the library, and against what? One table of figures and ratios; nothing is asserted.
+
+Run it with ``python benchmarks/speed.py``. What is compared is measured in turns, A B A B …, in one process, because a
+machine that does other things at the same time is not equally fast from one minute to the next.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from benchmarks.generated import FreeEnv, Weights, learn_alone, learn_together, random_network, simple_spread
+from cirl_marl import parallel_env
+from cirl_marl.learners import load_recipe, train
+from cirl_marl.parallel_env import NetworkParallelEnv
+from cirl_marl.vector_env import VectorEnv
+
+console = Console(width=150)
+
+COPIES, AGENTS = 1024, 16
+LONE = 64
+"""Lone environments stepped in turn; 1 024 of them cost 16 times as much."""
+ARCS = (10, 100, 1_000, 10_000, 100_000, 1_000_000)
+CELLS = 1_000_000
+"""Arcs × copies at every size, so that every size has as much to compute and arrays of 8 MB each."""
+PACKAGES = ("numpy", "scipy", "torch", "stable-baselines3", "gymnasium", "pettingzoo", "greenlet", "vmas")
+
+
+class Measurement(StrEnum):
+    """What ``--only`` can choose."""
+
+    BATCHED = "batched"
+    SINGLE = "single"
+    SHARE = "share"
+    LOCKSTEP = "lockstep"
+    ARCS = "arcs"
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A row of the table; ``met`` is None where there is no goal."""
+
+    what: str
+    value: str
+    goal: str = ""
+    met: bool | None = None
+    remark: str = ""
+
+    @property
+    def cells(self) -> tuple[str, str, str, str, str]:
+        """The row as text."""
+        met = "" if self.met is None else "yes" if self.met else "no"
+        return self.what, self.value, self.goal, met, self.remark
+
+
+def main(
+    only: Annotated[Measurement | None, typer.Option(help="Measure this alone.")] = None,
+    markdown: Annotated[Path | None, typer.Option(help="Also write machine and table here.")] = None,
+) -> None:
+    """Measure, and print figures and ratios with their goals."""
+    torch.set_num_threads(1)
+    machine = list(_machine())
+    figures: list[Figure] = []
+    for measurement, measure in MEASURES.items():
+        if only in (None, measurement):
+            with console.status(f"measuring: {measurement}"):
+                figures += measure()
+    header = ("what", "measured", "goal", "met", "remark")
+    table = Table(*header, title="; ".join(machine))
+    for figure in figures:
+        table.add_row(*map(escape, figure.cells))
+    console.print(table)
+    if markdown is not None:
+        rows = [header, ("-",) * len(header), *(figure.cells for figure in figures)]
+        lines = [*(f"- {line}" for line in machine), "", *(f"| {' | '.join(row)} |" for row in rows)]
+        markdown.write_text("\n".join(lines) + "\n")
+
+
+def batched() -> list[Figure]:
+    """Measure copper_net in 1 024 copies against VMAS and against lone environments, in agent-steps per second."""
+    env = VectorEnv("copper_net", num_envs=COPIES)
+    actions = _actions(env.agents, (COPIES, 1))
+    env.reset(seed=0)
+    horizon = env.network.episode.horizon
+
+    def whole_episode() -> float:
+        """Seconds per agent-step, the restart of every copy included."""
+        return _seconds(lambda: env.step(actions), horizon) / (len(env.agents) * COPIES)
+
+    def within_episode() -> float:
+        env.reset(seed=0)
+        return _seconds(lambda: env.step(actions), horizon - 1) / (len(env.agents) * COPIES)
+
+    lone = [parallel_env("copper_net") for _ in range(LONE)]
+    lone_actions = _actions(env.agents, (1,))
+    for i, one in enumerate(lone):
+        one.reset(seed=i)
+
+    def step_all() -> None:
+        for one in lone:
+            _step_on(one, lone_actions)
+
+    def lone_steps() -> float:
+        return _seconds(step_all, 10) / (len(env.agents) * LONE)
+
+    blocks = [whole_episode, within_episode, lone_steps]
+    yardstick = simple_spread(COPIES, AGENTS)
+    if yardstick is not None:
+        blocks.append(lambda: _seconds(yardstick, 3) / (AGENTS * COPIES))
+    whole, within, alone, *others = _interleaved(9, *blocks)
+    figures = [
+        Figure(
+            "copper_net, 1 024 copies, 16 agents: agent-steps/s",
+            _millions(whole),
+            "≥ 50 million",
+            1 / min(whole) >= 50e6,
+            f"whole episodes of {horizon} steps, automatic restarts included; best of rounds (median)",
+        ),
+        Figure("the same, between two restarts", _millions(within), remark="best of rounds (median)"),
+        Figure(
+            "the same / 1 024 lone PettingZoo environments",
+            _times(alone, whole),
+            remark=f"estimated from {LONE}, {_millions(alone)}",
+        ),
+    ]
+    against = "the same / VMAS simple_spread, 16 agents, 1 024 copies"
+    if others:
+        figures.append(Figure(against, _times(others[0], whole), remark=f"VMAS: {_millions(others[0])}"))
+    else:
+        figures.append(Figure(against, "not measured", remark="pip install -c constraints.txt -e '.[benchmarks]'"))
+    return figures
+
+
+def single() -> list[Figure]:
+    """Measure one PettingZoo environment, in joint steps per second."""
+    env = parallel_env("copper_net")
+    env.reset(seed=0)
+    actions = _actions(env.possible_agents, (1,))
+    horizon = env.network.episode.horizon
+    (costs,) = _interleaved(15, lambda: _seconds(lambda: _step_on(env, actions), horizon))
+    best, middle = 1 / min(costs), 1 / median(costs)
+    what = "one PettingZoo copper_net: joint steps/s"
+    remark = "whole episodes with reset; best of rounds (median)"
+    return [Figure(what, f"{best:,.0f} ({middle:,.0f})", "≥ 10 000", best >= 10_000, remark)]
+
+
+def share() -> list[Figure]:
+    """Measure which share of a training run the default recipe spends in ``VectorEnv.step``."""
+    spans: list[tuple[float, float]] = []
+    step = VectorEnv.step
+
+    def timed(env: VectorEnv, actions: Any) -> Any:
+        began = time.perf_counter()
+        outcome = step(env, actions)
+        spans.append((began, time.perf_counter()))
+        return outcome
+
+    run = load_recipe("independent_ppo").run
+    shares, rates = [], []
+    with patch.object(VectorEnv, "step", timed):
+        for seed in range(4):
+            spans.clear()
+            train("copper_net", "independent_ppo", steps=6400, seed=seed)
+            wall = time.perf_counter() - spans[0][0]  # making the learners is not training
+            shares.append(sum(ended - began for began, ended in spans) / wall)
+            rates.append(len(spans) * run.envs / wall)
+    value = median(shares[1:])  # the first run warms up
+    remark = f"median of 3 runs of 6 400 steps in {run.envs} copies, {median(rates[1:]):,.0f} environment steps/s"
+    what = "independent_ppo on copper_net: share of the environment in training time"
+    return [Figure(what, f"{value:.1%}", "≤ 5 %", value <= 0.05, remark)]
+
+
+def lockstep() -> list[Figure]:
+    """Measure 16 learners in lockstep against the same 16 one after another, where the environment costs nothing."""
+    recipe = load_recipe("independent_ppo")
+    steps = 2 * recipe.run.envs * int(recipe.learner.parameters["n_steps"])
+    env = FreeEnv("copper_net", recipe.run.envs)
+    work = steps * len(env.agents)
+    weights: dict[str, Weights] = {}
+
+    def together() -> float:
+        seconds, weights["together"] = learn_together(env, recipe, steps)
+        return seconds / work
+
+    def alone() -> float:
+        seconds, weights["alone"] = learn_alone(env, recipe, steps)
+        return seconds / work
+
+    joint, lone = _interleaved(7, together, alone)
+    same = all(map(np.array_equal, weights["together"], weights["alone"]))
+    ratio = median(b / a for a, b in zip(joint, lone, strict=True))
+    return [
+        Figure(
+            f"{len(env.agents)} PPO learners in lockstep / the same alone, free environment: agent-steps/s",
+            f"{ratio:.2f}",
+            "≥ 0.9",
+            ratio >= 0.9,
+            f"{1 / median(joint):,.0f} / {1 / median(lone):,.0f}; weights {'bit-identical' if same else 'DIFFER'}",
+        )
+    ]
+
+
+def arcs() -> list[Figure]:
+    """Measure what one step costs per arc and copy on random networks of growing size."""
+    envs = [VectorEnv(random_network(size), num_envs=max(1, CELLS // size)) for size in ARCS]
+    for env in envs:
+        env.reset(seed=0)
+
+    def cost_of(env: VectorEnv) -> Callable[[], float]:
+        actions = _actions(env.agents, (env.num_envs, 1))
+        cells = len(env.network.arcs) * env.num_envs
+        return lambda: _seconds(lambda: env.step(actions), 3) / cells
+
+    costs = _interleaved(7, *map(cost_of, envs))
+    figures = [
+        Figure(f"{size:,} arcs × {env.num_envs:,} copies: ns per arc and copy", f"{1e9 * median(cost):.0f}")
+        for size, env, cost in zip(ARCS, envs, costs, strict=True)
+    ]
+    ratio = median(max(each) / min(each) for each in zip(*costs, strict=True))
+    what = "cost per arc and copy from 10 to 1 000 000 arcs: largest / smallest"
+    remark = f"random networks, {CELLS:,} arcs × copies at every size"
+    return [*figures, Figure(what, f"{ratio:.1f}", "≤ 2", ratio <= 2, remark)]
+
+
+MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
+    zip(Measurement, (batched, single, share, lockstep, arcs), strict=True)
+)
+
+
+def _interleaved(rounds: int, *blocks: Callable[[], float]) -> list[list[float]]:
+    """Run the blocks in turns, after one round that does not count, and return what each cost in each round."""
+    for block in blocks:
+        block()
+    costs = [[block() for block in blocks] for _ in range(rounds)]
+    return [list(column) for column in zip(*costs, strict=True)]
+
+
+def _seconds(action: Callable[[], object], times: int) -> float:
+    """Seconds per call of ``action``."""
+    began = time.perf_counter()
+    for _ in range(times):
+        action()
+    return (time.perf_counter() - began) / times
+
+
+def _actions(agents: Sequence[str], shape: tuple[int, ...]) -> dict[str, NDArray[np.float32]]:
+    """Draw one random action array for each agent, the kind that learners hand in."""
+    random = np.random.default_rng(0)
+    return {agent: random.uniform(-1, 1, shape).astype(np.float32) for agent in agents}
+
+
+def _step_on(env: NetworkParallelEnv, actions: dict[str, NDArray[np.float32]]) -> None:
+    """Step, and start the next episode if that was the last of one."""
+    env.step(actions)
+    if not env.agents:
+        env.reset()
+
+
+def _millions(costs: Sequence[float]) -> str:
+    """Best and median rate of some costs in seconds."""
+    return f"{1e-6 / min(costs):.3g} million ({1e-6 / median(costs):.3g})"
+
+
+def _times(slow: Sequence[float], fast: Sequence[float]) -> str:
+    return f"{median(a / b for a, b in zip(slow, fast, strict=True)):,.0f} ×"
+
+
+def _machine() -> Iterator[str]:
+    """Yield what was measured on: processor, load by others, versions."""
+    model = platform.processor() or platform.machine()
+    information = Path("/proc/cpuinfo")
+    if information.is_file():
+        lines = information.read_text().splitlines()
+        model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
+    yield f"{model}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before the measurement"
+    found = {distribution.metadata["Name"].lower() for distribution in importlib.metadata.distributions()}
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES if name in found]
+    yield f"Python {platform.python_version()}, {', '.join(versions)}"
+
+
+if __name__ == "__main__":
+    typer.run(main)
