@@ -179,7 +179,7 @@ def learn_alone(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weight
 
 
 def _trainee(seat: Seat, recipe: Recipe, env: FreeEnv) -> Trainee:
-    return Trainee(seat, recipe.learner_of(seat.agent, env.network), 0).build(None)
+    return Trainee(seat, recipe.learner_of(seat.agent, env.network), 0).build()
 
 
 def _learning(trainee: Trainee, steps: int) -> Callable[[], None]:

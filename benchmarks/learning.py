@@ -68,7 +68,7 @@ def _seed(network: str, recipe: str, seed: int, steps: int | None, directory: Pa
     began = time.perf_counter()
     train(network, recipe, directory=directory, seed=seed, steps=steps)
     seconds = time.perf_counter() - began
-    figures, _, _ = evaluate_run(RunDirectory(directory), seed=1000 * seed)
+    figures, _, _ = evaluate_run(RunDirectory(directory), seed=seed)
     figures["seconds"] = seconds
     write_json(result, figures)
     trained = figures["controllers"]["trained"]

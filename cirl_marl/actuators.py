@@ -47,6 +47,8 @@ class Actuators:
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (agents, B); the checks of ``step`` apply."""
+        if not isinstance(actions, Mapping):
+            raise ControlError(f"actions must be a mapping agent → action, not {actions!r}")
         stacked = np.empty((len(self.agents), self.num_envs))
         if len(actions) != len(self.agents):
             raise ControlError(self._wrong_agents(actions))
@@ -67,7 +69,7 @@ class Actuators:
         Raises:
             ControlError: for NaN or values outside [−1, 1].
         """
-        if not (actions.max() <= 1.0 and actions.min() >= -1.0):
+        if not (actions.max(initial=0.0) <= 1.0 and actions.min(initial=0.0) >= -1.0):
             raise ControlError(self._wrong_values(actions))
         acting = actions * self._half
         acting += self._middle
@@ -95,13 +97,13 @@ class Actuators:
 def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:
     if agents is None:
         chosen = network.agents
-    elif isinstance(agents, str):
-        raise CirlError(f"agents must be a sequence of ids, not the string '{agents}'")
+    elif isinstance(agents, str) or not isinstance(agents, Sequence):
+        raise CirlError(f"agents must be a sequence of ids in a fixed order, such as a list, not {agents!r}")
     else:
         chosen = tuple(agents)
     for agent in chosen:
         if agent not in network.controllable:
             raise CirlError(f"network '{network.name}': {unknown('agent', agent, network.controllable)}")
-    if not chosen or len(set(chosen)) != len(chosen):
+    if (agents is not None and not chosen) or len(set(chosen)) != len(chosen):
         raise CirlError(f"network '{network.name}': agents {list(chosen)} must be distinct and at least one")
     return chosen

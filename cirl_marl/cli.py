@@ -46,6 +46,9 @@ def main() -> None:
     except CirlError as error:
         errors.print(f"[bold red]error:[/] {_plain(error)}", highlight=False, soft_wrap=True)
         sys.exit(2)
+    except OSError as error:
+        errors.print(f"[bold red]error:[/] {_plain(error)}", highlight=False, soft_wrap=True)
+        sys.exit(2)
     except LearnerError as error:
         errors.print(f"[bold red]training failed:[/] {_plain(error)}", highlight=False, soft_wrap=True)
         sys.exit(1)
@@ -84,6 +87,8 @@ def show(
         )
     console.print(f"λ of the start state: {float(found.circularity(flow)):.5g} {found.mass_unit}")
     path = picture or Path(f"{found.name}.png")
+    if path.suffix != ".png" or not path.parent.is_dir():
+        raise CirlError(f"--picture {path}: needs the name of a .png file in a folder that exists")
     save_network(path, found, stock, flow, title=found.title)
     console.print(f"picture: {path}")
 
@@ -146,6 +151,7 @@ def simulate(
 
 @app.command()
 def train(
+    context: typer.Context,
     network: Annotated[str | None, typer.Argument(metavar="NETWORK", help="Catalogue name or .toml file.")] = None,
     agents: Annotated[str, typer.Option(help="Learner recipe: catalogue name or .toml file.")] = "independent_ppo",
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps, summed over the copies.")] = None,
@@ -163,6 +169,8 @@ def train(
 
     if (network is None) == (resume is None):
         raise CirlError("train needs either NETWORK or --resume RUN")
+    if resume is not None:
+        _only_resume(context)
     directory = resume or out or Path("runs") / f"{Path(str(network)).stem}-{Path(agents).stem}-seed{seed}"
     with _training_bar() as report:
         try:
@@ -206,6 +214,18 @@ def evaluate(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
 def report(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
     """Evaluate a run and draw its pictures anew."""
     _evaluate_and_draw(run, episodes, seed)
+
+
+def _only_resume(context: typer.Context) -> None:
+    """Refuse options beside --resume: a resumed run keeps its own."""
+    given = [
+        f"--{name}"
+        for name in context.params
+        if name not in ("resume", "network", "episodes")
+        and getattr(context.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT"
+    ]
+    if given:
+        raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(given)}")
 
 
 def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:

@@ -31,7 +31,9 @@ def read_network(path: Path) -> Network:
         raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
     mistakes: list[str] = []
     networks: dict[str, Network] = {}
-    for name, override in {"default": {}, **overrides}.items():
+    if "default" in overrides:
+        mistakes.append("scenarios.default: the default scenario is what stands outside [scenarios]")
+    for name, override in {"default": {}, **{k: v for k, v in overrides.items() if k != "default"}}.items():
         where = "" if name == "default" else f"scenarios.{name}."
         strangers = list(_strangers(document, override, where))
         mistakes += strangers
@@ -80,7 +82,7 @@ def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, An
     merged = {key: value for key, value in base.items() if key != "scenarios"}
     for key, value in override.items():
         old = merged.get(key)
-        whole = isinstance(value, Mapping) and "source" in value
+        whole = isinstance(old, Mapping) and "source" in old
         nested = isinstance(value, Mapping) and isinstance(old, Mapping) and not whole
         merged[key] = _merge(old, value) if nested and isinstance(old, Mapping) else value
     return merged
@@ -90,9 +92,16 @@ def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: 
     """Yield the compartments and services that a scenario names but the network does not have."""
     for table in ("nodes", "arcs", "services"):
         known = document.get(table, {})
-        for name in override.get(table, {}):
+        given = override.get(table, {})
+        if not isinstance(given, Mapping) or not isinstance(known, Mapping):
+            yield f"{where}{table}: must be a table"
+            continue
+        for name in given:
             if name not in known:
                 yield f"{where}{table}: {unknown(table[:-1], name, known)}"
+    for key in ("name", "scenarios"):
+        if key in override:
+            yield f"{where}{key}: a scenario cannot set it"
 
 
 def _build(document: Mapping[str, Any], scenario: str) -> Network:

@@ -16,6 +16,9 @@ from cirl_marl.vector_env import VectorEnv
 EVALUATION_SEEDS = 2**31
 """First seed of evaluations; training draws its seeds below it, so no evaluated episode was trained on."""
 
+SEED_SPACING = 1_000_000
+"""Distance between the first seeds of two evaluations with different ``seed``, so that they share no episode."""
+
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
@@ -67,9 +70,12 @@ class Estimate:
         """Return ``mean ± half-width``."""
         return f"{self.mean:.4g} ± {self.half_width:.2g}"
 
-    def as_dict(self) -> dict[str, float]:
-        """Return the two numbers by name."""
-        return {"mean": self.mean, "half_width": self.half_width}
+    def as_dict(self) -> dict[str, float | None]:
+        """Return the two numbers by name; None stands for one that is not defined."""
+        return {
+            name: value if np.isfinite(value) else None
+            for name, value in zip(("mean", "half_width"), (self.mean, self.half_width), strict=True)
+        }
 
 
 def estimate(samples: Floats) -> Estimate:
@@ -134,9 +140,10 @@ def interval_ends(network: Network) -> Floats:
 
 
 def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
-    """Return the circularity gain (λ̄ − λ̄_neutral)/|λ̄_neutral| of each episode, shape (B,)."""
+    """Return the circularity gain (λ̄ − λ̄_neutral)/|λ̄_neutral| of each episode, shape (B,); NaN where λ̄_neutral = 0."""
     reference = neutral.episode_circularity
-    return (rollout_.episode_circularity - reference) / np.abs(reference)
+    difference = rollout_.episode_circularity - reference
+    return np.divide(difference, np.abs(reference), out=np.full_like(difference, np.nan), where=reference != 0)
 
 
 def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
@@ -153,6 +160,7 @@ def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
             "circularity_gain": estimate(gain(run, neutral)).as_dict(),
             "service_level": estimate(run.episode_service).as_dict(),
             "service_level_over_neutral": estimate(run.episode_service - neutral.episode_service).as_dict(),
+            "return": {agent: estimate(run.returns[i]).as_dict() for i, agent in enumerate(env.agents)},
             "local_return": {agent: estimate(run.local_returns[i]).as_dict() for i, agent in enumerate(env.agents)},
         }
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}

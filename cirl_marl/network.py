@@ -102,6 +102,14 @@ class Network:
         >>> load_network("copper_net").with_options(episode={"horizon": 3}).episode.horizon
         3
         """
+        known_groups = ("episode", "objective", "observation")
+        for group, values in groups.items():
+            if group not in known_groups:
+                raise CirlError(f"with_options: {unknown('group', group, known_groups)}")
+            known = [each.name for each in fields(getattr(self, group))]
+            for name in values:
+                if name not in known:
+                    raise CirlError(f"with_options: {group}: {unknown('field', name, known)}")
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
         return replace(self, **changes)
 

@@ -66,7 +66,7 @@ class ObservationLayout:
     def __init__(self, dynamics: Dynamics, agents: Sequence[str], mode: str | None, batch: int) -> None:
         """Lay out the observations of ``agents``; ``mode`` None takes the network's own."""
         network = dynamics.network
-        mode = mode or network.observation.mode
+        mode = network.observation.mode if mode is None else mode
         if mode not in MODES:
             raise CirlError(f"observe: {unknown('observation mode', mode, MODES)}")
         if mode == "stocks" and not network.observation.nodes:

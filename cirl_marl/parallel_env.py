@@ -18,6 +18,7 @@ from cirl_marl.state import Outcome, Snapshot
 from cirl_marl.vector_env import VectorEnv
 
 RENDER_MODES = ("rgb_array", "human")
+OPTIONS = ("observe", "circularity", "horizon")
 
 
 class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
@@ -53,10 +54,15 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         **options: Any,
     ) -> None:
         """Make the environment; ``options`` and errors are those of ``VectorEnv``."""
+        for option in options:
+            if option not in OPTIONS:
+                raise CirlError(unknown("option", option, (*OPTIONS, "scenario", "agents", "reward", "render_mode")))
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise CirlError(unknown("render_mode", render_mode, RENDER_MODES))
         self._batch = VectorEnv(network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options)
         self.network = self._batch.network
+        if not self._batch.agents:
+            raise CirlError(f"network '{self.network.name}': no compartment has a control, so nothing can act")
         self.layout = self._batch.layout
         self.possible_agents = list(self._batch.agents)
         self.agents: list[str] = []
@@ -86,6 +92,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         """Start an episode; ``options={"initial_state": {node: stock}}`` starts it from a given state."""
         observation = self._batch.reset(seed, options)
         self.agents = list(self.possible_agents)
+        if self.render_mode == "human":
+            self.render()
         return {agent: seen[0] for agent, seen in observation.items()}, {agent: {} for agent in self.agents}
 
     def step(
@@ -111,6 +119,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         truncated = bool(outcome.truncated[0])
         if truncated:
             self.agents = []
+        if self.render_mode == "human":
+            self.render()
         seen = outcome.observation[:, 0]
         slices = self.layout.slices
         return (
@@ -168,11 +178,17 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
     def _stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions; only if they do not stack are they looked at one by one, to say why."""
+        if not isinstance(actions, Mapping):
+            raise ControlError(f"actions must be a mapping agent → action, not {actions!r}")
         try:
-            stacked = np.array([actions[agent] for agent in self.possible_agents], dtype=float)
+            stacked = np.array([actions[agent] for agent in self.possible_agents])
         except (KeyError, ValueError):
             stacked = np.empty(0)
-        if stacked.shape != (len(self.possible_agents), 1) or len(actions) != len(self.possible_agents):
+        if (
+            stacked.dtype.kind not in "biuf"
+            or stacked.shape != (len(self.possible_agents), 1)
+            or len(actions) != len(self.possible_agents)
+        ):
             return self._batch.stack({agent: np.asarray(action)[None] for agent, action in actions.items()})
         return stacked
 

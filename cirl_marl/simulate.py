@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cirl_marl.elements import Law
+from cirl_marl.errors import CirlError
 from cirl_marl.flows import FlowLaws
 from cirl_marl.inner import InnerPhysics
 from cirl_marl.network import Floats, Integers, Network
@@ -15,6 +16,9 @@ from cirl_marl.rowsum import RowSum
 
 MAX_TURNOVER = 1.0
 """Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
+
+MAX_SUBSTEPS = 10_000
+"""Solver steps per control interval beyond which a rate is taken for a mistake."""
 
 NOTHING = 1e-290
 """Stock that no recipient can pull: emptied again and again it would become subnormal, which does not round well."""
@@ -69,8 +73,9 @@ class Dynamics(FlowLaws):
         stock_driven = self.driver < len(network.nodes)
         turnover = np.bincount(
             self.driver[stock_driven], weights=self.max_rate[stock_driven], minlength=len(network.nodes)
-        )
+        ).astype(float)
         fastest = float(turnover.max(initial=0.0))
+        self._check_turnover(turnover)
         if self._exact:
             self.substeps = max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
         else:
@@ -83,6 +88,33 @@ class Dynamics(FlowLaws):
         self._outgoing = RowSum(network.donors, np.arange(shape[1]), np.ones(shape[1]), shape)
         self._pulls = any(arc.law is Law.RECIPIENT for arc in network.arcs)
         self._compile_orders()
+
+    def _check_turnover(self, turnover: Floats) -> None:
+        """Refuse rates that the solver cannot follow.
+
+        Raises:
+            CirlError: naming the fastest node, its rate and the largest usable step.
+        """
+        episode = self.network.episode
+        if not self.physical or not len(turnover):
+            return
+        node = int(turnover.argmax())
+        rate = f"{turnover[node]:.4g}/{self.network.time_unit}"
+        where = f"network '{self.network.name}': node '{self.network.nodes[node].id}' turns over {rate}"
+        if turnover[node] * episode.control_interval > MAX_SUBSTEPS * MAX_TURNOVER:
+            raise CirlError(
+                f"{where}; a control interval of {episode.control_interval:g} {self.network.time_unit} would need more "
+                f"than {MAX_SUBSTEPS:,} solver steps. Is a rate in the wrong unit?"
+            )
+        if (
+            episode.solver == "rk4"
+            and episode.solver_step is not None
+            and turnover[node] * episode.solver_step > MAX_TURNOVER
+        ):
+            raise CirlError(
+                f"{where}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / turnover[node]:.4g} "
+                f"{self.network.time_unit}, not {episode.solver_step:g}"
+            )
 
     def _compile_orders(self) -> None:
         """Find the donors of scheduled flows, and their outflows by schedule and in proportion to their stock."""
@@ -124,6 +156,13 @@ class Dynamics(FlowLaws):
         assert total is not None
         return Transition(stock, inner, total, self.flow_at(stock, inner, controls, realised))
 
+    def start_flow(self, stock: Floats, inner: Floats, controls: Floats) -> Floats:
+        """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
+        rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp))
+        if self.physical:
+            rate = self._limit_orders(stock, rate)
+        return self.flow_at(stock, inner, controls, rate)
+
     def flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats) -> Floats:
         """Return the instantaneous flows r ∘ y[driver], shape (arcs, B), mass/time."""
         return self.flow(self.inner.extend(stock, inner, controls), rate)
@@ -153,9 +192,10 @@ class Dynamics(FlowLaws):
         """Move mass; scale the outflows of nodes that would be overdrawn to the stock they started with."""
         moved = np.maximum(moved, 0.0)
         after = self.incidence.add_to(stock.copy(), moved)
+        held = np.where(stock > NOTHING, stock * (1.0 - 1e-12), 0.0)
         while after.min() < 0:
             out = self._outgoing(moved)
-            share = np.divide(stock * (1.0 - 1e-12), out, out=np.ones_like(out), where=(after < 0) & (out > stock))
+            share = np.divide(held, out, out=np.ones_like(out), where=(after < 0) & (out > stock))
             by_arc = share.take(self.network.donors, axis=0)
             moved, rate = moved * by_arc, rate * by_arc
             after = self.incidence.add_to(stock.copy(), moved)

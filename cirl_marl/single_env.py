@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -100,11 +101,13 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the whole environment state, random streams included."""
-        return self.parallel.snapshot()
+        return replace(self.parallel.snapshot(), elapsed=self._elapsed)
 
     def restore(self, snapshot: Snapshot) -> NDArray[np.float32]:
         """Go back to a snapshot and return the observation there."""
-        return self.parallel.restore(snapshot)[self.agent]
+        observations = self.parallel.restore(snapshot)
+        self._elapsed = snapshot.elapsed
+        return observations[self.agent]
 
     def render(self) -> Any:
         """Draw the network; see ``NetworkParallelEnv.render``."""

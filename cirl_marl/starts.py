@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -40,7 +39,7 @@ class Starts:
             ControlError: for a seed, option or state that cannot be used; the streams are left as they were.
         """
         streams = self.streams if seed is None else self._seeded(seed)
-        given = self._given(options or {})
+        given = self._given({} if options is None else options)
         self.streams = streams
         drawn = self.draw(range(len(streams)))
         for row, values in given.items():
@@ -77,13 +76,15 @@ class Starts:
 
     def _given(self, options: Mapping[str, Any]) -> dict[int, Floats]:
         """Return the given initial stocks and inner states by their row."""
-        for key in options:  # other keys are for wrappers: PettingZoo's own test passes one; a misspelt one is an error
-            if key != "initial_state" and difflib.get_close_matches(str(key), ["initial_state"]):
+        if not isinstance(options, Mapping):
+            raise ControlError(f"reset options must be a mapping, not {options!r}")
+        for key in options:
+            if key not in ("initial_state", "options"):  # PettingZoo's own test passes the key "options"
                 raise ControlError(f"reset options: {unknown('option', key, ['initial_state'])}")
         given = options.get("initial_state", {})
         if not isinstance(given, Mapping):
             nodes = self._network.observation.nodes
-            values = np.asarray(given, dtype=float)
+            values = _numbers("initial_state", given)
             if not nodes or values.shape != (len(nodes),):
                 raise ControlError(
                     f"initial_state has shape {values.shape}: give a mapping node → stock"
@@ -108,7 +109,7 @@ class Starts:
         return self.names.index(id_)
 
     def _initial(self, id_: str, values: ArrayLike) -> Floats:
-        stock = np.asarray(values, dtype=float)
+        stock = _numbers(f"initial_state of '{id_}'", values)
         if stock.shape not in ((), (len(self.streams),)):
             raise ControlError(
                 f"initial_state of '{id_}' has shape {stock.shape}, expected () or {(len(self.streams),)}"
@@ -117,3 +118,10 @@ class Starts:
         if not np.isfinite(stock).all() or (is_stock and (stock < 0).any()):
             raise ControlError(f"initial_state of '{id_}' is {values!r}: stocks are finite and not negative")
         return stock
+
+
+def _numbers(what: str, values: ArrayLike) -> Floats:
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ControlError(f"{what} is {values!r}; it must hold numbers") from None

@@ -39,12 +39,21 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Everything needed to go on from here, bit for bit: physical state and random streams."""
+    """Everything needed to go on from here, bit for bit.
+
+    Attributes:
+        state: the physical state.
+        streams: state of the random stream of each copy.
+        agents: who acts.
+        network: what it is a snapshot of.
+        elapsed: the published step counter of a one-agent environment with ``legacy_episode``.
+    """
 
     state: State
     streams: tuple[Mapping[str, Any], ...]
     agents: tuple[str, ...]
     network: str
+    elapsed: int = 0
 
 
 @dataclass(frozen=True, slots=True)

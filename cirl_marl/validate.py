@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 def problems(network: Network) -> Iterator[str]:
     """Yield every reason why ``network`` cannot be simulated."""
+    if not network.nodes:
+        yield "nodes: a network needs at least one"
     seen: set[str] = set()
     for compartment in (*network.nodes, *network.arcs):
         if compartment.id in seen:

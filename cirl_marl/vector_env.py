@@ -73,13 +73,14 @@ class VectorEnv:
         """
         found = load_network(network) if isinstance(network, str | Path) else network
         found = found.scenario(scenario)
+        for name, value in (("num_envs", num_envs), ("horizon", found.episode.horizon if horizon is None else horizon)):
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+                raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
         if horizon is not None:
             found = found.with_options(episode={"horizon": horizon})
-        if num_envs < 1:
-            raise CirlError(f"num_envs must be at least 1, got {num_envs}")
         self.network = found
         self.num_envs = num_envs
-        self.reward_mode = _choice("reward", reward or found.objective.reward, REWARDS)
+        self.reward_mode = _choice("reward", found.objective.reward if reward is None else reward, REWARDS)
         self._team = _choice("circularity", circularity, ("end", "mean"))
         self.dynamics = Dynamics(found)
         self._actuators = Actuators(self.dynamics, agents, num_envs)
@@ -154,6 +155,7 @@ class VectorEnv:
             self._report_ends(infos, outcome)
             observation = self._restart(outcome.truncated)
         terminated = np.zeros(self.num_envs, dtype=bool)
+        terminated.flags.writeable = outcome.truncated.flags.writeable = False  # one array for all agents
         return (
             self.by_agent(observation),
             {agent: outcome.reward[i] for i, agent in enumerate(self.agents)},
@@ -179,6 +181,7 @@ class VectorEnv:
         controls = self._actuators.controls(actions)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step)
         flow = transition.moved / self.network.episode.control_interval
+        flow.flags.writeable = False  # infos hand it out, and the state keeps it
         quantities = np.concatenate([transition.stock[:-1], flow, transition.inner])
         levels = self.scoring.levels(quantities)
         service = self.scoring.service_level(levels)
@@ -323,7 +326,7 @@ class VectorEnv:
         stock, inner = dynamics.extend(drawn[:nodes]), np.ascontiguousarray(drawn[nodes:])
         step = np.zeros(batch, dtype=np.intp)
         neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
-        flow = dynamics.flow_at(stock, inner, neutral, dynamics.rate(neutral, step))
+        flow = dynamics.start_flow(stock, inner, neutral)
         zeros = np.zeros(batch)
         return State(stock, inner, flow, step, zeros, zeros)
 

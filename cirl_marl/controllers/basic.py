@@ -71,7 +71,7 @@ class Random:
     def start(self, env: VectorEnv, seed: int) -> None:
         """Seed the draws."""
         self._agents = env.agents
-        self._random = np.random.default_rng(seed)
+        self._random = np.random.default_rng([seed, 1])  # not the numbers that the start states are drawn from
 
     def act(self, observations: Arrays) -> Arrays:
         """Return fresh random actions."""

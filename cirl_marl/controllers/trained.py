@@ -27,11 +27,9 @@ class Trained:
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
         config, folder = self.run.config, self.run.checkpoint
         network = self.run.make_env(1).network
-        self._models = {
-            agent: load_model(folder, agent, config.recipe.learner_of(agent, network).algorithm)
-            for agent in config.agents
-        }
-        self._normalisers = {agent: load_normaliser(folder, agent) for agent in config.agents}
+        specs = {agent: config.recipe.learner_of(agent, network) for agent in config.agents}
+        self._models = {agent: load_model(folder, agent, spec.algorithm) for agent, spec in specs.items()}
+        self._normalisers = {agent: load_normaliser(folder, agent, spec) for agent, spec in specs.items()}
         self._memory: dict[str, Any] = {}
         self._starts = np.ones(1, dtype=bool)
 

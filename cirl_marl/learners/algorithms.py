@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -67,12 +68,30 @@ def checked_parameters(name: str, parameters: Mapping[str, Any]) -> None:
     for parameter in parameters:
         if parameter not in known:
             raise RecipeError(f"parameters: {unknown(f'parameter of {name}', parameter, known)}")
+    rate = parameters.get("learning_rate")
+    if isinstance(rate, Mapping) and not (set(rate) == {"linear_from", "linear_to"} and _are_numbers(rate.values())):
+        raise RecipeError(f"parameters.learning_rate: needs a number, or linear_from and linear_to, got {rate!r}")
     noise = parameters.get("action_noise")
     if noise is not None:
-        if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"}:
-            raise RecipeError(f"parameters.action_noise: needs kind and sigma, got {noise!r}")
+        if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"} or not _are_numbers([noise["sigma"]]):
+            raise RecipeError(f"parameters.action_noise: needs kind and a number sigma, got {noise!r}")
         if noise["kind"] not in NOISES:
             raise RecipeError(f"parameters.action_noise: {unknown('kind', noise['kind'], NOISES)}")
+
+
+def checked_policy(name: str, policy: str) -> None:
+    """Refuse a policy that the algorithm does not have.
+
+    Raises:
+        RecipeError: naming the nearest that it has.
+    """
+    known = [alias for alias in algorithm_class(name).policy_aliases if alias.startswith("Mlp")]
+    if policy not in known:
+        raise RecipeError(f"policy: {unknown(f'policy of {name} for vectors', policy, known)}")
+
+
+def _are_numbers(values: Iterable[object]) -> bool:
+    return all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values)
 
 
 def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **fixed: Any) -> BaseAlgorithm:
@@ -100,5 +119,5 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         arguments["action_noise"] = NOISES[noise["kind"]](mean, noise["sigma"] * np.ones_like(mean))  # type: ignore[call-arg]
     try:
         return algorithm_class(name)(policy, env, **arguments, **fixed)
-    except (TypeError, ValueError, AssertionError) as error:
+    except (TypeError, ValueError, AssertionError, KeyError) as error:
         raise RecipeError(f"{name} refuses its parameters {dict(parameters)}: {error}") from error

@@ -12,7 +12,7 @@ from cirl_marl.catalogue import recipe_path
 from cirl_marl.definition import read_toml
 from cirl_marl.elements import Node, Role
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
-from cirl_marl.learners.algorithms import algorithm_class, algorithms, checked_parameters
+from cirl_marl.learners.algorithms import algorithm_class, algorithms, checked_parameters, checked_policy
 from cirl_marl.mistakes import mistakes_of
 from cirl_marl.network import Network
 
@@ -28,6 +28,11 @@ class Normalisation(_Table):
     reward: bool = True
     clip_observation: Annotated[float, Field(gt=0)] = 10.0
     clip_reward: Annotated[float, Field(gt=0)] = 10.0
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is normalised."""
+        return self.observation or self.reward
 
 
 class Learner(_Table):
@@ -134,6 +139,7 @@ def load_recipe(name: str | Path) -> Recipe:
         try:
             algorithm_class(learner.algorithm)
             checked_parameters(learner.algorithm, learner.parameters)
+            checked_policy(learner.algorithm, learner.policy)
         except RecipeError as error:
             mistakes.append(f"{where}.{error}")
     if mistakes:

@@ -123,12 +123,22 @@ class RunDirectory:
         Raises:
             RunError: if the directory holds no complete run description.
         """
-        return RunConfig.from_dict(self._json("config.json"))
+        try:
+            return RunConfig.from_dict(self._json("config.json"))
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunError(f"{self.path / 'config.json'}: is not a run configuration: {error!r}") from error
 
     @property
     def status(self) -> dict[str, Any]:
-        """State, joint steps and checkpoint."""
-        return self._json("status.json")
+        """State, joint steps and checkpoint.
+
+        Raises:
+            RunError: if the file is missing or says something else.
+        """
+        status = self._json("status.json")
+        if not isinstance(status, dict) or not {"state", "joint_steps", "checkpoint"} <= set(status):
+            raise RunError(f"{self.path / 'status.json'}: is not the status of a run: {status!r}")
+        return status
 
     def set_status(self, state: str, joint_steps: int, checkpoint: str | None, reason: str = "") -> None:
         """Say how far the run got; written atomically."""
@@ -184,10 +194,11 @@ class RunDirectory:
         path = self.path / "metrics.csv"
         if not path.is_file():
             raise RunError(f"{path}: missing; no episode ended in this run")
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        names = list(rows[0]) if rows else []
-        return {name: [float(row[name]) for row in rows] for name in names}
+        header, *rows = _complete_rows(path)
+        try:
+            return {name: [float(row[i]) for row in rows] for i, name in enumerate(header)}
+        except (ValueError, IndexError) as error:
+            raise RunError(f"{path}: cannot be read: {error}") from error
 
     def _json(self, name: str) -> dict[str, Any]:
         path = self.path / name
@@ -202,17 +213,25 @@ class RunDirectory:
         return value
 
 
+def _complete_rows(path: Path) -> list[list[str]]:
+    """Return the rows of a CSV file that end in a newline; a crash may have cut the last one short."""
+    text = path.read_text()
+    return list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
+
+
 class MetricsFile:
     """Appends one row per joint episode to ``metrics.csv``."""
 
-    def __init__(self, path: Path, agents: Sequence[str]) -> None:
-        """Open the file; the header is written once."""
-        fresh = not path.is_file()
+    def __init__(self, path: Path, agents: Sequence[str], done: int) -> None:
+        """Open the file; rows past joint step ``done``, which a resumed run will repeat, are dropped."""
+        columns = ["joint_step", "env_steps", "seconds", "circularity", "service_level"]
+        rows = [columns + [f"return:{agent}" for agent in agents]]
+        if path.is_file():
+            rows += [row for row in _complete_rows(path)[1:] if float(row[0]) <= done]
+        text = "".join(",".join(row) + "\n" for row in rows)
+        write_atomically(path, lambda temporary: temporary.write_text(text))
         self._file = path.open("a", newline="")
-        self._writer = csv.writer(self._file)
-        if fresh:
-            returns = [f"return:{agent}" for agent in agents]
-            self._writer.writerow(["joint_step", "env_steps", "seconds", "circularity", "service_level", *returns])
+        self._writer = csv.writer(self._file, lineterminator="\n")
 
     def append(self, row: Sequence[float]) -> None:
         """Write a row and flush it."""

@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from cirl_marl.errors import RunError
+from cirl_marl.errors import RecipeError, RunError
 from cirl_marl.learners.algorithms import algorithm_class, build
 from cirl_marl.learners.recipe import Learner
 from cirl_marl.learners.run import write_atomically
@@ -59,27 +59,32 @@ class Trainee:
         noisy = spec.parameters.get("action_noise") is not None
         self.streams = Streams(self._seed, keep_gaussian=noisy)
 
-    def build(self, log: Path | None) -> Trainee:
-        """Make a fresh algorithm; ``log`` is the folder of its TensorBoard events."""
+    def build(self) -> Trainee:
+        """Make a fresh algorithm.
+
+        Raises:
+            RecipeError: naming the agent, if the algorithm refuses its parameters.
+        """
         spec = self.spec
         self.env = self._normalised(spec)
         parameters = dict(spec.parameters)
         if issubclass(algorithm_class(spec.algorithm), ARS):
             parameters.setdefault("n_eval_episodes", self.seat.num_envs)
         with self.streams.active():
-            self.model = build(spec.algorithm, spec.policy, self.env, parameters, seed=self._seed, device="cpu")
-        self._log_to(log)
+            try:
+                self.model = build(spec.algorithm, spec.policy, self.env, parameters, seed=self._seed, device="cpu")
+            except RecipeError as error:
+                raise RecipeError(f"agent '{self.agent}': {error}") from error
         return self
 
-    def load(self, folder: Path, log: Path | None) -> Trainee:
+    def load(self, folder: Path) -> Trainee:
         """Go on with the algorithm saved in ``folder``."""
         with self.streams.active():
-            self.env = load_normaliser(folder, self.agent, self.seat) or self.seat
+            self.env = load_normaliser(folder, self.agent, self.spec, self.seat) or self.seat
             self.model = load_model(folder, self.agent, self.spec.algorithm, env=self.env)
             replay = folder / f"{self.agent}.replay.pkl"
             if isinstance(self.model, OffPolicyAlgorithm) and replay.is_file():
                 self.model.load_replay_buffer(replay)
-        self._log_to(log)
         return self
 
     def budget(self, steps: int) -> int:
@@ -120,7 +125,7 @@ class Trainee:
 
     def _normalised(self, spec: Learner) -> VecEnv:
         normalise = spec.normalise
-        if not (normalise.observation or normalise.reward):
+        if not normalise.any:
             return self.seat
         return VecNormalize(
             self.seat,
@@ -131,7 +136,8 @@ class Trainee:
             gamma=spec.parameters.get("gamma", 0.99),
         )
 
-    def _log_to(self, log: Path | None) -> None:
+    def log_to(self, log: Path | None) -> None:
+        """Write TensorBoard events below the folder ``log``, or nowhere."""
         if log is not None:
             self.model.set_logger(configure(str(log / self.agent), ["tensorboard"]))
         else:
@@ -152,13 +158,20 @@ def load_model(folder: Path, agent: str, algorithm: str, env: VecEnv | None = No
             raise RunError(f"{path}: cannot be read: {error}") from error
 
 
-def load_normaliser(folder: Path, agent: str, seat: Seat | None = None) -> VecNormalize | None:
-    """Load the normaliser saved with a policy; None if the recipe did not normalise."""
-    path = folder / f"{agent}.normaliser.pkl"
-    if not path.is_file():
+def load_normaliser(folder: Path, agent: str, spec: Learner, seat: Seat | None = None) -> VecNormalize | None:
+    """Load the normaliser saved with a policy; None if its recipe does not normalise.
+
+    Raises:
+        RunError: if it is missing although the recipe normalises, or cannot be read.
+    """
+    if not spec.normalise.any:
         return None
-    if seat is not None:
-        return VecNormalize.load(str(path), seat)
-    with path.open("rb") as file:
-        normaliser: VecNormalize = pickle.load(file)
+    path = folder / f"{agent}.normaliser.pkl"
+    try:
+        if seat is not None:
+            return VecNormalize.load(str(path), seat)
+        with path.open("rb") as file:
+            normaliser: VecNormalize = pickle.load(file)
+    except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError, IndexError, ValueError) as error:
+        raise RunError(f"{path}: cannot be read: {error}; without it the policy of '{agent}' is useless") from error
     return normaliser

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -62,23 +63,36 @@ class Training:
         run: where it is kept; None if it is not.
     """
 
-    def __init__(self, config: RunConfig, env: VectorEnv, run: RunDirectory | None, *, resume: bool = False) -> None:
-        """Seat the agents and make, or load, their algorithms."""
+    def __init__(self, config: RunConfig, env: VectorEnv, resumed: RunDirectory | None = None) -> None:
+        """Seat the agents and make their algorithms, or load those of a run that is resumed."""
         self.config = config
         self.env = env
-        self.run = run
-        self.done = int(run.status["joint_steps"]) if run is not None and resume else 0
+        self.run: RunDirectory | None = None
+        self._metrics: MetricsFile | None = None
+        self._interrupted = False
+        checkpoint = None
+        self.done = 0
+        if resumed is not None and resumed.status["checkpoint"] is not None:
+            checkpoint, self.done = resumed.checkpoint, int(resumed.status["joint_steps"])
         keys: tuple[str | int, ...] = ("copies", self.done) if self.done else ("copies",)
         seeds = [derived_seed(config.seed, *keys, i) for i in range(config.envs)]
         self.lockstep = Lockstep(env, seeds)
-        log = run.path / "tensorboard" if run is not None else None
-        checkpoint = run.checkpoint if run is not None and self.done else None
         self.trainees: dict[str, Trainee] = {}
         for agent, seat in self.lockstep.seats.items():
             trainee = Trainee(seat, config.recipe.learner_of(agent, env.network), config.seed + self.done)
-            self.trainees[agent] = trainee.load(checkpoint, log) if checkpoint else trainee.build(log)
-        self._metrics = MetricsFile(run.path / "metrics.csv", env.agents) if run is not None else None
-        self._interrupted = False
+            self.trainees[agent] = trainee.load(checkpoint) if checkpoint else trainee.build()
+        self._log()
+
+    def keep_in(self, run: RunDirectory) -> None:
+        """Keep metrics, logs and checkpoints in ``run`` from now on."""
+        self.run = run
+        self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
+        self._log()
+
+    def _log(self) -> None:
+        log = self.run.path / "tensorboard" if self.run is not None else None
+        for trainee in self.trainees.values():
+            trainee.log_to(log)
 
     def start(
         self,
@@ -252,8 +266,10 @@ def train(
         if option not in OPTIONS:
             raise CirlError(unknown("option", option, OPTIONS))
     settings = found.environment | {name: value for name, value in options.items() if value is not None}
-    copies = envs or found.run.envs
+    copies = found.run.envs if envs is None else _whole("envs", envs, 1)
     env = VectorEnv(network, num_envs=copies, agents=agents, **settings)
+    if not env.agents:
+        raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
     found.check(env.network, env.agents)
     settings.pop("scenario", None)
     config = RunConfig(
@@ -261,13 +277,14 @@ def train(
         scenario=env.network.scenario_name,
         agents=env.agents,
         recipe=found,
-        seed=seed,
-        steps=steps or found.run.steps,
+        seed=_whole("seed", seed, 0),
+        steps=found.run.steps if steps is None else _whole("steps", steps, 1),
         envs=copies,
         options=settings,
     )
-    run = None if directory is None else _create(Path(directory), config, env.network)
-    training = Training(config, env, run)
+    training = Training(config, env)
+    if directory is not None:
+        training.keep_in(_create(Path(directory), config, env.network))
     training.start(callbacks=callbacks, report=report)
     return training
 
@@ -282,22 +299,31 @@ def resume(directory: str | Path, *, report: Callable[[Progress], None] | None =
     config, status = run.config, run.status
     if status["state"] == "complete":
         raise RunError(f"{run.path}: the run is complete ({status['joint_steps']} joint steps); nothing is left to do")
-    training = Training(config, run.make_env(config.envs), run, resume=status["checkpoint"] is not None)
+    training = Training(config, run.make_env(config.envs), run)
+    training.keep_in(run)
     training.start(report=report)
     return training
 
 
 def _create(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
+    """Start the run directory; the definition is copied if it is still what was trained on, and written if not."""
+    horizon = {"horizon": network.episode.horizon}
     source = network.source
-    if source is not None and load_network(source, scenario=network.scenario_name).nodes == network.nodes:
-        return RunDirectory.create(directory, config, source)
-    written = directory.with_name(f".{directory.name}.network.toml")
-    written.parent.mkdir(parents=True, exist_ok=True)
-    write_network(network, written)
-    try:
-        return RunDirectory.create(directory, config, written)
-    finally:
-        written.unlink()
+    if source is not None and source.is_file():
+        read = load_network(source, scenario=network.scenario_name).with_options(episode=horizon)
+        if read == network:
+            return RunDirectory.create(directory, config, source)
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        written = Path(folder) / "network.toml"
+        write_network(network, written)
+        return RunDirectory.create(directory, replace(config, scenario="default"), written)
+
+
+def _whole(name: str, value: object, least: int) -> int:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+        raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    return int(value)
 
 
 def _learner(trainee: Trainee, steps: int, callback: BaseCallback | None) -> Callable[[], None]:

@@ -11,7 +11,7 @@ import numpy as np
 from cirl_marl.controllers import Controller, Neutral, Random
 from cirl_marl.controllers.trained import Trained
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.evaluate import EVALUATION_SEEDS, Rollout, interval_ends, rollout, summary
+from cirl_marl.evaluate import EVALUATION_SEEDS, SEED_SPACING, Rollout, interval_ends, rollout, summary
 from cirl_marl.learners.run import RunDirectory, write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
 from cirl_marl.report.digraph import save_before_after
@@ -32,7 +32,7 @@ def evaluate_run(
     Args:
         run: a run with a checkpoint.
         episodes: number of episodes.
-        seed: offset of the evaluation seeds.
+        seed: different seeds evaluate on different episodes.
         progress: called with the controller's name and the number of intervals done.
 
     Returns:
@@ -46,6 +46,7 @@ def evaluate_run(
         raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
     if seed < 0:
         raise CirlError(f"seed must not be negative, got {seed}")
+    first = EVALUATION_SEEDS + SEED_SPACING * seed
     trained = Trained(run)
     env = run.make_env(episodes)
     controllers: Mapping[str, Controller] = {"trained": trained, "neutral": Neutral(), "random": Random()}
@@ -53,14 +54,14 @@ def evaluate_run(
         name: rollout(
             env,
             controller,
-            seed=EVALUATION_SEEDS + seed,
+            seed=first,
             progress=None if progress is None else _named(progress, name),
         )
         for name, controller in controllers.items()
     }
     figures = summary(env, rollouts)
     config = run.config
-    figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": EVALUATION_SEEDS + seed}
+    figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": first}
     write_json(run.path / "evaluation.json", figures)
     return figures, rollouts, env
 

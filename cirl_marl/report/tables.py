@@ -82,20 +82,24 @@ def control_text(network: Network, control: Control | None) -> str:
 
 
 def evaluation_table(figures: Mapping[str, Any]) -> Table:
-    """One row a controller: λ̄, circularity gain, service level, each with its confidence interval."""
+    """One row a controller: λ̄, gain, service level with confidence intervals; returns as means over the agents."""
     title = f"{figures['episodes']} fresh episodes, mean ± half-width of the 95 % confidence interval"
     table = Table(title=title)
-    columns = ("controller", f"λ̄ ({figures['unit']})", "gain over neutral", "service level", "local return, all agents")
+    columns = ("controller", f"λ̄ ({figures['unit']})", "gain over neutral", "service level", "return", "local return")
     for column in columns:
         table.add_column(column, justify="left" if column == "controller" else "right")
     for name, row in figures["controllers"].items():
-        local = float(np.sum([value["mean"] for value in row["local_return"].values()]))
+        mean = {
+            which: float(np.mean([value["mean"] for value in row[which].values()]))
+            for which in ("return", "local_return")
+        }
         table.add_row(
             name,
             _figure(row["circularity"], "{:.4g}"),
             _figure(row["circularity_gain"], "{:+.1%}"),
             _figure(row["service_level"], "{:.4f}"),
-            f"{local:.4g}",
+            f"{mean['return']:.4g}",
+            f"{mean['local_return']:.4g}",
         )
     return table
 
@@ -112,5 +116,7 @@ def local_returns_table(figures: Mapping[str, Any]) -> Table:
     return table
 
 
-def _figure(estimate: Mapping[str, float], form: str) -> str:
+def _figure(estimate: Mapping[str, float | None], form: str) -> str:
+    if estimate["mean"] is None or estimate["half_width"] is None:
+        return "–"
     return f"{form.format(estimate['mean'])} ± {form.format(estimate['half_width']).lstrip('+')}"
