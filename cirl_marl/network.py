@@ -207,7 +207,8 @@ class Network:
         """Return λ(N;t) = −Δ·σᵀf for continuous flows.
 
         With ``net_zero = "abs"`` the part through the environment enters by its absolute value:
-        λ = −Δ(σ_rest·f + |σ_env·f|).
+        λ = −Δ(σ_rest·f + |σ_env·f|). Given mean flows this is λ of the mean flows, which for ``abs`` is not the mean
+        of λ if the net flow changes its sign within the interval.
 
         Args:
             flow: f, shape (arcs, ...), mass/time.

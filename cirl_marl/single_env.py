@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
@@ -86,7 +86,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         observations, _ = self.parallel.reset(seed=seed, options=options)
         return observations[self.agent], {"state": self._paper_state()}
 
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Hold the action, shape (1,) in [−1, 1], for one control interval."""
         over = self._legacy and self._elapsed >= self.network.episode.horizon
         if over:

@@ -106,6 +106,8 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
         (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
         (["train"], "needs either NETWORK or --resume RUN"),
         (["train", "--resume", "nowhere"], "nowhere: no such run directory"),
+        (["train", "--resume", "nowhere", "--steps", "5", "--seed", "1"], "leave out --steps, --seed"),
+        (["show", "copper_net", "--picture", "no/such/folder.png"], "needs the name of a .png file"),
         (["evaluate", "nowhere"], "nowhere: no such run directory"),
         (["simulate", "copper_net", "--control", "nutral"], "Did you mean 'neutral'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mien=0"], "Did you mean 'mine'?"),

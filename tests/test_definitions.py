@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cirl_marl import CirlError, DefinitionError, Network, VectorEnv, load_network, networks, parallel_env
 from cirl_marl.catalogue import folder
+from cirl_marl.definition import read_network
 from cirl_marl.elements import ControlKind
 from cirl_marl.schema import json_schema
 from cirl_marl.units import factor
@@ -297,3 +298,21 @@ def test_network_can_be_built_in_python() -> None:
     source = load_network("copper_net")
     with pytest.raises(CirlError, match="used twice"):
         Network(name="twice", nodes=(*source.nodes, source.nodes[0]), arcs=())
+
+
+@pytest.mark.parametrize(
+    ("scenario", "message"),
+    [
+        ('[scenarios.default]\ntitle = "x"', "scenarios.default: the default scenario is what stands outside"),
+        ('[scenarios.other]\nname = "x"', "scenarios.other.name: a scenario cannot set it"),
+        ("[scenarios.other]\narcs = 5", "scenarios.other.arcs: must be a table"),
+        ("[scenarios.other.nodes.mine.initial]\nlow = 1", "scenarios.other.nodes.mine.initial.high: missing"),
+    ],
+)
+def test_scenarios_are_strict(tmp_path: Path, scenario: str, message: str) -> None:
+    """A scenario replaces whole quantities, with their sources, and nothing that it must not."""
+    path = tmp_path / "net.toml"
+    path.write_text((folder("envs") / "copper_net.toml").read_text(encoding="utf-8") + "\n" + scenario + "\n")
+    with pytest.raises(DefinitionError) as raised:
+        read_network(path)
+    assert message in str(raised.value)

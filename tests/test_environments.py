@@ -24,6 +24,7 @@ from cirl_marl import (
     single_agent_env,
     vector_env,
 )
+from cirl_marl.controllers import Random
 from cirl_marl.testing import ConformanceError, check_parallel_env, check_vector_env
 
 CATALOGUE = [
@@ -487,14 +488,14 @@ def test_acting_outside_an_episode() -> None:
         ({"agents": ["landfill"]}, "unknown agent 'landfill'"),
         ({"agents": []}, "at least one"),
         ({"agents": ["mine", "mine"]}, "distinct"),
-        ({"agents": "mine"}, "not the string"),
+        ({"agents": "mine"}, "sequence of ids in a fixed order"),
         ({"reward": "mixd"}, "unknown reward 'mixd'. Did you mean 'mixed'"),
         ({"observe": "neighbors"}, "unknown observation mode 'neighbors'. Did you mean 'neighbours'"),
         ({"observe": "stocks"}, "stocks"),
         ({"circularity": "ends"}, "unknown circularity 'ends'. Did you mean 'end'"),
         ({"scenario": "papr"}, "unknown scenario 'papr'. Did you mean 'paper'"),
         ({"num_envs": 0}, "num_envs.*0"),
-        ({"horizon": 0}, "horizon 0"),
+        ({"horizon": 0}, "horizon must be a whole number of at least 1, got 0"),
     ],
 )
 def test_bad_options(options: dict[str, Any], message: str) -> None:
@@ -688,3 +689,66 @@ def test_zero_throughput_is_not_best() -> None:
             services.append(service)
         assert totals[0] < totals[1], name
         assert services[0] < services[1], name
+
+
+def test_results_cannot_be_written_through() -> None:
+    """Flows and ends are shared by all agents and by the state, so they are read-only."""
+    env = vector_env("copper_net", num_envs=2)
+    env.reset(seed=0)
+    actions = {agent: np.zeros((2, 1)) for agent in env.agents}
+    _, _, terminations, truncations, infos = env.step(actions)
+    for shared in (infos["mine"]["flows"], terminations["mine"], truncations["mine"]):
+        with pytest.raises(ValueError, match="read-only"):
+            shared[:] = 0
+
+
+def test_random_control_does_not_copy_the_start_state() -> None:
+    """Actions and initial stocks come from different streams though both have the same seed."""
+    env = vector_env("copper_net", num_envs=1)
+    observations = env.reset(seed=7)
+    controller = Random()
+    controller.start(env, 7)
+    drawn = np.array([action[0, 0] for action in controller.act(observations).values()]) / 2 + 0.5
+    nodes = [node for node in env.network.nodes if node.initial[0] < node.initial[1]]
+    low, high = np.array([node.initial for node in nodes]).T
+    stock = env.physical.stock[[env.network.node_index[node.id] for node in nodes], 0]
+    assert not np.isclose((stock - low) / (high - low), drawn[: len(nodes)], rtol=1e-6).any()
+
+
+@pytest.mark.parametrize("options", [{"state": {}}, {"x0": 1}, 5])
+def test_unknown_reset_options_are_errors(options: Any) -> None:
+    """A start state under another name is not silently ignored."""
+    env = parallel_env("copper_net")
+    with pytest.raises(ControlError, match="reset options"):
+        env.reset(seed=0, options=options)
+
+
+@pytest.mark.parametrize("actions", [None, [0.0], "mine"])
+def test_actions_that_are_no_mapping_are_errors(actions: Any) -> None:
+    """Whatever is handed in, the error says what is wanted."""
+    env, batch = parallel_env("copper_net"), vector_env("copper_net", num_envs=1)
+    env.reset(seed=0)
+    batch.reset(seed=0)
+    for step in (env.step, batch.step):
+        with pytest.raises(ControlError, match="must be a mapping"):
+            step(actions)
+
+
+def test_text_is_no_action() -> None:
+    """Numbers in quotation marks are refused, not parsed."""
+    env = parallel_env("copper_net")
+    env.reset(seed=0)
+    with pytest.raises(ControlError, match="agent 'refinery'"):
+        env.step({agent: ["0.5"] for agent in env.agents})
+
+
+def test_misspelt_options_name_the_nearest() -> None:
+    """Options of the environments and of ``with_options`` are checked."""
+    with pytest.raises(CirlError, match=r"unknown option 'horzon'\. Did you mean 'horizon'"):
+        parallel_env("copper_net", horzon=3)
+    with pytest.raises(CirlError, match=r"unknown field 'horzon'\. Did you mean 'horizon'"):
+        load_network("copper_net").with_options(episode={"horzon": 3})
+    with pytest.raises(CirlError, match=r"unknown group 'episod'\. Did you mean 'episode'"):
+        load_network("copper_net").with_options(episod={"horizon": 3})
+    with pytest.raises(CirlError, match="fixed order"):
+        parallel_env("copper_net", agents={"mine", "use"})

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import gymnasium
+import numpy as np
 import pytest
 
-import cirl_marl  # noqa: F401 (registers the ids)
+import cirl_marl
 
 
 def episode(env: gymnasium.Env[object, object], action: float) -> tuple[int, float, bool]:
@@ -38,3 +39,15 @@ def test_default_episodes_end_by_truncation(name: str, action: float, clean: flo
         steps, total, terminated = episode(env, action)
         assert (steps, terminated) == (50, False)
         assert total == pytest.approx(clean, rel=1e-3)
+
+
+def test_step_counter_is_part_of_a_snapshot() -> None:
+    """After a restore the published step counter goes on from where it was."""
+    env = cirl_marl.single_agent_env("copper_net", scenario="paper", legacy_episode=True)
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(np.zeros(1))
+    saved = env.snapshot()
+    first = [env.step(np.zeros(1))[2] for _ in range(60)]
+    env.restore(saved)
+    assert [env.step(np.zeros(1))[2] for _ in range(60)] == first

@@ -65,13 +65,19 @@ def test_published_schema_is_up_to_date() -> None:
         ("[learner]", "[lerner]", "unknown key 'lerner'. Did you mean 'learner'?"),
         ("title", "titel", "unknown key 'titel'. Did you mean 'title'?"),
         ("[learner]", '[environment]\nrewrad = "local"\n[learner]', "unknown option 'rewrad'. Did you mean 'reward'?"),
-        ('"PPO"\nparameters = { n_steps = 8', '"SAC"\nparameters = { action_noise = 3', "needs kind and sigma, got 3"),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
+            '"SAC"\nparameters = { action_noise = 3',
+            "needs kind and a number sigma, got 3",
+        ),
         (
             '"PPO"\nparameters = { n_steps = 8',
             '"SAC"\nparameters = { action_noise = { kind = "nrmal", sigma = 1 }',
             "unknown kind 'nrmal'. Did you mean 'normal'?",
         ),
         ("[learner]", "[run]\nsteps = 0\n[learner]", "run.steps: Input should be greater than 0, got 0"),
+        ("[learner]", '[learner]\npolicy = "MlpPolcy"', "unknown policy of PPO for vectors 'MlpPolcy'. Did you mean"),
+        ("n_steps = 8", "learning_rate = { linear_from = 1e-3 }", "learning_rate: needs a number, or linear_from and"),
     ],
 )
 def test_mistakes_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -89,8 +95,10 @@ def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
     path = write(tmp_path, GOOD + '[[match]]\nagents = ["mien"]\nalgorithm = "A2C"\n')
     with pytest.raises(RecipeError, match=r"unknown agent 'mien'\. Did you mean 'mine'"):
         train("copper_net", path, directory=tmp_path / "run")
-    with pytest.raises(RecipeError, match="PPO refuses its parameters"):
-        train("copper_net", write(tmp_path, GOOD.replace("n_steps = 8", "n_steps = 1")), envs=1)
+    for refused in ("n_steps = 1", 'batch_size = "a"', "policy_kwargs = { net_ach = [8] }"):
+        path = write(tmp_path, GOOD.replace("n_steps = 8", refused))
+        with pytest.raises(RecipeError, match="agent 'refinery': PPO refuses its parameters"):
+            train("copper_net", path, envs=1, directory=tmp_path / "run")
     with pytest.raises(cirl_marl.CirlError, match=r"unknown option 'observ'\. Did you mean 'observe'"):
         train("copper_net", write(tmp_path, GOOD), observ="full")
     assert not (tmp_path / "run").exists()

@@ -248,9 +248,8 @@ def test_window_needs_pygame(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without pygame the error names the extra."""
     monkeypatch.setitem(sys.modules, "pygame", None)
     env = cirl_marl.parallel_env("copper_net", render_mode="human")
-    env.reset(seed=0)
     with pytest.raises(CirlError, match=r"cirl-marl\[human\]"):
-        env.render()
+        env.reset(seed=0)
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 12])

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, VectorEnv
+from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Network, Node, Role, VectorEnv, parallel_env
+from cirl_marl.controllers import Neutral
+from cirl_marl.evaluate import rollout
 from cirl_marl.simulate import Dynamics
 
 Floats = NDArray[np.float64]
@@ -280,3 +282,39 @@ def test_local_order_changes_nothing_but_the_order(network: Network) -> None:
     place = [ordered.node_index[node.id] for node in network.nodes]
     steps = min(3, network.episode.horizon)
     np.testing.assert_allclose(advanced(ordered, steps)[place], advanced(network, steps), rtol=0, atol=1e-11 * mass)
+
+
+def test_rates_that_no_solver_can_follow_are_refused() -> None:
+    """A rate in the wrong unit would need a million substeps; a long Runge-Kutta step would be unstable."""
+    fast = small({"a": 1.0, "b": 0.0}, [Arc(id="f", donor="a", recipient="b", rate=1e6)])
+    with pytest.raises(CirlError, match=r"node 'a' turns over 1e\+06/day.*wrong unit"):
+        Dynamics(fast)
+    slow = small({"a": 1.0, "b": 0.0}, [Arc(id="f", donor="a", recipient="b", rate=2.5)])
+    coarse = replace(slow, episode=Episode(solver="rk4", solver_step=1.0))
+    with pytest.raises(CirlError, match=r"solver_step of at most 0\.4 day, not 1"):
+        Dynamics(coarse)
+
+
+def test_runge_kutta_ends_on_vanishing_stocks() -> None:
+    """Emptied again and again, a stock reaches subnormal numbers; the step still ends and nothing is lost."""
+    arcs = [Arc(id=f"f{k}", donor="a", recipient="b", rate=0.2) for k in range(5)]
+    network = small({"a": 1.0, "b": 0.0}, arcs, horizon=3000)
+    stock = advanced(replace(network, episode=Episode(solver="rk4", solver_step=1.0, horizon=3000)), steps=3000)
+    assert stock[0] >= 0
+    assert stock.sum() == pytest.approx(1.0, rel=1e-12)
+
+
+def test_network_without_controls_can_be_simulated() -> None:
+    """A pure material-flow model has no agents; it runs under nobody's control, but no agent environment is made."""
+    network = small({"a": 8.0, "b": 0.0}, [Arc(id="f", donor="a", recipient="b", rate=0.5)])
+    run = rollout(VectorEnv(network, num_envs=2), Neutral())
+    assert run.stock[-1].sum() == pytest.approx(8.0, rel=1e-12)
+    with pytest.raises(CirlError, match="nothing can act"):
+        parallel_env(network)
+
+
+def test_start_flows_are_what_the_donors_hold() -> None:
+    """The first observation does not promise a flow from an empty store."""
+    env = VectorEnv("copper_net", num_envs=1)
+    env.reset(seed=0, options={"initial_state": {"use": 0.0}})
+    assert env.physical.flow[env.network.arc_index["use_to_collection"], 0] == 0.0

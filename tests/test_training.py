@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -337,3 +338,68 @@ def test_torch_threads_and_streams_are_left_alone() -> None:
     train("copper_net", ppo_recipe(), horizon=5)
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.rand(2), expected)
+
+
+def test_run_directory_describes_what_was_trained(tmp_path: Path) -> None:
+    """A network changed in Python, whatever part of it, is kept as it was trained, not as its file says."""
+    network = cirl_marl.load_network("copper_net")
+    arcs = tuple(replace(arc, rate=2 * arc.rate) if arc.id == "use_to_landfill" else arc for arc in network.arcs)
+    changed = replace(network, arcs=arcs).with_options(objective={"circularity_weight": 0.9})
+    train(changed, ppo_recipe(), directory=tmp_path / "changed", horizon=5)
+    kept = RunDirectory(tmp_path / "changed").make_env(1).network
+    assert (kept.arcs, kept.objective) == (changed.arcs, changed.objective)
+    paper = cirl_marl.load_network("copper_net", scenario="paper")
+    train(paper, ppo_recipe(), directory=tmp_path / "paper")
+    assert RunDirectory(tmp_path / "paper").make_env(1).network == paper
+    assert RunDirectory(tmp_path / "paper").config.scenario == "paper"
+
+
+def test_missing_or_damaged_normaliser_is_an_error(tmp_path: Path) -> None:
+    """A policy without its normaliser would act on the wrong numbers."""
+    directory = tmp_path / "run"
+    train("copper_net", ppo_recipe(), directory=directory, horizon=5)
+    normaliser = RunDirectory(directory).checkpoint / "use.normaliser.pkl"
+    normaliser.write_bytes(normaliser.read_bytes()[:50])
+    with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
+        Trained(directory)
+    normaliser.unlink()
+    with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
+        Trained(directory)
+
+
+@pytest.mark.parametrize(("name", "text"), [("config.json", "{}"), ("status.json", "{}"), ("status.json", "[]")])
+def test_files_that_say_something_else_are_refused(tmp_path: Path, name: str, text: str) -> None:
+    """A readable file with the wrong contents is named."""
+    train("copper_net", ppo_recipe(), directory=tmp_path / "run", horizon=5)
+    (tmp_path / "run" / name).write_text(text)
+    with pytest.raises(RunError, match=name):
+        Trained(tmp_path / "run")
+
+
+def test_metrics_survive_a_crash(tmp_path: Path) -> None:
+    """A row that a crash cut short is left out, and rows past the checkpoint are not repeated on resumption."""
+    directory = tmp_path / "run"
+
+    def stop(progress: Any) -> None:
+        if progress.env_steps == 60:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", ppo_recipe(), directory=directory, horizon=5, report=stop)
+    metrics = directory / "metrics.csv"
+    before = RunDirectory(directory).metrics()["joint_step"]
+    metrics.write_text(metrics.read_text() + "35,70,1.0,-9")
+    assert RunDirectory(directory).metrics()["joint_step"] == before
+    metrics.write_text(metrics.read_text() + "\n")
+    resume(directory)
+    steps = RunDirectory(directory).metrics()["joint_step"]
+    assert steps == sorted(set(steps))
+    assert steps[: len(before)] == before
+    assert len(steps) > len(before)
+
+
+@pytest.mark.parametrize("options", [{"steps": 0}, {"steps": -5}, {"steps": 1.5}, {"envs": 0}, {"seed": -1}])
+def test_budgets_are_whole_numbers(options: dict[str, Any]) -> None:
+    """Zero, negative and fractional budgets are errors that name the option; none falls back on a default."""
+    with pytest.raises(cirl_marl.CirlError, match=f"{next(iter(options))} must be a whole number"):
+        train("copper_net", ppo_recipe(), **options)
