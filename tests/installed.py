@@ -10,8 +10,8 @@ from pathlib import Path
 
 def main(environment: Path) -> None:
     """Run the command line of ``environment`` in an empty folder and check that it works."""
-    cirl = str((environment / "bin" / "cirl").resolve())
-    python = str((environment / "bin" / "python").resolve().parent / "python")
+    binaries = environment.resolve() / "bin"  # not resolved further: the interpreter is a link out of the environment
+    cirl, python = str(binaries / "cirl"), str(binaries / "python")
     with tempfile.TemporaryDirectory() as folder:
 
         def run(*command: str) -> str:
