@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network import Floats, Network
 from cirl_marl.rowsum import RowSum
 
 
@@ -28,25 +28,27 @@ class Scoring:
         compartments = list(network.compartments.values())
         position = {c.id: i for i, c in enumerate(compartments)}
         chosen = network.objective.tracked or [c.id for c in compartments if c.set_point is not None]
-        self._tracked: Integers = np.array([position[c] for c in chosen], dtype=np.intp)
-        tracked = [network.compartments[c] for c in chosen]
-        self._set_point = np.array([c.set_point for c in tracked], dtype=float).reshape(-1, 1)
-        self._inverse_scale = 1.0 / np.array([c.scale for c in tracked], dtype=float).reshape(-1, 1)
+        tracked = [position[c] for c in chosen]
+        self._set_point = np.array([c.set_point or 0.0 for c in compartments]).reshape(-1, 1)
+        self._inverse_scale = 1.0 / np.array([c.scale for c in compartments]).reshape(-1, 1)
         services = network.services
         self._measure = _measurement(network, position, sum(len(c.inner) for c in compartments))
         self._low = np.array([s.low for s in services]).reshape(-1, 1)
         self._high = np.array([s.high for s in services]).reshape(-1, 1)
         self._bounded = bool(np.isfinite(self._high).any())
         modelled = [position[c.id] for c in compartments if c.model is not None]
-        terms = len(chosen) + len(services) + len(modelled)
-        debts = [(position[d], len(chosen) + i, s.weight) for i, s in enumerate(services) for d in s.debtors]
-        inner = range(len(chosen) + len(services), terms)
-        owners = np.array([*self._tracked, *(owner for owner, _, _ in debts), *modelled], dtype=np.intp)
-        columns = np.array([*range(len(chosen)), *(term for _, term, _ in debts), *inner], dtype=np.intp)
-        weights = np.array([*[1.0] * len(chosen), *(weight for _, _, weight in debts), *[-1.0] * len(modelled)])
+        count = len(compartments)
+        terms = count + len(services) + len(modelled)
+        debts = [(position[d], count + i, s.weight) for i, s in enumerate(services) for d in s.debtors]
+        inner = range(count + len(services), terms)
+        owners = np.array([*tracked, *(owner for owner, _, _ in debts), *modelled], dtype=np.intp)
+        columns = np.array([*tracked, *(term for _, term, _ in debts), *inner], dtype=np.intp)
+        weights = np.array([*[1.0] * len(tracked), *(weight for _, _, weight in debts), *[-1.0] * len(modelled)])
         self._everyone = RowSum(owners, columns, -weights, (len(compartments), terms))
         self._agents = self._everyone.chosen([position[agent] for agent in agents])
-        self._all = RowSum([0] * terms, range(terms), self._everyone.column_sums(), (1, terms))
+        sums = self._everyone.column_sums()
+        counted = np.flatnonzero(sums)
+        self._all = RowSum(np.zeros(len(counted), dtype=np.intp), counted, sums[counted], (1, terms))
         self._sum_of_levels = RowSum(
             [0] * len(services), range(len(services)), [1.0] * len(services), (1, len(services))
         )
@@ -61,16 +63,15 @@ class Scoring:
         return np.maximum(level, 0.0, out=level)
 
     def terms(self, quantities: Floats, levels: Floats, inner: Floats) -> Floats:
-        """Return squared scaled distances, service shortfalls and the models' rewards, shape (terms, B)."""
-        tracked, services = len(self._tracked), len(levels)
-        terms = np.empty((tracked + services + len(inner), quantities.shape[1]))
-        distance = terms[:tracked]
-        quantities.take(self._tracked, axis=0, out=distance, mode="clip")
-        distance -= self._set_point
+        """Return every squared scaled distance, service shortfall and model's reward, shape (terms, B)."""
+        count, services = len(self._set_point), len(levels)
+        terms = np.empty((count + services + len(inner), quantities.shape[1]))
+        distance = terms[:count]
+        np.subtract(quantities[:count], self._set_point, out=distance)
         distance *= self._inverse_scale
         distance *= distance
-        np.subtract(1.0, levels, out=terms[tracked : tracked + services])
-        terms[tracked + services :] = inner
+        np.subtract(1.0, levels, out=terms[count : count + services])
+        terms[count + services :] = inner
         return terms
 
     def local(self, terms: Floats) -> Floats:
