@@ -31,7 +31,7 @@ wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clea
 	$(PYTHON) tests/installed.py build/clean
 
 study: $(VENV)/.runtime  ## five seeds of the default recipe on each network (about half an hour)
-	$(BIN)/python benchmarks/learning.py --markdown docs/learning.md
+	$(BIN)/python benchmarks/learning.py --markdown runs/study.md
 
 speed: $(VENV)/.runtime  ## table of speed ratios
 	$(PIP) install --quiet -c constraints.txt -e '.[benchmarks]'
