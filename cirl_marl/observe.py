@@ -95,7 +95,10 @@ class ObservationLayout:
         }
         self.names = {agent: tuple(self._names[row] for row in seen) for agent, seen in zip(agents, rows, strict=True)}
         scales = np.array([c.scale for c in (*network.nodes, *network.arcs)])
-        self._inverse_scale = (1.0 / np.concatenate([scales, np.ones(len(inner.names))])).reshape(-1, 1)
+        inverse_scale = 1.0 / np.concatenate([scales, np.ones(len(inner.names))])
+        self._inverse_scale = np.repeat(
+            inverse_scale[:, None], batch, axis=1
+        )  # equal shapes are faster than a broadcast
         set_points = np.array([c.set_point or 0.0 for c in (*network.nodes, *network.arcs)]) / scales
         self._table = np.zeros((self.signals.rows, batch), dtype=np.float32)
         self._table[self.signals.set_point(0) :] = set_points[:, None]

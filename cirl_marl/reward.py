@@ -23,14 +23,16 @@ class Scoring:
     Args of all methods are compartment-major, shape (rows, B).
     """
 
-    def __init__(self, network: Network, agents: Sequence[str]) -> None:
-        """Compile the scores of ``agents`` and of the network as a whole."""
+    def __init__(self, network: Network, agents: Sequence[str], batch: int) -> None:
+        """Compile the scores of ``agents`` and of the network as a whole, for arrays of ``batch`` columns."""
         compartments = list(network.compartments.values())
         position = {c.id: i for i, c in enumerate(compartments)}
         chosen = network.objective.tracked or [c.id for c in compartments if c.set_point is not None]
         tracked = [position[c] for c in chosen]
-        self._set_point = np.array([c.set_point or 0.0 for c in compartments]).reshape(-1, 1)
-        self._inverse_scale = 1.0 / np.array([c.scale for c in compartments]).reshape(-1, 1)
+        set_point = np.array([c.set_point or 0.0 for c in compartments])
+        inverse_scale = 1.0 / np.array([c.scale for c in compartments])
+        self._set_point = np.repeat(set_point[:, None], batch, axis=1)  # equal shapes are faster than a broadcast
+        self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         services = network.services
         self._measure = _measurement(network, position, sum(len(c.inner) for c in compartments))
         self._low = np.array([s.low for s in services]).reshape(-1, 1)

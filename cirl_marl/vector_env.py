@@ -19,7 +19,7 @@ from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.observe import ObservationLayout
 from cirl_marl.reward import Scoring
-from cirl_marl.simulate import Dynamics
+from cirl_marl.simulate import Dynamics, Transition
 from cirl_marl.starts import Starts
 from cirl_marl.state import Outcome, Snapshot, State
 
@@ -87,7 +87,7 @@ class VectorEnv:
         self.agents = self._actuators.agents
         self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
-        self.scoring = Scoring(found, self.agents)
+        self.scoring = Scoring(found, self.agents, num_envs)
         self.observation_spaces = self.layout.spaces
         self._starts = Starts(found, self.dynamics, num_envs)
         self.state_names = self._starts.names
@@ -180,9 +180,7 @@ class VectorEnv:
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         controls = self._actuators.controls(actions)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step)
-        flow = transition.moved / self.network.episode.control_interval
-        flow.flags.writeable = False  # infos hand it out, and the state keeps it
-        quantities = np.concatenate([transition.stock[:-1], flow, transition.inner])
+        quantities, flow = self._measured(transition)
         levels = self.scoring.levels(quantities)
         service = self.scoring.service_level(levels)
         terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
@@ -329,6 +327,17 @@ class VectorEnv:
         flow = dynamics.start_flow(stock, inner, neutral)
         zeros = np.zeros(batch)
         return State(stock, inner, flow, step, zeros, zeros)
+
+    def _measured(self, transition: Transition) -> tuple[Floats, Floats]:
+        """Return stocks, mean flows and inner states in one array, and the mean flows, which are read-only."""
+        nodes, arcs = len(self.network.nodes), len(self.network.arcs)
+        quantities = np.empty((nodes + arcs + len(transition.inner), self.num_envs))
+        flow = quantities[nodes : nodes + arcs]
+        np.divide(transition.moved, self.network.episode.control_interval, out=flow)
+        quantities[:nodes] = transition.stock[:-1]
+        quantities[nodes + arcs :] = transition.inner
+        flow.flags.writeable = False  # infos hand it out, and the state keeps it
+        return quantities, flow
 
     def _quantities(self, state: State) -> Floats:
         return np.concatenate([state.stock[:-1], state.flow, state.inner])
