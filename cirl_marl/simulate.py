@@ -82,12 +82,28 @@ class Dynamics(FlowLaws):
             assert episode.solver_step is not None
             self.substeps = round(episode.control_interval / episode.solver_step)
         self.substep = episode.control_interval / self.substeps
-        self.terms = _series_terms(2 * fastest * self.substep) if self._exact else 0
+        self.terms = self._series_terms() if self._exact else 0
         self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
         shape = (len(network.nodes) + 1, len(network.arcs))
         self._outgoing = RowSum(network.donors, np.arange(shape[1]), np.ones(shape[1]), shape)
         self._pulls = any(arc.law is Law.RECIPIENT for arc in network.arcs)
         self._compile_orders()
+
+    def _series_terms(self) -> int:
+        """Smallest K ≥ 2 for which the first neglected term of the mean, ‖|A|^K‖₁·h^K/(K + 1)!, is ≤ TRUNCATION.
+
+        A, entry by entry, is largest in absolute value with every control at its upper bound, so that bound serves all.
+        """
+        donors, recipients = self.network.donors, self.network.recipients
+        nodes = len(self.network.nodes)
+        driven = np.flatnonzero(self.driver < nodes)
+        reach, term, k = np.ones(nodes), 1.0, 0
+        while term > TRUNCATION or k < 2:
+            k += 1
+            moved = self.max_rate[driven] * (reach[donors[driven]] + reach[recipients[driven]]) * self.substep
+            reach = np.bincount(self.driver[driven], weights=moved, minlength=nodes) / (k + 1)
+            term = float(reach.max(initial=0.0))
+        return k
 
     def _check_turnover(self, turnover: Floats) -> None:
         """Refuse rates that the solver cannot follow.
@@ -265,12 +281,3 @@ class Dynamics(FlowLaws):
             moved = np.maximum(self._moved_exactly(stock, rate, settled), 0.0)
             after = self.incidence.add_to(stock.copy(), moved)
         return after, moved, rate
-
-
-def _series_terms(size: float) -> int:
-    """Smallest K ≥ 2 with size^K/(K + 1)! ≤ TRUNCATION, the first neglected term of the mean; size = ‖A‖₁·h."""
-    term, k = size, 1
-    while term > TRUNCATION * (k + 1) or k < 2:
-        k += 1
-        term *= size / k
-    return k

@@ -48,9 +48,10 @@ class Starts:
 
     def draw(self, which: Sequence[int] | range | Integers) -> Floats:
         """Draw initial stocks and inner states of some copies, each from its own stream, shape (rows, len(which))."""
-        uniform = np.empty((len(self._low), len(which)))
-        for column, i in enumerate(which):
-            uniform[:, column] = self.streams[i].random(len(self._low))
+        by_copy = np.empty((len(which), len(self._low)))
+        for row, i in zip(by_copy, which, strict=True):
+            self.streams[i].random(out=row)
+        uniform = np.ascontiguousarray(by_copy.T)
         uniform *= self._width[:, None]
         uniform += self._low[:, None]
         return uniform
