@@ -32,7 +32,7 @@ def scenarios(name: str) -> list[str]:
 
 @pytest.mark.parametrize("name", networks())
 def test_every_network_reads_in_every_scenario(name: str) -> None:
-    """DESIGN 3: a network is one file, named like it."""
+    """A network is one file, named like it."""
     for scenario in scenarios(name):
         network = load_network(name, scenario=scenario)
         assert network.name == name
@@ -212,7 +212,7 @@ REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
     ],
 )
 def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, said: list[str]) -> None:
-    """DESIGN 5.7: file, object, value, nearest valid name."""
+    """Each mistake names file, object, value and the nearest valid name."""
     message = broken(tmp_path, (old, new))
     for fragment in said:
         assert fragment in message

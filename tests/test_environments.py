@@ -71,7 +71,7 @@ def pettingzoo_passes(make: Callable[[], ParallelEnv[Any, Any, Any]]) -> bool:
 @anything
 @pytest.mark.parametrize("observe", [None, "local", "full"])
 def test_catalogue_conforms(name: str, scenario: str, observe: str | None) -> None:
-    """DESIGN 5.6, the stricter suite."""
+    """The stricter suite holds for every network, scenario and view."""
     check_parallel_env(lambda: parallel_env(name, scenario=scenario, observe=observe))
     check_vector_env(lambda: vector_env(name, num_envs=3, scenario=scenario, observe=observe, horizon=7), steps=20)
 
@@ -499,7 +499,7 @@ def test_acting_outside_an_episode() -> None:
     ],
 )
 def test_bad_options(options: dict[str, Any], message: str) -> None:
-    """DESIGN 5.7: a wrong option is an error that gives the nearest valid one."""
+    """A wrong option is an error that gives the nearest valid one."""
     with pytest.raises(CirlError, match=message):
         VectorEnv("copper_net", **options)
 

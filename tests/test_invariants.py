@@ -1,4 +1,4 @@
-"""What holds for every network under any action (DESIGN, section 5)."""
+"""What holds for every network under any action (mass, positivity, determinism, equal views)."""
 
 from __future__ import annotations
 
@@ -71,13 +71,13 @@ def assert_conserves(network: Network, seed: int) -> None:
 
 @random_networks
 def test_random_networks_conserve_mass(network: Network, seed: int) -> None:
-    """DESIGN 5.1 and 5.2."""
+    """Mass is conserved to round-off and stocks stay non-negative and finite."""
     assert_conserves(network, seed)
 
 
 @anything
 def test_catalogue_conserves_mass(name: str, scenario: str) -> None:
-    """DESIGN 5.1 and 5.2."""
+    """Mass is conserved to round-off and stocks stay non-negative and finite."""
     assert_conserves(load_network(name, scenario=scenario), 1)
 
 
@@ -108,14 +108,14 @@ def assert_batch_is_lone(network: Network, seed: int, reward: str) -> None:
 
 @given(network=st.from_type(Network), seed=st.integers(0, 2**31), reward=st.sampled_from(REWARDS))
 def test_random_batch_equals_lone(network: Network, seed: int, reward: str) -> None:
-    """DESIGN 5.3 and 5.4."""
+    """Same seed, same bits; a copy of a batch equals a lone environment, and all views agree."""
     assert_batch_is_lone(network, seed, reward)
 
 
 @pytest.mark.parametrize("reward", REWARDS)
 @anything
 def test_catalogue_batch_equals_lone(name: str, scenario: str, reward: str) -> None:
-    """DESIGN 5.3 and 5.4."""
+    """Same seed, same bits; a copy of a batch equals a lone environment, and all views agree."""
     network = load_network(name, scenario=scenario).with_options(episode={"horizon": 5})
     assert_batch_is_lone(network, 3, reward)
 
@@ -140,14 +140,14 @@ def test_single_equals_parallel(name: str, scenario: str) -> None:
 
 @random_networks
 def test_random_networks_conform(network: Network, seed: int) -> None:
-    """DESIGN 5.3 and 5.6: determinism and membership, over whole episodes and restarts."""
+    """Determinism and membership, over whole episodes and restarts."""
     check_parallel_env(lambda: parallel_env(network), seed=seed)
     check_vector_env(lambda: VectorEnv(network, num_envs=2), steps=6, seed=seed)
 
 
 @given(network=st.from_type(Network), seed=st.integers(0, 2**31), mode=st.sampled_from(["neighbours", "full"]))
 def test_wider_observations_conform(network: Network, seed: int, mode: str) -> None:
-    """DESIGN 5.6 in the other observation modes."""
+    """Membership in the other observation modes."""
     check_vector_env(lambda: VectorEnv(network, num_envs=2, observe=mode), steps=6, seed=seed)
 
 
@@ -192,7 +192,7 @@ def test_window_circularity_is_read_off_the_stocks() -> None:
 
 @random_networks
 def test_snapshot_replays(network: Network, seed: int) -> None:
-    """DESIGN 5.3: from a snapshot in mid-episode, also a pickled one, all comes again, restarts included."""
+    """From a snapshot in mid-episode, also a pickled one, all comes again, restarts included."""
     env = VectorEnv(network, num_envs=2)
     rng = np.random.default_rng(seed)
     env.reset(seed)

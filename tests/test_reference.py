@@ -25,7 +25,7 @@ def reference(name: str) -> dict[str, NDArray[np.float64]]:
 
 @pytest.mark.parametrize("name", PAPER)
 def test_published_trajectory(name: str) -> None:
-    """DESIGN 5.5, through gymnasium.make: row t's action leads to row t+1's state and to row t's reward."""
+    """Through gymnasium.make: row t's action leads to row t+1's state and to row t's reward."""
     published = reference(name)
     env = gymnasium.make(f"cirl_marl/{name}-v0", disable_env_checker=True)
     observation, info = env.reset(seed=0)
