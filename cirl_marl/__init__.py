@@ -5,7 +5,7 @@ reward is the circularity λ(N;t) of the network.
 
 >>> import cirl_marl
 >>> cirl_marl.networks()
-['carbo_net', 'copper_net']
+['carbo_net', 'copper_net', 'net_zero', 'solids_net']
 """
 
 from cirl_marl.catalogue import load_network, networks, recipes

@@ -18,7 +18,8 @@ class Actuators:
 
     Attributes:
         agents: compartments that act, in the order of every stacked array.
-        acting: row of each agent's control among all controls, shape (agents,).
+        entries: rows of each agent's action in a stacked action.
+        acting: row of each entry of a stacked action among all controls, shape (entries,).
         spaces: action space of each agent.
     """
 
@@ -31,10 +32,13 @@ class Actuators:
         network = laws.network
         self.agents = _checked(network, agents)
         self.num_envs = num_envs
-        order = {id_: i for i, id_ in enumerate(network.controllable)}
-        self.acting: Integers = np.array([order[agent] for agent in self.agents], dtype=np.intp)
-        self.spaces = {agent: Box(-1.0, 1.0, (1,), np.float32) for agent in self.agents}
-        self._all_act = self.acting.tolist() == list(range(len(order)))
+        rows = {agent: network.control_rows[agent] for agent in self.agents}
+        edges = np.cumsum([0, *(each.stop - each.start for each in rows.values())]).tolist()
+        self.entries = {agent: slice(edges[i], edges[i + 1]) for i, agent in enumerate(self.agents)}
+        acting = [row for each in rows.values() for row in range(each.start, each.stop)]
+        self.acting: Integers = np.array(acting, dtype=np.intp)
+        self.spaces = {a: Box(-1.0, 1.0, (each.stop - each.start,), np.float32) for a, each in rows.items()}
+        self._all_act = self.acting.tolist() == list(range(len(laws.neutral)))
         self._neutral = laws.neutral
         low, high = laws.control_low[self.acting], laws.control_high[self.acting]
         # one value per copy: NumPy multiplies equal shapes about twice as fast as it broadcasts a column
@@ -43,30 +47,31 @@ class Actuators:
 
     @property
     def neutral_action(self) -> dict[str, Floats]:
-        """Normalised action of each agent that leaves it neutral, shape (1,) each."""
+        """Normalised action of each agent that leaves it neutral, shape (entries,) each."""
         neutral = (self._neutral[self.acting] - self._middle[:, 0]) / self._half[:, 0]
-        return {agent: neutral[i : i + 1] for i, agent in enumerate(self.agents)}
+        return {agent: neutral[entries] for agent, entries in self.entries.items()}
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
-        """Stack the actions of all agents, shape (agents, B); the checks of ``step`` apply."""
+        """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
         if not isinstance(actions, Mapping):
             raise ControlError(f"actions must be a mapping agent → action, not {actions!r}")
-        stacked = np.empty((len(self.agents), self.num_envs))
+        stacked = np.empty((len(self.acting), self.num_envs))
         if len(actions) != len(self.agents):
             raise ControlError(self._wrong_agents(actions))
-        for i, agent in enumerate(self.agents):
+        for agent, entries in self.entries.items():
             if agent not in actions:
                 raise ControlError(self._wrong_agents(actions))
             action = np.asarray(actions[agent])
-            if action.shape != (self.num_envs, 1):
-                raise ControlError(f"action of agent '{agent}' has shape {action.shape}, expected {(self.num_envs, 1)}")
+            expected = (self.num_envs, entries.stop - entries.start)
+            if action.shape != expected:
+                raise ControlError(f"action of agent '{agent}' has shape {action.shape}, expected {expected}")
             if action.dtype.kind not in "biuf":
                 raise ControlError(f"action of agent '{agent}' is {actions[agent]!r}; it must hold numbers in [-1, 1]")
-            stacked[i] = action[:, 0]
+            stacked[entries] = action.T
         return stacked
 
     def controls(self, actions: Floats) -> Floats:
-        """Map stacked actions, shape (agents, B), to the physical values of every control, shape (controls, B).
+        """Map stacked actions, shape (entries, B), to the physical values of every control, shape (controls, B).
 
         Raises:
             ControlError: for NaN or values outside [−1, 1].
@@ -89,11 +94,9 @@ class Actuators:
 
     def _wrong_values(self, actions: Floats) -> str:
         wrong = ~((actions >= -1.0) & (actions <= 1.0))
-        agent, copy_ = np.argwhere(wrong)[0]
-        return (
-            f"action of agent '{self.agents[agent]}' in copy {copy_} is {actions[agent, copy_]}; "
-            "it must be a number in [-1, 1]"
-        )
+        entry, copy_ = np.argwhere(wrong)[0]
+        agent = next(agent for agent, entries in self.entries.items() if entries.start <= entry < entries.stop)
+        return f"action of agent '{agent}' in copy {copy_} is {actions[entry, copy_]}; it must be a number in [-1, 1]"
 
 
 def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:

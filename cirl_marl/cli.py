@@ -1,4 +1,4 @@
-"""The command line: ``cirl networks | show | check | simulate | train | evaluate | report``."""
+"""The command line: ``cirl networks | show | check | simulate | train | evaluate | report | paper``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from cirl_marl.catalogue import load_network, networks, recipes
-from cirl_marl.controllers import Constant, Controller, Neutral, Random
+from cirl_marl.controllers import Constant, Controller, Neutral, Random, Scripted
 from cirl_marl.errors import CirlError, DefinitionError, LearnerError, unknown
 from cirl_marl.evaluate import Rollout, interval_ends, rollout
 from cirl_marl.network import Network
@@ -36,7 +36,7 @@ RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a tra
 Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]
 Episodes = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
-CONTROLS = ("neutral", "constant", "random")
+CONTROLS = ("neutral", "constant", "random", "scripted")
 
 
 def main() -> None:
@@ -77,7 +77,7 @@ def show(
     env = VectorEnv(found, num_envs=1)
     middle = {node.id: sum(node.initial) / 2 for node in found.nodes}
     env.reset(seed=0, options={"initial_state": middle})
-    stock, flow = env.physical.stock[:-1, 0], env.physical.flow[:, 0]
+    stock, flow = env.physical.stock[: len(found.nodes), 0], env.physical.flow[:, 0]
     console.print(nodes_table(found, stock))
     console.print(arcs_table(found, flow))
     for service in found.services:
@@ -216,6 +216,32 @@ def report(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
     _evaluate_and_draw(run, episodes, seed)
 
 
+@app.command()
+def paper(
+    environment: Annotated[str | None, typer.Argument(metavar="ENV", help="Such as CopperNet; default: all.")] = None,
+    algorithm: Annotated[str | None, typer.Argument(metavar="ALGORITHM", help="Such as A2C; default: all.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; default: the paper's.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many seeds: 0, 1, …")] = 1,
+    recipe: Annotated[str, typer.Option(help="published: the paper's settings; tuned: ours.")] = "published",
+    episodes: Annotated[int | None, typer.Option(min=1, help="Evaluation episodes that count successes.")] = None,
+    out: Annotated[Path, typer.Option(help="Results, one file a row; a row that is done is not run again.")] = Path(
+        "runs/paper"
+    ),
+) -> None:
+    """Repeat the CiRL paper's training runs and show their figures beside the published ones."""
+    from cirl_marl.paper.plan import planned
+    from cirl_marl.paper.results import Results
+    from cirl_marl.paper.session import run_session
+
+    rows = planned(environment, algorithm, steps=steps, seeds=seeds, recipe=recipe)
+    try:
+        run_session(rows, Results(out), console, success_episodes=episodes)
+    except KeyboardInterrupt:
+        message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
+        console.print(message, soft_wrap=True, highlight=False)
+        raise typer.Exit(130) from None
+
+
 def _only_resume(context: typer.Context) -> None:
     """Refuse options beside --resume: a resumed run keeps its own."""
     given = [
@@ -253,8 +279,8 @@ def _controller(control: str, settings: list[str]) -> Controller:
         raise CirlError(f"--set goes with --control constant, not with {control}")
     if control == "neutral":
         return Neutral()
-    if control == "random":
-        return Random()
+    if control in ("random", "scripted"):
+        return Random() if control == "random" else Scripted()
     actions = {}
     for setting in settings:
         agent, _, value = setting.partition("=")

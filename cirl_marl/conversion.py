@@ -3,14 +3,46 @@
 from __future__ import annotations
 
 import inspect
+import math
 from typing import Any
 
 from cirl_marl.compartments import model_class
-from cirl_marl.elements import Arc, Control, ControlKind, Episode, Law, Node, Objective, Observation, Service
+from cirl_marl.elements import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    Node,
+    Objective,
+    Observation,
+    Service,
+    ranged_states,
+)
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network import Network
-from cirl_marl.schema import ArcTable, ControlTable, ModelTable, NetworkTable, NodeTable, Quantity, ServiceTable
+from cirl_marl.schema import (
+    ArcTable,
+    Batches,
+    ControlTable,
+    ModelTable,
+    NetworkTable,
+    NodeTable,
+    Quantity,
+    ServiceTable,
+)
 from cirl_marl.units import factor
+
+GIVEN = ("rate", "flow", "series", "batches")
+NEEDED = {
+    Law.DONOR: ("rate",),
+    Law.RECIPIENT: ("rate",),
+    Law.CONTROLLED: ("",),
+    Law.EXOGENOUS: ("flow", "series"),
+    Law.COMPARTMENT: ("rate",),
+    Law.BATCH: ("rate", "batches"),
+}
+"""What each law needs, one of the given."""
 
 
 class Converter:
@@ -57,6 +89,7 @@ class Converter:
                 circularity_scale=self._value(objective.circularity_scale, "mass", "objective.circularity_scale"),
                 circularity_weight=self._value(objective.circularity_weight, "1", "objective.circularity_weight"),
                 tracked=tuple(objective.tracked),
+                criticality=self._optional(objective.criticality, "1", "objective.criticality"),
             ),
         }
         if self.mistakes:
@@ -100,33 +133,48 @@ class Converter:
             clock = self._factor(arc.series.time_unit, "time", f"{where}.series.time_unit")
             flow = tuple(value * unit for value in arc.series.values)
             times = tuple(time * clock for time in arc.series.times)
+        batches: tuple[tuple[float, float], ...] = ()
+        if arc.batches is not None:
+            batches = self._batches(arc.batches, f"{where}.batches")
+        batch = arc.law is Law.BATCH
+        rate_kind = {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}.get(arc.law, "rate")
+        default = self.table.scales.stock if batch else self.table.scales.flow
         return Arc(
             id=id_,
             donor=arc.from_,
             recipient=arc.to,
             law=arc.law,
-            rate=self._optional(arc.rate, "flow" if arc.law is Law.COMPARTMENT else "rate", f"{where}.rate") or 0.0,
+            rate=self._optional(arc.rate, rate_kind, f"{where}.rate") or 0.0,
             by=arc.by,
+            port=arc.port,
+            batches=batches,
+            delay=self._optional(arc.delay, "time", f"{where}.delay") or 0.0,
             flow=flow,
             times=times,
             set_point=self._optional(arc.set_point, "flow", f"{where}.set_point"),
-            scale=self._value(arc.scale or self.table.scales.flow, "flow", f"{where}.scale"),
+            scale=self._value(arc.scale or default, "mass" if batch else "flow", f"{where}.scale"),
             pollutant=arc.pollutant,
             control=self._control(arc.control, f"{where}.control"),
             **self._model(arc.model, f"{where}.model"),
         )
 
     def _check_law(self, arc: ArcTable, where: str) -> None:
-        needed = "flow or series" if arc.law is Law.EXOGENOUS else "" if arc.law is Law.CONTROLLED else "rate"
-        given = [key for key in ("rate", "flow", "series") if getattr(arc, key) is not None]
-        if len(given) != (1 if needed else 0) or any(key not in needed for key in given):
-            self.mistakes.append(
-                f"{where}: law '{arc.law}' needs {needed or 'no rate, flow or series'}, got {given or 'none'}"
-            )
+        given = [key for key in GIVEN if getattr(arc, key) is not None]
+        if given not in ([key] if key else [] for key in NEEDED[arc.law]):
+            needed = " or ".join(key for key in NEEDED[arc.law] if key) or f"none of {', '.join(GIVEN)}"
+            self.mistakes.append(f"{where}: law '{arc.law}' needs {needed}, got {given or 'none'}")
+
+    def _batches(self, table: Batches, where: str) -> tuple[tuple[float, float], ...]:
+        if len(table.times) != len(table.masses):
+            self.mistakes.append(f"{where}: {len(table.times)} times and {len(table.masses)} masses")
+            return ()
+        clock = self._factor(table.time_unit, "time", f"{where}.time_unit")
+        unit = self._factor(table.unit, "mass", f"{where}.unit")
+        return tuple((time * clock, mass * unit) for time, mass in zip(table.times, table.masses, strict=True))
 
     def _service(self, id_: str, service: ServiceTable) -> Service:
         where = f"services.{id_}"
-        kind = "mass" if service.quantity == "stock" else "flow"
+        kind = {"stock": "mass", "measure": "1"}.get(service.quantity, "flow")
         high = self._optional(service.high, kind, f"{where}.high")
         return Service(
             id=id_,
@@ -135,7 +183,8 @@ class Converter:
             low=self._value(service.low, kind, f"{where}.low"),
             weight=self._value(service.weight, "1", f"{where}.weight"),
             owed_by=tuple(service.owed_by),
-            **({} if high is None else {"high": high}),
+            measure=service.measure,
+            high=math.inf if high is None else high,
         )
 
     def _model(self, table: ModelTable | None, where: str) -> dict[str, Any]:
@@ -153,12 +202,18 @@ class Converter:
         except CirlError as error:
             self.mistakes.append(f"{where}: {error}")
             return {}
-        for name in (*table.initial, *model.state_names):
-            if name not in model.state_names or name not in table.initial:
-                known = [state for state in model.state_names if state not in table.initial]
+        ranged = ranged_states(model)
+        for name in (*table.initial, *ranged):
+            if name not in ranged or name not in table.initial:
+                known = [state for state in ranged if state not in table.initial]
                 self.mistakes.append(f"{where}.initial: {unknown('inner state', name, known)}")
-        ranges = [table.initial[name] for name in model.state_names if name in table.initial]
-        return {"model": model, "inner": tuple((span.low, span.high) for span in ranges)}
+        ranges = [table.initial[name] for name in ranged if name in table.initial]
+        scale = self._optional(table.reward_scale, "1", f"{where}.reward_scale")
+        return {
+            "model": model,
+            "inner": tuple((span.low, span.high) for span in ranges),
+            "reward_scale": 1.0 if scale is None else scale,
+        }
 
     def _control(self, control: ControlTable | None, where: str) -> Control | None:
         if control is None:

@@ -40,7 +40,7 @@ def read_network(path: Path) -> Network:
         if strangers:
             continue
         try:
-            networks[name] = _build(_merge(document, override), name)
+            networks[name] = _build(_merge(_without(document, override), override), name)
         except NetworkError as error:
             mistakes += [where + problem for problem in error.problems]
             if name == "default":
@@ -81,6 +81,8 @@ def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, An
     """Return ``base`` with the tables of ``override`` laid over it; a quantity is replaced whole."""
     merged = {key: value for key, value in base.items() if key != "scenarios"}
     for key, value in override.items():
+        if key == "without":
+            continue
         old = merged.get(key)
         whole = isinstance(old, Mapping) and "source" in old
         nested = isinstance(value, Mapping) and isinstance(old, Mapping) and not whole
@@ -88,8 +90,38 @@ def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, An
     return merged
 
 
+def _without(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy of ``document`` less the tables at the dotted paths in ``override["without"]``, which exist."""
+    kept = copy.deepcopy(dict(document))
+    for path in override.get("without", []):
+        *parents, last = path.split(".")
+        table = kept
+        for key in parents:
+            table = table[key]
+        del table[last]
+    return kept
+
+
+def _lost(document: Mapping[str, Any], paths: Any, where: str) -> typing.Iterator[str]:
+    """Yield what is wrong with the dotted paths of a scenario's ``without``."""
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        yield f"{where}without: must be a list of dotted paths, such as ['nodes.digester.model']"
+        return
+    if len(set(paths)) != len(paths):
+        yield f"{where}without: names a path twice"
+    for path in paths:
+        table: Any = document
+        for key in path.split("."):
+            if not isinstance(table, Mapping) or key not in table:
+                known = list(table) if isinstance(table, Mapping) else []
+                yield f"{where}without: '{path}': {unknown('key', key, known)}"
+                break
+            table = table[key]
+
+
 def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> typing.Iterator[str]:
     """Yield the compartments and services that a scenario names but the network does not have."""
+    yield from _lost(document, override.get("without", []), where)
     for table in ("nodes", "arcs", "services"):
         known = document.get(table, {})
         given = override.get(table, {})

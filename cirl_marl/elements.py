@@ -29,6 +29,7 @@ class Law(StrEnum):
     CONTROLLED = "controlled"
     EXOGENOUS = "exogenous"
     COMPARTMENT = "compartment"
+    BATCH = "batch"
 
 
 class ControlKind(StrEnum):
@@ -42,12 +43,18 @@ class ControlKind(StrEnum):
     INPUT = "input"
 
 
+def ranged_states(model: CompartmentModel) -> tuple[str, ...]:
+    """Return the states whose start is drawn from a given range: all, unless the model has a ``start`` of its own."""
+    return () if hasattr(model, "start") else model.state_names
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high].
 
     Attributes:
-        kind: ``rate`` (dimensionless factor), ``flow`` (mass/time) or ``input`` (unit of the model's input).
+        kind: ``rate`` (dimensionless factor), ``flow`` (mass/time) or ``input`` (unit of the model's inputs; the bounds
+            hold for each of them, and the action has one entry per input).
         low: value at action -1.
         high: value at action +1.
         neutral: value while nobody acts on the compartment.
@@ -69,7 +76,9 @@ class Compartment:
         scale: reference stock or flow for observations and rewards.
         control: its actuator; None if it cannot act.
         model: inner physics; None for a plain store or transport.
-        inner: (low, high) of the initial value of each inner state of the model, drawn uniformly.
+        inner: (low, high) of the initial value of each inner state of the model, drawn uniformly; empty for a model
+            that draws its own start.
+        reward_scale: the model's reward is divided by it.
     """
 
     id: str
@@ -78,6 +87,15 @@ class Compartment:
     control: Control | None = None
     model: CompartmentModel | None = None
     inner: tuple[tuple[float, float], ...] = ()
+    reward_scale: float = 1.0
+
+    @property
+    def actions(self) -> int:
+        """Number of entries of its action."""
+        if self.control is None:
+            return 0
+        takes_inputs = self.control.kind is ControlKind.INPUT and self.model is not None
+        return len(self.model.input_names) if takes_inputs and self.model is not None else 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,9 +121,13 @@ class Arc(Compartment):
         donor: id of the node that gives.
         recipient: id of the node that receives.
         law: ``donor`` f = a·x_donor, ``recipient`` f = a·x_recipient, ``controlled`` f = u, ``exogenous`` f = e(t),
-            ``compartment`` f = a·y, y the output of the model of the compartment ``by``.
-        rate: a, 1/time (donor and recipient laws) or mass/time per unit of the model's output.
-        by: the compartment whose model gives the flow (compartment law).
+            ``compartment`` f = a·y, y the output of the model of the compartment ``by``, ``batch`` discrete masses.
+        rate: a, 1/time (donor and recipient laws), mass/time per unit of the model's output, or mass per unit that the
+            donor's model releases (batch law).
+        by: the compartment whose model gives the flow (compartment law) or releases the batches (batch law).
+        port: what ``by`` releases into this arc, one of the ports of its model (batch law).
+        batches: (time, mass) of batches that leave on schedule (batch law without ``by``).
+        delay: transit time of a batch, a whole number of control intervals; 0 if the arc's own model is the vehicle.
         flow: e, mass/time (exogenous law); with ``times`` the values of a step function, else a single value.
         times: starts of the steps of an exogenous series, time; empty for a constant.
         pollutant: whether material that enters an environment here is a pollutant.
@@ -116,6 +138,9 @@ class Arc(Compartment):
     law: Law = Law.DONOR
     rate: float = 0.0
     by: str = ""
+    port: str = ""
+    batches: tuple[tuple[float, float], ...] = ()
+    delay: float = 0.0
     flow: tuple[float, ...] = (0.0,)
     times: tuple[float, ...] = ()
     pollutant: bool = True
@@ -130,8 +155,10 @@ class Service:
     Attributes:
         id: name of the service.
         provider: compartment at which it is measured.
-        quantity: ``stock`` of a node, ``outflow`` of a node (sum of its outflows), or ``flow`` of an arc.
-        low: lower end of the band, mass or mass/time.
+        quantity: ``stock`` (of a node, or on the way along a batch arc), ``outflow`` of a node (sum of its outflows),
+            ``flow`` of an arc, or ``measure``, one that the provider's model offers.
+        measure: its name, for ``quantity = "measure"``.
+        low: lower end of the band, mass, mass/time or the unit of the measure.
         high: upper end of the band.
         weight: factor of the shortfall in the local rewards.
         owed_by: compartments whose local reward bears the shortfall; empty means the provider alone.
@@ -143,6 +170,7 @@ class Service:
     low: float
     high: float = math.inf
     weight: float = 1.0
+    measure: str = ""
     owed_by: tuple[str, ...] = ()
 
     @property
@@ -182,6 +210,7 @@ class Objective:
         circularity_weight: weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local.
         tracked: compartments whose distance to the set-point enters their local reward; empty means every
             compartment with a set-point.
+        criticality: c of the material; evaluations then report the time-window circularity of CIRO7.2 too.
     """
 
     reference_interval: float = 1.0
@@ -190,6 +219,7 @@ class Objective:
     circularity_scale: float = 1.0
     circularity_weight: float = 0.5
     tracked: tuple[str, ...] = ()
+    criticality: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,7 +227,8 @@ class Observation:
     """What agents see by default.
 
     Attributes:
-        mode: ``local``, ``neighbours``, ``full``, or ``stocks`` (the stocks of ``nodes`` in that order).
+        mode: ``local``, ``neighbours``, ``full``, ``stocks`` (the stocks of ``nodes`` in that order) or ``model`` (what
+            the agent's own model shows, nothing else).
         nodes: in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``).
     """
 
@@ -208,6 +239,6 @@ class Observation:
 SOLVERS = ("exact", "rk4", "euler")
 NET_ZERO = ("signed", "abs")
 REWARDS = ("local", "circularity", "mixed", "difference", "local_sum")
-OBSERVE = ("local", "neighbours", "full", "stocks")
-QUANTITIES = ("stock", "outflow", "flow")
+OBSERVE = ("local", "neighbours", "full", "stocks", "model")
+QUANTITIES = ("stock", "outflow", "flow", "measure")
 SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})

@@ -11,6 +11,7 @@ from scipy import stats
 
 from cirl_marl.controllers.basic import Controller
 from cirl_marl.network import Floats, Network
+from cirl_marl.staged import CIRO_FACTOR
 from cirl_marl.vector_env import VectorEnv
 
 EVALUATION_SEEDS = 2**31
@@ -113,7 +114,8 @@ def rollout(
     circularity, mean, service = np.empty(shape), np.empty(shape), np.empty(shape)
     local = np.zeros((len(env.agents), env.num_envs))
     returns = np.zeros_like(local)
-    stock = np.empty((steps, len(env.network.nodes)))
+    nodes = len(env.network.nodes)
+    stock = np.empty((steps, nodes))
     flow = np.empty((steps, len(env.network.arcs)))
     total_flow = np.zeros(len(env.network.arcs))
     for t in range(steps):
@@ -122,12 +124,12 @@ def rollout(
         service[:, t] = outcome.service_level
         local += outcome.local
         returns += outcome.reward
-        stock[t], flow[t] = env.physical.stock[:-1, 0], outcome.flow[:, 0]
+        stock[t], flow[t] = env.physical.stock[:nodes, 0], outcome.flow[:, 0]
         total_flow += outcome.flow.mean(axis=1)
         observations = env.by_agent(outcome.observation)
         if progress is not None:
             progress(t + 1)
-    final = env.physical.stock[:-1].mean(axis=1)
+    final = env.physical.stock[:nodes].mean(axis=1)
     return Rollout(circularity, mean, service, local, returns, stock, flow, final, total_flow / steps)
 
 
@@ -150,7 +152,8 @@ def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
     """Return the figures of each controller beside those of ``neutral``, ready for JSON.
 
     Each figure is a mean over episodes with the half-width of its 95 % confidence interval; gains are paired, episode
-    by episode, with the neutral controller's from the same start.
+    by episode, with the neutral controller's from the same start. A network that states the criticality of its material
+    has its time-window circularity as well (see ``staged.time_window_circularity``).
     """
     neutral = rollouts["neutral"]
     figures = {}
@@ -163,4 +166,8 @@ def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
             "return": {agent: estimate(run.returns[i]).as_dict() for i, agent in enumerate(env.agents)},
             "local_return": {agent: estimate(run.local_returns[i]).as_dict() for i, agent in enumerate(env.agents)},
         }
+        criticality = env.network.objective.criticality
+        if criticality is not None:
+            weighted = CIRO_FACTOR * criticality * run.episode_circularity
+            figures[name]["time_window_circularity"] = estimate(weighted).as_dict()
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}

@@ -2,7 +2,8 @@
 
 Every law is one product, ``f_k = r_k · y[driver_k]``. The driver is the stock of the donor or of the recipient (r in
 1/time), the constant 1 for scheduled flows (r in mass/time), or the output of a compartment's model (r in mass/time per
-unit of output). Stocks are therefore kept with one more row, the *unit row*, which is 1; outputs follow it.
+unit of output). Stocks are therefore kept with more rows: those of the nodes, then the masses of batch arcs, then the
+*unit row*, which is 1; outputs follow it. Batch arcs carry no continuous flow.
 
 Arrays are compartment-major, shape (compartments, batch), contiguous along the batch. Gather, multiply and sparse
 segment sum treat each column alike, so a column's bits do not depend on the batch it is in.
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cirl_marl.batches import Batches
 from cirl_marl.elements import Arc, ControlKind, Law
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.rowsum import RowSum
@@ -24,10 +26,12 @@ class FlowLaws:
 
     Attributes:
         network: whose laws they are.
-        incidence: S with an empty unit row, shape (nodes + 1, arcs).
+        batches: the batch arcs; their masses lie in the rows between the nodes and the unit row.
+        unit: the unit row; the rows before it hold all the mass there is.
+        incidence: S with empty rows for batches and unit, shape (unit + 1, arcs).
         driver: row of the extended stocks that drives each arc, shape (arcs,).
         scheduled: arcs that flow by schedule, shape (arcs,).
-        control_low: lower bounds of the controls, in the order of ``network.controllable``.
+        control_low: lower bounds of the controls, in the rows of ``network.control_rows``.
         control_high: upper bounds.
         neutral: values while nobody acts.
         max_rate: r of each arc with every control at its upper bound, shape (arcs,).
@@ -36,21 +40,24 @@ class FlowLaws:
     def __init__(self, network: Network) -> None:
         """Compile ``network``."""
         self.network = network
-        nodes, arcs = len(network.nodes), len(network.arcs)
+        arcs = len(network.arcs)
+        self.batches = Batches(network)
+        self.unit = len(network.nodes) + len(self.batches)
         donors, recipients = network.donors, network.recipients
         columns = np.arange(arcs)
         self.incidence = RowSum(
             np.concatenate([donors, recipients]),
             np.tile(columns, 2),
             np.repeat([-1.0, 1.0], arcs),
-            (nodes + 1, arcs),
+            (self.unit + 1, arcs),
         )
         laws = np.array([arc.law for arc in network.arcs])
         self.scheduled = np.isin(laws, SCHEDULED)
-        self.driver: Integers = np.where(self.scheduled, nodes, np.where(laws == Law.RECIPIENT, recipients, donors))
+        constant = self.scheduled | (laws == Law.BATCH)
+        self.driver: Integers = np.where(constant, self.unit, np.where(laws == Law.RECIPIENT, recipients, donors))
         modelled = [c.id for c in network.compartments.values() if c.model is not None]
         for k in np.flatnonzero(laws == Law.COMPARTMENT):
-            self.driver[k] = nodes + 1 + modelled.index(network.arcs[k].by)
+            self.driver[k] = self.unit + 1 + modelled.index(network.arcs[k].by)
         self._compile_controls()
         self._series_arcs: Integers = np.flatnonzero([bool(arc.times) for arc in network.arcs])
         self._series = np.array([_interval_means(network.arcs[k], network) for k in self._series_arcs])
@@ -63,7 +70,7 @@ class FlowLaws:
         """Return r of each arc for given controls.
 
         Args:
-            controls: physical values in the order of ``network.controllable``, shape (controls, B).
+            controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
             step: index of the control interval in each environment, shape (B,); picks the value of time series.
 
         Returns:
@@ -85,17 +92,18 @@ class FlowLaws:
         return flow
 
     def extend(self, stock: Floats) -> Floats:
-        """Append the unit row to stocks of shape (nodes, B)."""
-        return np.concatenate([stock, np.ones((1, stock.shape[1]))])
+        """Append empty batch rows and the unit row to stocks of shape (nodes, B)."""
+        return np.concatenate([stock, np.zeros((len(self.batches), stock.shape[1])), np.ones((1, stock.shape[1]))])
 
     def _compile_controls(self) -> None:
         """Find for each arc the rows of the control array that act on it; the row past the last is 1."""
         network = self.network
-        controls = [c.control for c in network.compartments.values() if c.control is not None]
+        acting = [network.compartments[id_] for id_ in network.controllable]
+        controls = [c.control for c in acting for _ in range(c.actions) if c.control is not None]
         position = {
-            id_: i
-            for i, (id_, control) in enumerate(zip(network.controllable, controls, strict=True))
-            if control.kind is not ControlKind.INPUT
+            c.id: network.control_rows[c.id].start
+            for c in acting
+            if c.control is not None and c.control.kind is not ControlKind.INPUT
         }
         none = len(controls)
         self.control_low: Floats = np.array([c.low for c in controls], dtype=float)
@@ -116,6 +124,8 @@ class FlowLaws:
 
 
 def _base_rate(arc: Arc) -> float:
+    if arc.law is Law.BATCH:
+        return 0.0
     if arc.law not in SCHEDULED:
         return arc.rate
     if arc.law is Law.EXOGENOUS and not arc.times:

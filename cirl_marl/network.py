@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from cirl_marl.elements import SINKS, Arc, Compartment, Episode, Node, Objective, Observation, Role, Service
+from cirl_marl.elements import SINKS, Arc, Compartment, Episode, Law, Node, Objective, Observation, Role, Service
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.rowsum import Floats as Floats
 from cirl_marl.rowsum import RowSum
@@ -162,6 +162,12 @@ class Network:
         return tuple(c.id for c in self.compartments.values() if c.control is not None)
 
     @cached_property
+    def control_rows(self) -> Mapping[str, slice]:
+        """Rows of each controllable compartment in control arrays: one, or one per input of its model."""
+        edges = np.cumsum([0, *(self.compartments[id_].actions for id_ in self.controllable)]).tolist()
+        return MappingProxyType({id_: slice(edges[i], edges[i + 1]) for i, id_ in enumerate(self.controllable)})
+
+    @cached_property
     def agents(self) -> tuple[str, ...]:
         """Compartments that act by default."""
         return self.acting or self.controllable
@@ -203,15 +209,17 @@ class Network:
             graph.edges[arc.donor, arc.recipient]["arcs"].append(arc)
         return graph
 
-    def circularity(self, flow: Floats) -> Floats:
-        """Return λ(N;t) = −Δ·σᵀf for continuous flows.
+    def circularity(self, flow: Floats, batched: Floats | None = None) -> Floats:
+        """Return λ(N;t) = −(m_fb + Δ·σᵀf), σᵀf summed over the continuous flows.
 
         With ``net_zero = "abs"`` the part through the environment enters by its absolute value:
         λ = −Δ(σ_rest·f + |σ_env·f|). Given mean flows this is λ of the mean flows, which for ``abs`` is not the mean
         of λ if the net flow changes its sign within the interval.
 
         Args:
-            flow: f, shape (arcs, ...), mass/time.
+            flow: f, shape (arcs, ...), mass/time; entries of batch arcs are ignored.
+            batched: m_fb, net batch mass moved finite-time sustainably so far, shape (...), mass; None if nothing moves
+                in batches.
 
         Returns:
             λ, shape (...), mass.
@@ -224,12 +232,13 @@ class Network:
         else:
             circularity = parts[0] + parts[1]
         shaped: Floats = circularity.reshape(flow.shape[1:])
-        return shaped
+        return shaped if batched is None else shaped - batched
 
     @cached_property
     def _circularity_parts(self) -> RowSum:
         """Rows −Δ·σ_rest and −Δ·σ_env."""
-        counted = np.flatnonzero(self.sustainability)
+        continuous = np.array([arc.law is not Law.BATCH for arc in self.arcs], dtype=bool)
+        counted = np.flatnonzero(self.sustainability * continuous)
         rows = self.environmental[counted].astype(np.intp)
         weights = -self.objective.reference_interval * self.sustainability[counted]
         return RowSum(rows, counted, weights, (2, len(self.arcs)))

@@ -9,30 +9,57 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from cirl_marl.elements import Arc
+from cirl_marl.elements import OBSERVE, Arc
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.simulate import Dynamics
 
-MODES = ("local", "neighbours", "full", "stocks")
-
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Rows of the signal table: stocks, flows, inner states, time, service levels, set-points of nodes and arcs.
+    """Rows of the signal table: quantities, time, service levels, set-points of nodes and arcs.
 
-    Stocks, flows and set-points are divided by the scale of their compartment, time by the horizon.
+    The quantities are stocks, flows, inner states, measures and masses on the way along batch arcs. Stocks, flows,
+    masses on the way and set-points are divided by the scale of their compartment (what a batch arc delivers in a
+    control interval too), time by the horizon.
     """
 
     nodes: int
     arcs: int
-    states: int
+    inner: int
+    measured: int
+    batch_arcs: int
     services: int
 
     @property
     def quantities(self) -> int:
-        """Number of stocks, flows and inner states together."""
-        return self.nodes + self.arcs + self.states
+        """Number of quantities."""
+        return self.nodes + self.arcs + self.inner + self.measured + self.batch_arcs
+
+    @property
+    def flows(self) -> slice:
+        """Rows of the mean flows."""
+        return slice(self.nodes, self.nodes + self.arcs)
+
+    @property
+    def states(self) -> slice:
+        """Rows of the inner states."""
+        return slice(self.flows.stop, self.flows.stop + self.inner)
+
+    @property
+    def measures(self) -> slice:
+        """Rows of what the models measure."""
+        return slice(self.states.stop, self.states.stop + self.measured)
+
+    @property
+    def loads(self) -> slice:
+        """Rows of the masses on batch arcs."""
+        return slice(self.measures.stop, self.measures.stop + self.batch_arcs)
+
+    @property
+    def inside(self) -> bool:
+        """Whether there are quantities besides stocks and flows."""
+        return self.inner + self.measured + self.batch_arcs > 0
 
     @property
     def time(self) -> int:
@@ -67,18 +94,34 @@ class ObservationLayout:
         """Lay out the observations of ``agents``; ``mode`` None takes the network's own."""
         network = dynamics.network
         mode = network.observation.mode if mode is None else mode
-        if mode not in MODES:
-            raise CirlError(f"observe: {unknown('observation mode', mode, MODES)}")
+        if mode not in OBSERVE:
+            raise CirlError(f"observe: {unknown('observation mode', mode, OBSERVE)}")
         if mode == "stocks" and not network.observation.nodes:
             raise CirlError(f"observe: mode 'stocks' needs a scenario that lists the nodes; '{network.name}' has none")
+        for agent in agents:
+            if mode == "model" and network.compartments[agent].model is None:
+                raise CirlError(f"observe: mode 'model' needs a model, and '{agent}' of '{network.name}' has none")
         inner = dynamics.inner
-        self.signals = Signals(len(network.nodes), len(network.arcs), len(inner.names), len(network.services))
-        first = self.signals.nodes + self.signals.arcs
-        self._inner = {owner: range(first + rows.start, first + rows.stop) for owner, rows in inner.rows.items()}
+        batches = dynamics.batches
+        self.signals = signals = Signals(
+            nodes=len(network.nodes),
+            arcs=len(network.arcs),
+            inner=len(inner.names),
+            measured=len(inner.measure_names),
+            batch_arcs=len(batches.lines),
+            services=len(network.services),
+        )
+        first = signals.states.start
+        self._inner = {owner: [first + row for row in rows] for owner, rows in inner.observed.items()}
+        self._measures = inner.measure_names
+        for row, name in enumerate(inner.measure_names, signals.measures.start):
+            self._inner[name.split(".")[0]].append(row)
+        self._load = {line.id: signals.loads.start + i for i, line in enumerate(batches.lines)}
+        self._hidden = {*range(first, signals.states.stop)}.difference(*self._inner.values())
         self._observed = {**network.node_index, **{name: first + i for i, name in enumerate(inner.names)}}
         self._network = network
         self._incident = _incident_arcs(network)
-        self._names = list(self._signal_names(inner.names))
+        self._names = list(self._signal_names((*inner.names, *inner.measure_names)))
         compartments = [c.id for c in (*network.nodes, *network.arcs)]
         self._position = {id_: i for i, id_ in enumerate(compartments)}
         self._debts: dict[str, list[int]] = {}
@@ -95,7 +138,9 @@ class ObservationLayout:
         }
         self.names = {agent: tuple(self._names[row] for row in seen) for agent, seen in zip(agents, rows, strict=True)}
         scales = np.array([c.scale for c in (*network.nodes, *network.arcs)])
-        inverse_scale = 1.0 / np.concatenate([scales, np.ones(len(inner.names))])
+        inside = np.ones(signals.inner + signals.measured)
+        inverse_scale = 1.0 / np.concatenate([scales, inside, scales[signals.nodes :][batches.arcs]])
+        inverse_scale[signals.flows][batches.arcs] *= network.episode.control_interval
         self._inverse_scale = np.repeat(
             inverse_scale[:, None], batch, axis=1
         )  # equal shapes are faster than a broadcast
@@ -107,7 +152,7 @@ class ObservationLayout:
         """Return the stacked observation, shape (entries of all agents, B).
 
         Args:
-            quantities: stocks, mean flows and inner states, shape (nodes + arcs + states, B).
+            quantities: shape (quantities, B); see ``Signals``.
             time: elapsed share of the episode, shape (B,).
             levels: service levels, shape (services, B).
         """
@@ -118,15 +163,29 @@ class ObservationLayout:
         table[self.signals.levels] = levels
         return table.take(self._index, axis=0)
 
+    def row(self, compartment: str, quantity: str, measure: str = "") -> int:
+        """Return the row of a compartment's ``stock``, ``flow`` or ``measure`` among the quantities."""
+        if quantity == "measure":
+            first: int = self.signals.measures.start
+            return first + self._measures.index(f"{compartment}.{measure}")
+        if quantity == "stock" and compartment in self._load:
+            return self._load[compartment]
+        return self._position[compartment]
+
     def _rows(self, agent: str, mode: str) -> Iterator[int]:
         network, signals = self._network, self.signals
         if mode == "stocks":
             yield from (self._observed[name] for name in network.observation.nodes)
             return
+        if mode == "model":
+            yield from self._inner[agent]
+            return
         compartment = network.compartments[agent]
         own = self._position[agent]
         yield own
         yield from self._inner.get(agent, ())
+        if agent in self._load:
+            yield self._load[agent]
         if not isinstance(compartment, Arc):
             arcs = self._incident[own]
             neighbours = self._across(own)
@@ -136,10 +195,11 @@ class ObservationLayout:
             arcs = [k for end in ends for k in self._incident[end]] if mode == "neighbours" else []
             neighbours = [node for end in ends for node in self._across(end)]
         yield from (signals.nodes + k for k in arcs)
+        yield from (self._load[network.arcs[k].id] for k in arcs if network.arcs[k].id in self._load)
         if mode == "neighbours":
             yield from neighbours
         if mode == "full":
-            yield from range(signals.quantities)
+            yield from (row for row in range(signals.quantities) if row not in self._hidden)
         if compartment.set_point is not None:
             yield signals.set_point(own)
         if mode == "full":
@@ -157,6 +217,7 @@ class ObservationLayout:
         yield from (f"stock of {node.id}" for node in network.nodes)
         yield from (f"flow of {arc.id}" for arc in network.arcs)
         yield from states
+        yield from (f"mass on {arc}" for arc in self._load)
         yield "time"
         yield from (f"service level of {service.id}" for service in network.services)
         yield from (f"set-point of {c.id}" for c in (*network.nodes, *network.arcs))
@@ -171,11 +232,14 @@ class ObservationLayout:
         low[:known], high[:known] = -np.inf, np.inf
         if dynamics.physical:
             mass = sum(node.initial[1] for node in network.nodes)
-            drive = np.where(dynamics.driver == signals.nodes, 1.0, mass)
-            drive[dynamics.driver > signals.nodes] = np.inf
-            limits = np.concatenate([np.full(signals.nodes, mass), drive * dynamics.max_rate]) / scales
+            drive = np.where(dynamics.driver == dynamics.unit, 1.0, mass)
+            drive[dynamics.driver > dynamics.unit] = np.inf
+            flows = drive * dynamics.max_rate
+            flows[dynamics.batches.arcs] = mass
+            limits = np.concatenate([np.full(signals.nodes, mass), flows]) / scales
             low[:known], high[:known] = 0.0, limits * (1 + 1e-6) + 1e-6
         low[known : signals.quantities], high[known : signals.quantities] = -np.inf, np.inf
+        low[signals.loads] = 0.0
         set_points = np.abs([c.set_point or 0.0 for c in compartments]) / scales
         low[signals.set_point(0) :] = -set_points - 1
         high[signals.set_point(0) :] = set_points + 1

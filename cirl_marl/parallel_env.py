@@ -27,7 +27,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
     Each agent has its own Box(−1, 1) action and its own float32 observation; ``layout.names[agent]`` says what each
     entry is. Episodes end by truncation at the horizon. ``infos[agent]`` carries ``circularity`` (λ at the end of the
     step, mass), ``local_reward``, ``flows`` (mean flows in the order of ``network.arcs``, mass/time) and
-    ``service_level``.
+    ``service_level``; for an agent whose model has a criterion of success also ``success``.
 
     Attributes:
         network: the network under the chosen scenario.
@@ -69,6 +69,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         self.observation_spaces = dict(self._batch.observation_spaces)
         self.action_spaces = dict(self._batch.action_spaces)
         self.state_names = self._batch.state_names
+        self._entries = sum(len(neutral) for neutral in self._batch.neutral_action.values())
         self.state_space = Box(-np.inf, np.inf, (len(self.state_names) + 1,), np.float64)
         self.render_mode = render_mode
         self._canvas: Any = None
@@ -105,7 +106,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """Hold one action per agent, each of shape (1,) in [−1, 1], for one control interval.
+        """Hold one action per agent, each in its Box(−1, 1), for one control interval.
 
         Raises:
             ControlError: for missing or unknown agents, wrong shapes, NaN or values out of bounds.
@@ -167,7 +168,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             self._canvas = Canvas(self.network, window=self.render_mode == "human")
         state = self._batch.physical
         time = float(state.step[0]) * self.network.episode.control_interval
-        image: NDArray[np.uint8] = self._canvas.draw(state.stock[:-1, 0], state.flow[:, 0], time)
+        image: NDArray[np.uint8] = self._canvas.draw(state.stock[: len(self.network.nodes), 0], state.flow[:, 0], time)
         return image if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
@@ -186,7 +187,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             stacked = np.empty(0)
         if (
             stacked.dtype.kind not in "biuf"
-            or stacked.shape != (len(self.possible_agents), 1)
+            or stacked.shape != (self._entries, 1)
             or len(actions) != len(self.possible_agents)
         ):
             return self._batch.stack({agent: np.asarray(action)[None] for agent, action in actions.items()})
@@ -195,7 +196,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
     def _infos(self, outcome: Outcome) -> dict[str, dict[str, Any]]:
         circularity, service = float(outcome.circularity[0]), float(outcome.service_level[0])
         flows = outcome.flow[:, 0]
-        return {
+        infos: dict[str, dict[str, Any]] = {
             agent: {
                 "circularity": circularity,
                 "local_reward": local,
@@ -204,6 +205,10 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             }
             for agent, local in zip(self.possible_agents, outcome.local[:, 0].tolist(), strict=True)
         }
+        for agent, success in outcome.success.items():
+            if agent in infos:
+                infos[agent]["success"] = bool(success[0])
+        return infos
 
 
 def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParallelEnv:

@@ -5,18 +5,25 @@ from __future__ import annotations
 import gymnasium
 
 PAPER_ENVIRONMENTS = {
-    "cirl_marl/CopperNet-v0": ("copper_net", "use_to_collection"),
-    "cirl_marl/CarboNet-v0": ("carbo_net", "urban_to_capture"),
+    "cirl_marl/CopperNet-v0": ("copper_net", "use_to_collection", "paper"),
+    "cirl_marl/CarboNet-v0": ("carbo_net", "urban_to_capture", "paper"),
+    "cirl_marl/TransportTruck-v0": ("solids_net", "truck", "paper_truck"),
+    "cirl_marl/Incinerator-v0": ("solids_net", "incinerator", "paper_incinerator"),
+    "cirl_marl/Reacher-v0": ("solids_net", "sorter", "paper_reacher"),
+    "cirl_marl/FetchWasteSorting-v0": ("solids_net", "sorter", "paper_fetch"),
+    "cirl_marl/CO2MicroalgaeMonod-v0": ("net_zero", "microalgae", "paper_monod"),
+    "cirl_marl/CO2MicroalgaeDroop-v0": ("net_zero", "microalgae", "paper_droop"),
 }
-"""Gymnasium id → (network, agent), each under ``scenario="paper"``."""
+"""Gymnasium id → (network, agent, scenario)."""
 
 
 def register() -> None:
     """Register every id once; called when ``cirl_marl`` is imported."""
-    for id_, (network, agent) in PAPER_ENVIRONMENTS.items():
+    for id_, (network, agent, scenario) in PAPER_ENVIRONMENTS.items():
         if id_ not in gymnasium.registry:
+            goal = scenario == "paper_fetch"
             gymnasium.register(
                 id_,
-                entry_point="cirl_marl.single_env:SingleAgentEnv",
-                kwargs={"network": network, "agent": agent, "scenario": "paper"},
+                entry_point="cirl_marl.goal_env:GoalEnv" if goal else "cirl_marl.single_env:SingleAgentEnv",
+                kwargs={"network": network, "agent": agent, "scenario": scenario},
             )

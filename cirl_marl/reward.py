@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cirl_marl.network import Floats, Network
+from cirl_marl.observe import ObservationLayout
 from cirl_marl.rowsum import RowSum
 
 
@@ -23,7 +24,7 @@ class Scoring:
     Args of all methods are compartment-major, shape (rows, B).
     """
 
-    def __init__(self, network: Network, agents: Sequence[str], batch: int) -> None:
+    def __init__(self, network: Network, layout: ObservationLayout, agents: Sequence[str], batch: int) -> None:
         """Compile the scores of ``agents`` and of the network as a whole, for arrays of ``batch`` columns."""
         compartments = list(network.compartments.values())
         position = {c.id: i for i, c in enumerate(compartments)}
@@ -34,7 +35,7 @@ class Scoring:
         self._set_point = np.repeat(set_point[:, None], batch, axis=1)  # equal shapes are faster than a broadcast
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         services = network.services
-        self._measure = _measurement(network, position, sum(len(c.inner) for c in compartments))
+        self._measure = _measurement(network, layout)
         self._low = np.array([s.low for s in services]).reshape(-1, 1)
         self._high = np.array([s.high for s in services]).reshape(-1, 1)
         self._bounded = bool(np.isfinite(self._high).any())
@@ -98,16 +99,15 @@ class Scoring:
         return total
 
 
-def _measurement(network: Network, position: dict[str, int], states: int) -> RowSum:
-    """Matrix that reads each service off the quantities, shape (services, nodes + arcs + states)."""
+def _measurement(network: Network, layout: ObservationLayout) -> RowSum:
+    """Matrix that reads each service off the quantities, shape (services, quantities)."""
     rows, columns = [], []
     for row, service in enumerate(network.services):
         if service.quantity == "outflow":
             provider = network.node_index[service.provider]
             read = [len(network.nodes) + int(k) for k in np.flatnonzero(network.donors == provider)]
         else:
-            read = [position[service.provider]]
+            read = [layout.row(service.provider, service.quantity, service.measure)]
         rows += [row] * len(read)
         columns += read
-    shape = (len(network.services), len(position) + states)
-    return RowSum(rows, columns, np.ones(len(rows)), shape)
+    return RowSum(rows, columns, np.ones(len(rows)), (len(network.services), layout.signals.quantities))

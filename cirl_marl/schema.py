@@ -46,6 +46,16 @@ class Series(Table):
     source: Source
 
 
+class Batches(Table):
+    """Discrete masses: ``masses[i]`` leaves the donor at ``times[i]``, at the start of a control interval."""
+
+    times: list[Number]
+    time_unit: str
+    masses: list[Number]
+    unit: str
+    source: Source
+
+
 class ControlTable(Table):
     """What the agent of this compartment sets."""
 
@@ -74,7 +84,10 @@ class ModelTable(Table):
     form: str | None = Field(None, description="form of the equations, such as 'published' or 'sound'")
     parameters: dict[str, Number] = Field({}, description="parameters that differ from the model's own, by name")
     source: Source
-    initial: dict[str, InnerRange] = Field(description="initial range of each inner state")
+    initial: dict[str, InnerRange] = Field(
+        {}, description="initial range of each inner state that the model does not draw"
+    )
+    reward_scale: Quantity | None = Field(None, description="the model's reward is divided by it, unit '1'; default 1")
 
 
 class NodeTable(Table):
@@ -94,17 +107,22 @@ class ArcTable(Table):
 
     title: str = ""
     model: ModelTable | None = None
-    by: str = Field("", description="compartment whose model gives the flow (compartment law)")
+    by: str = Field("", description="compartment whose model gives the flow or releases the batches")
+    port: str = Field("", description="port of that model (batch law)")
+    batches: Batches | None = Field(None, description="schedule of the batch law; instead of 'by'")
+    delay: Quantity | None = Field(None, description="transit time of batches, if no vehicle's model decides")
     from_: str = Field(alias="from", description="id of the node that gives")
     to: str = Field(description="id of the node that receives")
     law: Law
     rate: Quantity | None = Field(
-        None, description="a of the donor and recipient laws, 1/time; or flow per unit of a model's output"
+        None, description="a, 1/time (donor, recipient), mass/time per unit of output, mass per unit released (batch)"
     )
     flow: Quantity | None = Field(None, description="constant flow of the exogenous law")
     series: Series | None = Field(None, description="time series of the exogenous law")
     set_point: Quantity | None = None
-    scale: Quantity | None = Field(None, description="reference flow; default: scales.flow")
+    scale: Quantity | None = Field(
+        None, description="reference flow, default: scales.flow; of a batch arc reference mass, default: scales.stock"
+    )
     pollutant: bool = Field(True, description="whether what enters an environment here is a pollutant")
     control: ControlTable | None = None
 
@@ -114,7 +132,8 @@ class ServiceTable(Table):
 
     title: str = ""
     provider: str = Field(description="compartment at which the service is measured")
-    quantity: Literal["stock", "outflow", "flow"]
+    quantity: Literal["stock", "outflow", "flow", "measure"]
+    measure: str = Field("", description="what the provider's model measures, for quantity 'measure'")
     low: Quantity
     high: Quantity | None = None
     weight: Quantity = Field(description="factor of the shortfall in the local rewards")
@@ -157,12 +176,15 @@ class ObjectiveTable(Table):
     tracked: list[str] = Field(
         [], description="compartments whose set-point counts in local rewards; default: all that have one"
     )
+    criticality: Quantity | None = Field(
+        None, description="criticality of the material, unit '1', for its weighted KPI"
+    )
 
 
 class ObservationTable(Table):
     """What agents see by default."""
 
-    mode: Literal["local", "neighbours", "full", "stocks"]
+    mode: Literal["local", "neighbours", "full", "stocks", "model"]
     nodes: list[str] = Field([], description="observed nodes of mode 'stocks', in order")
 
 
@@ -183,7 +205,9 @@ class NetworkTable(Table):
     arcs: dict[Identifier, ArcTable]
     services: dict[Identifier, ServiceTable] = {}
     scenarios: dict[Identifier, dict[str, Any]] = Field(
-        {}, description="tables that replace those of the default scenario, key by key"
+        {},
+        description="tables that replace those of the default scenario, key by key, after those named in 'without', "
+        "such as 'nodes.digester.model', are left out",
     )
 
 
@@ -207,7 +231,12 @@ def json_schema() -> dict[str, Any]:
     tables = [name for name, body in definitions.items() if body.get("type") == "object"]
     parts = {f"{name}Part": part(definitions[name]) for name in tables}
     properties = {k: v for k, v in schema["properties"].items() if k not in ("scenarios", "name")}
-    parts["Scenario"] = {"type": "object", "additionalProperties": False, "properties": part(properties)}
+    without = {"type": "array", "items": {"type": "string"}, "description": "what to leave out first, as dotted paths"}
+    parts["Scenario"] = {
+        "type": "object",
+        "additionalProperties": False,
+        "properties": {"without": without, **part(properties)},
+    }
     definitions.update(parts)
     scenarios = schema["properties"]["scenarios"]["patternProperties"]
     scenarios.update({pattern: {"$ref": "#/$defs/Scenario"} for pattern in scenarios})

@@ -35,16 +35,19 @@ class Transition:
     """What one control interval did.
 
     Attributes:
-        stock: stocks after the interval with the unit row, shape (nodes + 1, B), mass.
+        stock: stocks after the interval with batch rows and unit row, shape (unit + 1, B), mass.
         inner: inner states of the models after the interval, shape (states, B).
-        moved: mass moved along each arc, shape (arcs, B), mass.
-        flow: realised flows at the end of the interval, shape (arcs, B), mass/time.
+        moved: mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass.
+        flow: realised continuous flows at the end of the interval, shape (arcs, B), mass/time.
+        batched: m_fb of the interval, net batch mass moved finite-time sustainably at its start and at its end, shape
+            (2, B), mass; None without batch arcs.
     """
 
     stock: Floats
     inner: Floats
     moved: Floats
     flow: Floats
+    batched: Floats | None = None
 
 
 class Dynamics(FlowLaws):
@@ -66,7 +69,7 @@ class Dynamics(FlowLaws):
     def __init__(self, network: Network) -> None:
         """Compile ``network``."""
         super().__init__(network)
-        self.inner = InnerPhysics(network)
+        self.inner = InnerPhysics(network, self.batches)
         episode = network.episode
         self.physical = episode.solver != "euler"
         self._exact = episode.solver == "exact"
@@ -84,7 +87,7 @@ class Dynamics(FlowLaws):
         self.substep = episode.control_interval / self.substeps
         self.terms = self._series_terms() if self._exact else 0
         self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
-        shape = (len(network.nodes) + 1, len(network.arcs))
+        shape = (self.unit + 1, len(network.arcs))
         self._outgoing = RowSum(network.donors, np.arange(shape[1]), np.ones(shape[1]), shape)
         self._pulls = any(arc.law is Law.RECIPIENT for arc in network.arcs)
         self._compile_orders()
@@ -155,12 +158,19 @@ class Dynamics(FlowLaws):
         lower than those asked for.
 
         Args:
-            stock: stocks with the unit row, shape (nodes + 1, B).
+            stock: stocks with batch rows and unit row, shape (unit + 1, B).
             inner: inner states of the models, shape (states, B).
-            controls: physical values in the order of ``network.controllable``, shape (controls, B).
-            step: index of the control interval in each environment, shape (B,).
+            controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
+            step: index of the control interval in each environment, shape (B,); networks without time series and
+                batches need none.
         """
         rate = realised = self.rate(controls, step)
+        sent = None
+        if self.batches.lines:
+            assert step is not None
+            stock = stock.copy()
+            sent = self.batches.dispatch(stock, step)
+        inner = self.inner.tick(inner, controls, stock)
         total = None
         for _ in range(self.substeps):
             realised = self._limit_orders(stock, rate) if self.physical else rate
@@ -170,7 +180,13 @@ class Dynamics(FlowLaws):
                 stock, inner, moved, realised = self._explicit_step(stock, inner, realised, controls)
             total = moved if total is None else total + moved
         assert total is not None
-        return Transition(stock, inner, total, self.flow_at(stock, inner, controls, realised))
+        batched = None
+        if sent is not None and step is not None:
+            inner = inner.copy()
+            delivered, counted = self.batches.settle(stock, inner, step, self.inner)
+            total[self.batches.arcs] = delivered
+            batched = np.stack([sent, counted])
+        return Transition(stock, inner, total, self.flow_at(stock, inner, controls, realised), batched)
 
     def start_flow(self, stock: Floats, inner: Floats, controls: Floats) -> Floats:
         """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
@@ -186,15 +202,16 @@ class Dynamics(FlowLaws):
     def _explicit_step(
         self, stock: Floats, inner: Floats, rate: Floats, controls: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Take one Runge-Kutta step of stocks and inner states together."""
+        """Take one Runge-Kutta step of stocks and inner states together; models with a step of their own go ahead."""
         h = self.substep
+        ahead, means = self.inner.own_steps(inner, controls, h, stock)
         nodes, weights = RUNGE_KUTTA[self.network.episode.solver]
         flow, slope = np.zeros_like(rate), np.zeros_like(inner)
         moved, change = np.zeros_like(rate), np.zeros_like(inner)
         for node, weight in zip(nodes, weights, strict=True):
             stage = self.incidence.add_to(stock.copy(), flow * (node * h)) if node else stock
             stage_inner = inner + slope * (node * h) if node else inner
-            flow = self.flow_at(stage, stage_inner, controls, rate)
+            flow = self.flow(self.inner.extend(stage, stage_inner, controls, means), rate)
             slope = self.inner.derivative(stage_inner, controls, stage)
             moved += flow * (weight * h)
             change += slope * (weight * h)
@@ -202,7 +219,7 @@ class Dynamics(FlowLaws):
             stock, moved, rate = self._move_what_is_there(stock, moved, rate)
         else:
             stock = self.incidence.add_to(stock.copy(), moved)
-        return stock, inner + change, moved, rate
+        return stock, ahead + change, moved, rate
 
     def _move_what_is_there(self, stock: Floats, moved: Floats, rate: Floats) -> tuple[Floats, Floats, Floats]:
         """Move mass; scale the outflows of nodes that would be overdrawn to the stock they started with."""

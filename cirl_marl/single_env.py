@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cirl_marl.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 from cirl_marl.parallel_env import NetworkParallelEnv
@@ -43,7 +44,8 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         Args:
             network: catalogue name, path of a definition file, or a network.
             agent: who acts; None if the scenario has exactly one agent.
-            scenario: scenario of the definition.
+            scenario: scenario of the definition; where several agents have one each, as in ``paper_truck`` and
+                ``paper_incinerator``, ``paper`` means that of ``agent``.
             legacy_episode: reproduce the step counter of the published classes. It is checked at the start of a step
                 and survives ``reset``: when it has reached the horizon, the state is drawn anew, one step is taken from
                 there, and its time limit is reported as termination. So the first episode has horizon + 1 steps, and
@@ -51,12 +53,14 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             **options: those of ``parallel_env``, but for ``agents``.
 
         Raises:
-            CirlError: if ``agent`` is missing or unknown.
+            CirlError: if ``agent`` is missing or unknown, or the scenario is not the only one of its name for it.
         """
         if "agents" in options:
             raise CirlError("a single-agent environment takes agent=, not agents=")
         chosen = None if agent is None else [agent]
-        self.parallel = NetworkParallelEnv(network, scenario=scenario, agents=chosen, **options)
+        found = load_network(network) if isinstance(network, str | Path) else network
+        scenario = _scenario_of(found, scenario, agent)
+        self.parallel = NetworkParallelEnv(found, scenario=scenario, agents=chosen, **options)
         if len(self.parallel.possible_agents) != 1:
             raise CirlError(
                 f"network '{self.parallel.network.name}' has several agents: "
@@ -121,8 +125,24 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self.parallel.state()[self._order]
 
 
+def _scenario_of(network: Network, scenario: str | None, agent: str | None) -> str | None:
+    """Return ``scenario`` or, if there is none of that name, the ``scenario_…`` in which ``agent`` alone acts."""
+    if scenario is None or scenario == network.scenario_name or scenario in network.scenarios:
+        return scenario
+    fitting = [
+        name
+        for name, other in network.scenarios.items()
+        if name.startswith(f"{scenario}_") and agent is not None and other.acting == (agent,)
+    ]
+    if len(fitting) > 1:
+        raise CirlError(
+            f"network '{network.name}': agent '{agent}' has the scenarios {', '.join(fitting)}: give one of them"
+        )
+    return fitting[0] if fitting else scenario
+
+
 def single_agent_env(network: str | Path | Network, agent: str | None = None, **options: Any) -> SingleAgentEnv:
-    """Return one agent of ``network`` as a Gymnasium environment.
+    """Return one agent of ``network`` as a Gymnasium environment; see ``GoalEnv`` for one whose task is a goal.
 
     >>> env = single_agent_env("copper_net", agent="use_to_collection", scenario="paper")
     >>> observation, info = env.reset(seed=0)

@@ -29,6 +29,10 @@ class Starts:
         self.streams = [np.random.default_rng() for _ in range(num_envs)]
         self._network = network
         self._physical = dynamics.physical
+        nodes = len(network.nodes)
+        self._nodes, self._inner = nodes, inner
+        self._ranged = np.concatenate([np.arange(nodes), nodes + inner.ranged])
+        self._own = np.setdiff1d(np.arange(len(self.names)), self._ranged)
         self._low = np.concatenate([[node.initial[0] for node in network.nodes], inner.low])
         self._width = np.concatenate([[node.initial[1] for node in network.nodes], inner.high]) - self._low
 
@@ -47,14 +51,24 @@ class Starts:
         return drawn
 
     def draw(self, which: Sequence[int] | range | Integers) -> Floats:
-        """Draw initial stocks and inner states of some copies, each from its own stream, shape (rows, len(which))."""
+        """Draw initial stocks and inner states of some copies, each from its own stream, shape (rows, len(which)).
+
+        Models that draw their own start come first, so that a lone robot starts as it does in its own library.
+        """
         by_copy = np.empty((len(which), len(self._low)))
-        for row, i in zip(by_copy, which, strict=True):
+        own = np.empty((len(self._own), len(which)))
+        for column, (row, i) in enumerate(zip(by_copy, which, strict=True)):
+            if len(own):
+                own[:, column] = self._inner.start(self.streams[i])
             self.streams[i].random(out=row)
         uniform = np.ascontiguousarray(by_copy.T)
         uniform *= self._width[:, None]
         uniform += self._low[:, None]
-        return uniform
+        if not len(own):
+            return uniform
+        drawn = np.empty((len(self.names), len(which)))
+        drawn[self._ranged], drawn[self._own] = uniform, own
+        return drawn
 
     def saved_streams(self) -> tuple[Mapping[str, Any], ...]:
         """Return a copy of the state of every stream."""
@@ -93,7 +107,7 @@ class Starts:
                 )
             given = dict(zip(nodes, values, strict=True))
         checked = {self._row(id_): self._initial(id_, values) for id_, values in given.items()}
-        most = (self._low + self._width)[: len(self._network.nodes)]
+        most = (self._low + self._width)[: self._nodes]
         limit = float(most.sum())
         if self._physical and checked:
             total = sum(float(np.max(checked.get(i, most[i]))) for i in range(len(most)))

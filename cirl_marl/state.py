@@ -17,10 +17,11 @@ class State:
     """The physical state of B environments and the sums that an episode reports.
 
     Attributes:
-        stock: stocks and the unit row, shape (nodes + 1, B), mass.
+        stock: masses of nodes, then of batch arcs, then the unit row, shape (rows, B), mass.
         inner: inner states of the compartments' models, shape (states, B).
         flow: mean flows of the last control interval, shape (arcs, B), mass/time.
         step: control intervals done, shape (B,).
+        batched: m_fb, net batch mass moved finite-time sustainably in this episode, shape (B,), mass.
         circularity: sum over the episode of the interval means of λ, shape (B,), mass.
         service: sum over the episode of the service level, shape (B,).
     """
@@ -29,6 +30,7 @@ class State:
     inner: Floats
     flow: Floats
     step: Integers
+    batched: Floats
     circularity: Floats
     service: Floats
 
@@ -69,6 +71,7 @@ class Outcome:
         service_level: shape (B,).
         flow: mean flows, shape (arcs, B), mass/time.
         truncated: time limit reached, shape (B,).
+        success: whether a compartment whose model has a criterion of success meets it, shape (B,) each.
     """
 
     observation: NDArray[np.float32]
@@ -79,3 +82,4 @@ class Outcome:
     service_level: Floats
     flow: Floats
     truncated: NDArray[np.bool_]
+    success: Mapping[str, NDArray[np.bool_]]

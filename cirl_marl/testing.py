@@ -89,7 +89,10 @@ def check_vector_env(make: Callable[[], VectorEnv], *, steps: int = 200, seed: i
     _check_batch(first, observations, 0)
     for step in range(1, steps + 1):
         kept = copy.deepcopy(observations)
-        drawn = {agent: generator.uniform(-1, 1, (first.num_envs, 1)) for agent in first.agents}
+        drawn = {
+            agent: generator.uniform(-1, 1, (first.num_envs, *space.shape))
+            for agent, space in first.action_spaces.items()
+        }
         given = copy.deepcopy(drawn)
         result = first.step(given)
         same_or_raise(drawn, given, f"step {step}: the actions were changed")

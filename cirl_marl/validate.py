@@ -20,8 +20,10 @@ from cirl_marl.elements import (
     Law,
     Node,
     Service,
+    ranged_states,
 )
 from cirl_marl.errors import unknown
+from cirl_marl.units import factor
 
 if TYPE_CHECKING:
     from cirl_marl.network import Network
@@ -88,6 +90,8 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
         yield f"{where}: rate {arc.rate} must be finite and not negative"
     if arc.law is Law.COMPARTMENT:
         yield from _model_flow_problems(where, arc, network)
+    if arc.law is Law.BATCH:
+        yield from _batch_problems(where, arc, network)
     if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and arc.rate == 0:
         yield f"{where}: law '{arc.law}' needs a positive rate"
     if not arc.flow or any(not math.isfinite(f) or f < 0 for f in arc.flow):
@@ -117,12 +121,48 @@ def _model_flow_problems(where: str, arc: Arc, network: Network) -> Iterator[str
         yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
 
 
+def _batch_problems(where: str, arc: Arc, network: Network) -> Iterator[str]:
+    interval = network.episode.control_interval
+    vehicle = hasattr(arc.model, "boarding")
+    if vehicle == (arc.delay > 0):
+        yield f"{where}: law 'batch' needs a delay or a vehicle as its model, and not both"
+    if vehicle and not arc.by:
+        yield f"{where}: a vehicle carries what a compartment releases: it needs 'by', not a schedule"
+    if arc.by and arc.batches:
+        yield f"{where}: law 'batch' takes 'by' or a schedule of batches, not both"
+    times = [time for time, _ in arc.batches]
+    if any(not (math.isfinite(value) and value >= 0) for pair in arc.batches for value in pair):
+        yield f"{where}: times and masses of batches {arc.batches} must be finite and not negative"
+        return
+    for what, time in [("delay", arc.delay), *(("batch at", time) for time in times)]:
+        if not math.isfinite(time) or not math.isclose(time / interval, round(time / interval), abs_tol=1e-6):
+            yield f"{where}: {what} {time:g} is not a whole number of control intervals of {interval:g}"
+    for what, given in (("set_point", arc.set_point), ("control of kind 'rate'", _rate_control(arc))):
+        if given is not None:
+            yield f"{where}: law 'batch' takes no {what}"
+    donor = {node.id: node for node in network.nodes}.get(arc.donor)
+    if arc.by and donor is not None:
+        ports = getattr(donor.model, "ports", ())
+        if arc.by != donor.id or not ports:
+            yield f"{where}: by: batches are released by the model of the donor '{donor.id}', which has ports {ports}"
+        elif arc.port not in ports:
+            yield f"{where}: {unknown('port', arc.port, ports)}"
+        if arc.rate <= 0:
+            yield f"{where}: law 'batch' with 'by' needs a positive rate, the mass per unit released"
+
+
+def _rate_control(arc: Arc) -> str | None:
+    return arc.control.kind if arc.control is not None and arc.control.kind is ControlKind.RATE else None
+
+
 def _common_problems(where: str, compartment: Compartment) -> Iterator[str]:
     if not math.isfinite(compartment.scale) or compartment.scale <= 0:
         yield f"{where}: scale {compartment.scale} must be positive and finite"
     if compartment.set_point is not None and not math.isfinite(compartment.set_point):
         yield f"{where}: set_point {compartment.set_point} must be finite"
-    states = compartment.model.state_names if compartment.model is not None else ()
+    states = ranged_states(compartment.model) if compartment.model is not None else ()
+    if not math.isfinite(compartment.reward_scale) or compartment.reward_scale <= 0:
+        yield f"{where}: reward_scale {compartment.reward_scale} must be positive and finite"
     if len(compartment.inner) != len(states):
         yield f"{where}: {len(compartment.inner)} initial ranges for the inner states {list(states)}"
     for low, high in compartment.inner:
@@ -131,9 +171,9 @@ def _common_problems(where: str, compartment: Compartment) -> Iterator[str]:
     control = compartment.control
     if control is None:
         return
-    takes_input = compartment.model is not None and len(compartment.model.input_names) == 1
+    takes_input = compartment.model is not None and compartment.model.input_names
     if control.kind is ControlKind.INPUT and not takes_input:
-        yield f"{where}: control.kind 'input' needs a model with one input"
+        yield f"{where}: control.kind 'input' needs a model with inputs"
     if not all(map(math.isfinite, (control.low, control.neutral, control.high))):
         yield f"{where}: control bounds must be finite"
     elif not control.low <= control.neutral <= control.high or control.low == control.high:
@@ -149,11 +189,19 @@ def _service_problems(service: Service, network: Network, nodes: Mapping[str, No
     where = f"service '{service.id}'"
     if service.quantity not in QUANTITIES:
         yield f"{where}: {unknown('quantity', service.quantity, QUANTITIES)}"
-    known = [arc.id for arc in network.arcs] if service.quantity == "flow" else list(nodes)
+    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
+    known = {
+        "flow": [arc.id for arc in network.arcs],
+        "stock": [*nodes, *(arc.id for arc in network.arcs if arc.law is Law.BATCH)],
+        "measure": [id_ for id_, c in everyone.items() if hasattr(c.model, "measures")],
+    }.get(service.quantity, list(nodes))
+    if service.provider in known and service.quantity == "measure":
+        names = getattr(everyone[service.provider].model, "measure_names", ())
+        if service.measure not in names:
+            yield f"{where}: {unknown('measure', service.measure, names)}"
     if service.provider not in known:
-        kind = "arc" if service.quantity == "flow" else "node"
+        kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
         yield f"{where}: provider: {unknown(kind, service.provider, known)}"
-    everyone = [c.id for c in (*network.nodes, *network.arcs)]
     for debtor in service.owed_by:
         if debtor not in everyone:
             yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
@@ -180,14 +228,19 @@ def _setting_problems(network: Network) -> Iterator[str]:
     ):
         if not math.isfinite(number) or number <= 0:
             yield f"{name} {number} must be positive and finite"
+    criticality = objective.criticality
+    if criticality is not None and not (math.isfinite(criticality) and criticality >= 0):
+        yield f"criticality {criticality} must be finite and not negative"
     if episode.horizon < 1:
         yield f"horizon {episode.horizon} must be at least 1 step"
     if not 0 <= objective.circularity_weight <= 1:
         yield f"circularity_weight {objective.circularity_weight} must lie in [0, 1]"
     if episode.solver != "exact":
         yield from _step_problems(episode)
-    elif any(compartment.model is not None for compartment in (*network.nodes, *network.arcs)):
-        yield "solver 'exact' knows no inner physics: a network with models needs solver 'rk4' or 'euler'"
+    elif any(c.model is not None and not hasattr(c.model, "interval") for c in (*network.nodes, *network.arcs)):
+        yield "solver 'exact' knows no continuous inner physics: a network with models needs solver 'rk4' or 'euler'"
+    for compartment in (*network.nodes, *network.arcs):
+        yield from _clock_problems(network, compartment)
     tracked = [c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None]
     for name in objective.tracked:
         if name not in tracked:
@@ -201,6 +254,19 @@ def _setting_problems(network: Network) -> Iterator[str]:
     for name in network.observation.nodes:
         if name not in signals:
             yield f"observation: {unknown('node or inner state', name, signals)}"
+
+
+def _clock_problems(network: Network, compartment: Compartment) -> Iterator[str]:
+    step = getattr(compartment.model, "interval", None)
+    if step is None or compartment.model is None:
+        return
+    interval = network.episode.control_interval * factor(network.time_unit, compartment.model.time_unit)
+    if not math.isclose(interval, step, rel_tol=1e-9):
+        unit = compartment.model.time_unit
+        yield (
+            f"'{compartment.id}': model '{compartment.model.kind}' moves in steps of {step:g} {unit}; "
+            f"the control interval is {interval:g} {unit}"
+        )
 
 
 def _step_problems(episode: Episode) -> Iterator[str]:

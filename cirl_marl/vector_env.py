@@ -6,6 +6,7 @@ Every other view (PettingZoo, Gymnasium, the seats of the learners) stands on th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,8 @@ class VectorEnv:
         reward_mode: one of ``local``, ``circularity``, ``mixed``, ``difference``, ``local_sum``.
         observation_spaces: by agent.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
-        state_names: nodes, then ``compartment.state`` of the inner states, in the order of ``state()``.
+        state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
+            order of ``state()``.
     """
 
     def __init__(
@@ -64,7 +66,7 @@ class VectorEnv:
             scenario: scenario of the definition; None is the default, physical one.
             agents: who acts; the others hold their neutral control. None: the network's own choice.
             reward: reward mode; None takes the scenario's own, which is ``mixed`` unless the definition says otherwise.
-            observe: ``local``, ``neighbours`` or ``full``; None takes the scenario's own.
+            observe: ``local``, ``neighbours``, ``full`` or ``model``; None takes the scenario's own.
             circularity: whether the team reward is λ at the ``end`` of the interval or its ``mean`` over it.
             horizon: decisions per episode; None takes the definition's.
 
@@ -87,16 +89,17 @@ class VectorEnv:
         self.agents = self._actuators.agents
         self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
-        self.scoring = Scoring(found, self.agents, num_envs)
+        self.scoring = Scoring(found, self.layout, self.agents, num_envs)
         self.observation_spaces = self.layout.spaces
         self._starts = Starts(found, self.dynamics, num_envs)
-        self.state_names = self._starts.names
+        self.state_names = (*self._starts.names, *self.dynamics.batches.names)
+        self._batched = slice(len(found.nodes), self.dynamics.unit)
         self._state: State | None = None
         _keep_freed_memory()
 
     @property
     def neutral_action(self) -> dict[str, Floats]:
-        """Normalised action of each agent that leaves it neutral, shape (1,) each."""
+        """Normalised action of each agent that leaves it neutral, shape (entries,) each."""
         return self._actuators.neutral_action
 
     @property
@@ -140,7 +143,7 @@ class VectorEnv:
         """Hold the actions for one control interval.
 
         Args:
-            actions: agent → array of shape (num_envs, 1) in [−1, 1].
+            actions: agent → array of shape (num_envs, entries of its action) in [−1, 1].
 
         Returns:
             Observations, rewards, terminations, truncations and infos, each by agent.
@@ -165,11 +168,11 @@ class VectorEnv:
         )
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
-        """Stack the actions of all agents, shape (agents, B); the checks of ``step`` apply."""
+        """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
         return self._actuators.stack(actions)
 
     def advance(self, actions: Floats) -> Outcome:
-        """Hold stacked actions, shape (agents, B), for one control interval; no copy is restarted.
+        """Hold stacked actions, shape (entries, B), for one control interval; no copy is restarted.
 
         Raises:
             ControlError: for NaN, values outside [−1, 1], or an episode that is over.
@@ -180,36 +183,50 @@ class VectorEnv:
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         controls = self._actuators.controls(actions)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step)
-        quantities, flow = self._measured(transition)
+        quantities, flow = self._measured(transition, controls)
         levels = self.scoring.levels(quantities)
         service = self.scoring.service_level(levels)
         terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
         local = self.scoring.local(terms)
-        circularity = self.network.circularity(transition.flow)
-        mean = self.network.circularity(flow)
+        circularity, mean, batched = self._circularity(state, transition, flow)
         team = circularity if self._team == "end" else mean
         reward = self._reward(team, local, terms, state, controls)
         step = state.step + 1
         self._state = State(
-            transition.stock, transition.inner, flow, step, state.circularity + mean, state.service + service
+            transition.stock, transition.inner, flow, step, batched, state.circularity + mean, state.service + service
         )
         observation = self.layout.observe(quantities, step / horizon, levels)
-        return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon)
+        success = dynamics.inner.successes(transition.inner, controls)
+        return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
+
+    def _circularity(self, state: State, transition: Transition, flow: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return λ at the end of the interval, its mean over the interval, and m_fb, shape (B,) each, mass.
+
+        Batches that leave at the start of the interval count in its mean, those of its end do not.
+        """
+        network = self.network
+        if transition.batched is None:
+            return network.circularity(transition.flow), network.circularity(flow), state.batched
+        during = state.batched + transition.batched[0]
+        after = during + transition.batched[1]
+        return network.circularity(transition.flow, after), network.circularity(flow, during), after
 
     def local_rewards(self) -> dict[str, Floats]:
         """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
         state = self.physical
-        quantities = self._quantities(state)
         neutral = np.repeat(self.dynamics.neutral[:, None], self.num_envs, axis=1)
+        quantities = self._quantities(state)
         inner = self.dynamics.inner.rewards(state.inner, state.inner, neutral)
         rewards = self.scoring.local_of_all(self.scoring.terms(quantities, self.scoring.levels(quantities), inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
 
     def state(self) -> Floats:
-        """Return the whole state, shape (B, nodes + states + 1): stocks, inner states, elapsed share of time."""
+        """Return the whole state, shape (B, entries): ``state_names``, then the elapsed share of time."""
         state = self.physical
         time = state.step / self.network.episode.horizon
-        return np.concatenate([state.stock[:-1], state.inner, time[None]]).T
+        return np.concatenate(
+            [state.stock[: len(self.network.nodes)], state.inner, state.stock[self._batched], time[None]]
+        ).T
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the state and the random streams; environments are not changed."""
@@ -242,9 +259,9 @@ class VectorEnv:
         return f"{self.network.name}, scenario {self.network.scenario_name}"
 
     def infos(self, outcome: Outcome) -> Infos:
-        """Return λ, local reward, flows (B, arcs) and service level for each agent."""
+        """Return λ, local reward, flows (B, arcs) and service level for each agent; success where it is defined."""
         flows = outcome.flow.T
-        return {
+        infos: Infos = {
             agent: {
                 "circularity": outcome.circularity,
                 "local_reward": outcome.local[i],
@@ -253,6 +270,10 @@ class VectorEnv:
             }
             for i, agent in enumerate(self.agents)
         }
+        for agent, success in outcome.success.items():
+            if agent in infos:
+                infos[agent]["success"] = success
+        return infos
 
     def _reward(self, team: Floats, local: Floats, terms: Floats, state: State, controls: Floats) -> Floats:
         objective = self.network.objective
@@ -271,23 +292,25 @@ class VectorEnv:
     def _counterfactuals(self, state: State, controls: Floats) -> Floats:
         """λ had each agent in turn been neutral, re-simulated from the same state, shape (agents, B)."""
         dynamics, batch = self.dynamics, self.num_envs
-        chunk = max(1, COUNTERFACTUAL_CELLS // state.stock.size)
+        chunk = max(1, COUNTERFACTUAL_CELLS // (state.stock.size + state.inner.size))
         results = []
-        for start in range(0, len(self._actuators.acting), chunk):
-            rows = self._actuators.acting[start : start + chunk]
-            count = len(rows)
+        for start in range(0, len(self.agents), chunk):
+            agents = self.agents[start : start + chunk]
+            count = len(agents)
             imagined = np.tile(controls, (1, count))
-            for i, row in enumerate(rows):
-                imagined[row, i * batch : (i + 1) * batch] = dynamics.neutral[row]
+            for i, agent in enumerate(agents):
+                rows = self.network.control_rows[agent]
+                imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows, None]
             transition = dynamics.advance(
                 np.tile(state.stock, (1, count)),
                 np.tile(state.inner, (1, count)),
                 imagined,
                 np.tile(state.step, count),
             )
-            mean = transition.moved / self.network.episode.control_interval
-            flow = transition.flow if self._team == "end" else mean
-            results.append(self.network.circularity(flow).reshape(count, batch))
+            imagined_state = replace(state, batched=np.tile(state.batched, count))
+            flow = transition.moved / self.network.episode.control_interval
+            end, mean, _ = self._circularity(imagined_state, transition, flow)
+            results.append((end if self._team == "end" else mean).reshape(count, batch))
         return np.concatenate(results)
 
     def _report_ends(self, infos: Infos, outcome: Outcome) -> None:
@@ -305,14 +328,15 @@ class VectorEnv:
         """Start the next episode in the copies that ended and return the observation of all."""
         which = np.flatnonzero(ended)
         old = self.physical
-        drawn = np.concatenate([old.stock[:-1], old.inner])
+        drawn = np.concatenate([old.stock[: len(self.network.nodes)], old.inner])
         drawn[:, which] = self._starts.draw(which)
         fresh = self._fresh(drawn)
         self._state = State(
-            fresh.stock,
+            np.where(ended, fresh.stock, old.stock) if len(self.dynamics.batches) else fresh.stock,
             fresh.inner,
             np.where(ended, fresh.flow, old.flow),
             np.where(ended, 0, old.step),
+            np.where(ended, 0.0, old.batched),
             np.where(ended, 0.0, old.circularity),
             np.where(ended, 0.0, old.service),
         )
@@ -326,21 +350,28 @@ class VectorEnv:
         neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
         flow = dynamics.start_flow(stock, inner, neutral)
         zeros = np.zeros(batch)
-        return State(stock, inner, flow, step, zeros, zeros)
+        return State(stock, inner, flow, step, zeros, zeros, zeros)
 
-    def _measured(self, transition: Transition) -> tuple[Floats, Floats]:
-        """Return stocks, mean flows and inner states in one array, and the mean flows, which are read-only."""
-        nodes, arcs = len(self.network.nodes), len(self.network.arcs)
-        quantities = np.empty((nodes + arcs + len(transition.inner), self.num_envs))
-        flow = quantities[nodes : nodes + arcs]
+    def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
+        """Return all quantities in one array, and the mean flows, which are read-only."""
+        signals, dynamics = self.layout.signals, self.dynamics
+        quantities = np.empty((signals.quantities, self.num_envs))
+        flow = quantities[signals.flows]
         np.divide(transition.moved, self.network.episode.control_interval, out=flow)
-        quantities[:nodes] = transition.stock[:-1]
-        quantities[nodes + arcs :] = transition.inner
+        quantities[: signals.nodes] = transition.stock[: signals.nodes]
+        if signals.inside:
+            quantities[signals.states] = transition.inner
+            quantities[signals.measures] = dynamics.inner.measures(transition.inner, controls)
+            quantities[signals.loads] = dynamics.batches.loads(transition.stock)
         flow.flags.writeable = False  # infos hand it out, and the state keeps it
         return quantities, flow
 
     def _quantities(self, state: State) -> Floats:
-        return np.concatenate([state.stock[:-1], state.flow, state.inner])
+        dynamics = self.dynamics
+        neutral = np.repeat(dynamics.neutral[:, None], self.num_envs, axis=1)
+        measures = dynamics.inner.measures(state.inner, neutral)
+        nodes = state.stock[: len(self.network.nodes)]
+        return np.concatenate([nodes, state.flow, state.inner, measures, dynamics.batches.loads(state.stock)])
 
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from cirl_marl.elements import Arc, Compartment, Control, ControlKind, Law, Node
+from cirl_marl.elements import Arc, Compartment, Control, ControlKind, Law, Node, ranged_states
 from cirl_marl.network import Network
 
 SOURCE = "network built in Python"
@@ -38,15 +38,17 @@ def _lines(network: Network) -> Iterator[str]:
     yield f"circularity_scale = {_quantity(objective.circularity_scale, mass)}"
     yield f"circularity_weight = {_quantity(objective.circularity_weight, '1')}"
     yield f"tracked = {_list(objective.tracked)}"
+    if objective.criticality is not None:
+        yield f"criticality = {_quantity(objective.criticality, '1')}"
     yield f"[observation]\nmode = {_text(network.observation.mode)}\nnodes = {_list(network.observation.nodes)}"
     for node in network.nodes:
         yield from _node(network, node)
     for arc in network.arcs:
         yield from _arc(network, arc)
     for service in network.services:
-        unit = mass if service.quantity == "stock" else _flow(network)
+        unit = {"stock": mass, "measure": "1"}.get(service.quantity, _flow(network))
         yield f"[services.{service.id}]\nprovider = {_text(service.provider)}\nquantity = {_text(service.quantity)}"
-        yield f"owed_by = {_list(service.owed_by)}"
+        yield f"owed_by = {_list(service.owed_by)}\nmeasure = {_text(service.measure)}"
         yield f"low = {_quantity(service.low, unit)}\nweight = {_quantity(service.weight, '1')}"
         if math.isfinite(service.high):
             yield f"high = {_quantity(service.high, unit)}"
@@ -66,6 +68,8 @@ def _arc(network: Network, arc: Arc) -> Iterator[str]:
     yield f"pollutant = {json.dumps(arc.pollutant)}"
     if arc.law is Law.COMPARTMENT:
         yield f"by = {_text(arc.by)}\nrate = {_quantity(arc.rate, _flow(network))}"
+    elif arc.law is Law.BATCH:
+        yield from _batch(network, arc)
     elif arc.law in (Law.DONOR, Law.RECIPIENT):
         yield f"rate = {_quantity(arc.rate, f'1/({network.time_unit})')}"
     elif arc.law is Law.EXOGENOUS and not arc.times:
@@ -76,7 +80,20 @@ def _arc(network: Network, arc: Arc) -> Iterator[str]:
             f"series = {{ times = {times!r}, time_unit = {_text(network.time_unit)}, values = {values!r}, "
             f"unit = {_text(flow)}, source = {_text(SOURCE)} }}"
         )
-    yield from _common(network, arc, flow)
+    yield from _common(network, arc, network.mass_unit if arc.law is Law.BATCH else flow)
+
+
+def _batch(network: Network, arc: Arc) -> Iterator[str]:
+    if arc.by:
+        yield f"by = {_text(arc.by)}\nport = {_text(arc.port)}\nrate = {_quantity(arc.rate, network.mass_unit)}"
+    else:
+        times, masses = [float(time) for time, _ in arc.batches], [float(mass) for _, mass in arc.batches]
+        yield (
+            f"batches = {{ times = {times!r}, time_unit = {_text(network.time_unit)}, masses = {masses!r}, "
+            f"unit = {_text(network.mass_unit)}, source = {_text(SOURCE)} }}"
+        )
+    if arc.delay:
+        yield f"delay = {_quantity(arc.delay, network.time_unit)}"
 
 
 def _common(network: Network, compartment: Compartment, unit: str) -> Iterator[str]:
@@ -104,11 +121,12 @@ def _model(compartment: Compartment) -> str:
     parameters = ", ".join(f"{name} = {float(value)!r}" for name, value in values.items())
     initial = ", ".join(
         f"{name} = {{ low = {float(low)!r}, high = {float(high)!r}, source = {_text(SOURCE)} }}"
-        for name, (low, high) in zip(model.state_names, compartment.inner, strict=True)
+        for name, (low, high) in zip(ranged_states(model), compartment.inner, strict=True)
     )
+    scale = _quantity(compartment.reward_scale, "1")
     return (
         f"{{ kind = {_text(model.kind)}, {form}parameters = {{ {parameters} }}, source = {_text(SOURCE)}, "
-        f"initial = {{ {initial} }} }}"
+        f"initial = {{ {initial} }}, reward_scale = {scale} }}"
     )
 
 

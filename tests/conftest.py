@@ -33,25 +33,26 @@ settings.register_profile("thorough", settings.get_profile("cirl_marl"), max_exa
 settings.load_profile("cirl_marl")
 
 ROLES = list(Role)
-LAWS = list(Law)
+LAWS = [law for law in Law if law is not Law.COMPARTMENT]
 
 
 def random_network(seed: int, nodes: int, arcs: int) -> Network:
     """Return a network with every law, role and kind of control, drawn from ``seed``."""
     rng = np.random.default_rng(seed)
     ends = [rng.choice(nodes, 2, replace=False) for _ in range(arcs if nodes > 1 else 0)]
-    laws = [LAWS[rng.integers(4)] for _ in ends]
+    laws = [LAWS[rng.integers(len(LAWS))] for _ in ends]
+    interval = float(rng.uniform(0.05, 3))
     orders = np.bincount([i for (i, _), law in zip(ends, laws, strict=True) if law is Law.CONTROLLED], minlength=nodes)
     sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) for i in range(nodes)]
     return Network(
         name="random",
         nodes=tuple(_node(rng, i, sets_flow[i]) for i in range(nodes)),
         arcs=tuple(
-            _arc(rng, k, int(i), int(j), law, sets_flow[int(i)])
+            _arc(rng, k, int(i), int(j), law, sets_flow[int(i)], interval)
             for k, ((i, j), law) in enumerate(zip(ends, laws, strict=True))
         ),
         services=tuple(_services(rng, nodes, len(ends))),
-        episode=Episode(control_interval=float(rng.uniform(0.05, 3)), horizon=int(rng.integers(1, 5))),
+        episode=Episode(control_interval=interval, horizon=int(rng.integers(1, 5))),
         objective=Objective(
             reference_interval=float(rng.uniform(0.1, 3)),
             net_zero=str(rng.choice(["signed", "abs"])),
@@ -80,17 +81,29 @@ def _node(rng: np.random.Generator, i: int, sets_flow: bool) -> Node:
     )
 
 
-def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_flow: bool) -> Arc:
+def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_flow: bool, interval: float) -> Arc:
     control = None
+    if law is Law.BATCH:
+        times, masses = rng.integers(0, 5, 3) * interval, rng.uniform(0, 200, 3)
+        return Arc(
+            id=f"arc_{k}",
+            donor=f"node_{i}",
+            recipient=f"node_{j}",
+            law=law,
+            batches=tuple(zip(times.tolist(), masses.tolist(), strict=True)),
+            delay=float(rng.integers(1, 4)) * interval,
+            scale=float(rng.uniform(1, 100)),
+            pollutant=bool(rng.integers(2)),
+        )
     if law is Law.CONTROLLED and not donor_sets_flow:
         control = _control(rng, ControlKind.FLOW)
     elif law is not Law.CONTROLLED and rng.random() < 0.4:
         control = _control(rng, ControlKind.RATE)
-    flow, times = [0.0], []
+    flow, starts = [0.0], []
     if law is Law.EXOGENOUS:
         steps = int(rng.integers(1, 5))
         flow = (rng.integers(0, 2, steps) * rng.uniform(0, 200, steps)).tolist()
-        times = [0.0, *np.cumsum(rng.uniform(0.01, 2, steps - 1)).tolist()] if rng.integers(2) or steps > 1 else []
+        starts = [0.0, *np.cumsum(rng.uniform(0.01, 2, steps - 1)).tolist()] if rng.integers(2) or steps > 1 else []
     return Arc(
         id=f"arc_{k}",
         donor=f"node_{i}",
@@ -98,7 +111,7 @@ def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_
         law=law,
         rate=float(10 ** rng.uniform(-2, 0.7)),
         flow=tuple(flow),
-        times=tuple(times),
+        times=tuple(starts),
         set_point=float(rng.uniform(0, 100)) if rng.random() < 0.3 else None,
         scale=float(rng.uniform(1, 100)),
         pollutant=bool(rng.integers(2)),

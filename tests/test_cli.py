@@ -113,6 +113,10 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
         (["simulate", "copper_net", "--control", "constant", "--set", "mien=0"], "Did you mean 'mine'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mine=nan"], "must lie in [-1, 1]"),
         (["simulate", "copper_net", "--set", "mine=0"], "goes with --control constant"),
+        (["paper", "CoperNet"], "unknown environment of the paper 'CoperNet'. Did you mean 'CopperNet'?"),
+        (["paper", "CopperNet", "A2"], "unknown algorithm of the paper 'A2'. Did you mean 'A2C'?"),
+        (["paper", "CopperNet", "SAC-HER"], "did not run SAC-HER on CopperNet; it ran A2C, ARS, DDPG, PPO, SAC"),
+        (["paper", "CopperNet", "--recipe", "tund"], "unknown recipe 'tund'. Did you mean 'tuned'?"),
     ],
 )
 def test_bad_input_ends_with_code_2(

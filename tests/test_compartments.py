@@ -32,7 +32,7 @@ from cirl_marl.network import Floats
 from cirl_marl.units import factor
 
 REFERENCE = Path(__file__).parent / "reference"
-HELPERS = {"model", "light"}
+HELPERS = {"model", "light", "nutrient"}
 """Modules of the package that hold no model."""
 
 PAPER: dict[str, tuple[CompartmentModel, PaperScenario, tuple[int, ...]]] = {

@@ -18,12 +18,14 @@ LAYERS = (
         "rowsum",
         "validate",
         "network",
+        "staged",
     },
     {"compartments"},
     {"schema", "mistakes", "conversion", "definition", "writing", "catalogue"},
-    {"flows", "inner", "simulate", "actuators", "starts", "state", "observe", "reward", "vector_env"},
-    {"parallel_env", "single_env", "registration"},
+    {"batches", "flows", "inner", "simulate", "actuators", "starts", "state", "observe", "reward", "vector_env"},
+    {"parallel_env", "single_env", "goal_env", "registration"},
     {"controllers", "learners", "evaluate", "report", "nested", "testing"},
+    {"paper"},
     {"cli"},
 )
 """From the network to the command line; a module imports from its own layer or earlier ones."""

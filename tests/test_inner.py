@@ -186,7 +186,7 @@ def test_definition_with_a_model_reads_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"episode": Episode(solver="exact")}, "solver 'exact' knows no inner physics"),
+        ({"episode": Episode(solver="exact")}, "solver 'exact' knows no continuous inner physics"),
         ({"episode": Episode(solver="rk4")}, "solver 'rk4' needs a positive solver_step"),
         ({"episode": Episode(solver="rk4", solver_step=0.3)}, "not a whole number of solver steps"),
     ],
@@ -203,7 +203,7 @@ def test_faults_of_models_are_named() -> None:
     digester, air = network.nodes
     with pytest.raises(NetworkError, match="5 initial ranges for the inner states"):
         replace(network, nodes=(replace(digester, inner=digester.inner[1:]), air))
-    with pytest.raises(NetworkError, match=r"control\.kind 'input' needs a model with one input"):
+    with pytest.raises(NetworkError, match=r"control\.kind 'input' needs a model with inputs"):
         replace(network, nodes=(digester, replace(air, control=digester.control)))
     with pytest.raises(NetworkError, match=r"unknown compartment at this arc .* 'ar'"):
         replace(network, arcs=(replace(network.arcs[0], by="ar"),))

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cirl_marl import Network, SingleAgentEnv, VectorEnv, load_network, networks, parallel_env
+from cirl_marl import Law, Network, SingleAgentEnv, VectorEnv, load_network, networks, parallel_env
 from cirl_marl.elements import REWARDS
 from cirl_marl.testing import check_parallel_env, check_vector_env
 
@@ -28,8 +28,8 @@ random_networks = given(network=st.from_type(Network), seed=st.integers(0, 2**31
 
 def draw(env: VectorEnv, rng: np.random.Generator) -> Actions:
     """Draw actions, a third of them at the bounds."""
-    shape = (env.num_envs, 1)
-    drawn = {agent: np.clip(rng.uniform(-1.5, 1.5, shape), -1, 1) for agent in env.agents}
+    shapes = {agent: (env.num_envs, *env.action_spaces[agent].shape) for agent in env.agents}
+    drawn = {agent: np.clip(rng.uniform(-1.5, 1.5, shape), -1, 1) for agent, shape in shapes.items()}
     return {agent: action.astype(np.float32) for agent, action in drawn.items()}
 
 
@@ -129,7 +129,7 @@ def test_single_equals_parallel(name: str, scenario: str) -> None:
     np.testing.assert_array_equal(one.reset(seed=4)[0], many.reset(4)[0][agent])
     rng = np.random.default_rng(0)
     for _ in range(6):
-        action = rng.uniform(-1, 1, 1).astype(np.float32)
+        action = rng.uniform(-1, 1, one.action_space.shape).astype(np.float32)
         observation, reward, terminated, truncated, info = one.step(action)
         observations, rewards, terminations, truncations, infos = many.step({agent: action})
         np.testing.assert_array_equal(observation, observations[agent])
@@ -152,17 +152,24 @@ def test_wider_observations_conform(network: Network, seed: int, mode: str) -> N
 
 
 def assert_window_circularity(network: Network, seed: int) -> None:
-    """λ̄ = −Δ·(finite-time sustainable mass moved)/T."""
+    """λ̄ = −(Δ·(finite-time sustainable mass that flowed)/T + mean of m_fb)."""
     env = VectorEnv(network, num_envs=3)
     interval, horizon = network.episode.control_interval, network.episode.horizon
     infos: dict[str, dict[str, Any]] = {}
     moved = np.zeros((len(network.arcs), 3))
-    for actions in episode(env, seed):
+    batched = np.zeros(3)
+    continuous = np.array([arc.law is not Law.BATCH for arc in network.arcs], dtype=bool)
+    for step, actions in enumerate(episode(env, seed)):
+        held = env.physical.stock.copy()
+        sent = env.dynamics.batches.dispatch(held, env.physical.step)
+        batched += env.physical.batched + sent
+        assert step > 0 or not env.physical.batched.any()
         infos = env.step(actions)[4]
         moved += infos[env.agents[0]]["flows"].T * interval
-    lost = network.sustainability @ moved
-    expected = -network.objective.reference_interval * lost / (interval * horizon)
+    lost = network.sustainability[continuous] @ moved[continuous]
+    expected = -network.objective.reference_interval * lost / (interval * horizon) - batched / horizon
     tolerance = 1e-12 * (1 + network.objective.reference_interval * moved.sum(axis=0) / (interval * horizon))
+    tolerance = tolerance + 1e-12 * np.abs(batched)
     for agent in env.agents:
         assert (np.abs(infos[agent]["episode_circularity"] - expected) <= tolerance).all()
 

@@ -5,21 +5,24 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from functools import cache
+from typing import Any
 
 from cirl_marl.compartments.model import CompartmentModel, PaperScenario, RewardState
 from cirl_marl.errors import CirlError, unknown
 
 __all__ = ["CompartmentModel", "PaperScenario", "RewardState", "model_class", "models"]
 
+ROBOTS = f"{__name__}.robots"
+
 
 @cache
-def _found() -> dict[str, type[CompartmentModel]]:
-    """Import every module of this package (not its subpackages, which may be heavy) and collect its models."""
-    found: dict[str, type[CompartmentModel]] = {}
-    for module_info in pkgutil.iter_modules(__path__):
+def _found(package: str) -> dict[str, type[Any]]:
+    """Import every module of a package, but not its subpackages, which may be heavy, and collect its models."""
+    found: dict[str, type[Any]] = {}
+    for module_info in pkgutil.iter_modules(importlib.import_module(package).__path__):
         if module_info.ispkg:
             continue
-        module = importlib.import_module(f"{__name__}.{module_info.name}")
+        module = importlib.import_module(f"{package}.{module_info.name}")
         for member in vars(module).values():
             if not isinstance(member, type) or member.__module__ != module.__name__:
                 continue
@@ -29,20 +32,20 @@ def _found() -> dict[str, type[CompartmentModel]]:
             if kind in found:
                 raise CirlError(f"{module.__name__}: kind '{kind}' is taken by {found[kind].__module__}.")
             found[kind] = member
-    return dict(sorted(found.items()))
+    return found
 
 
-def models() -> dict[str, type[CompartmentModel]]:
-    """Return every compartment model by its kind.
+def models() -> dict[str, type[Any]]:
+    """Return every compartment model by its kind; robots import MuJoCo.
 
     >>> "transport_truck" in models()
     True
     """
-    return dict(_found())
+    return dict(sorted((_found(__name__) | _found(ROBOTS)).items()))
 
 
-def model_class(kind: str) -> type[CompartmentModel]:
-    """Return the model of that kind.
+def model_class(kind: str) -> type[Any]:
+    """Return the model of that kind; MuJoCo is imported only for a kind that is not among the others.
 
     Raises:
         CirlError: if there is none; the message names the nearest match.
@@ -50,7 +53,10 @@ def model_class(kind: str) -> type[CompartmentModel]:
     >>> model_class("digester").time_unit
     'day'
     """
+    light = _found(__name__)
+    if kind in light:
+        return light[kind]
     try:
-        return _found()[kind]
+        return _found(ROBOTS)[kind]
     except KeyError:
-        raise CirlError(unknown("compartment kind", kind, _found())) from None
+        raise CirlError(unknown("compartment kind", kind, models())) from None

@@ -62,6 +62,7 @@ class Digester:
         "inorganic_carbon_mmol_l",
     )
     input_names: ClassVar[tuple[str, ...]] = ("dilution_per_day",)
+    measure_names: ClassVar[tuple[str, ...]] = ("methane_mmol_l_day",)
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
@@ -151,6 +152,10 @@ class Digester:
     def methane(self, state: Floats) -> Floats:
         """Return k6μ2X2, CH₄ produced, mmol/(L d), shape (B,): the service of a digester."""
         return self.k6 * self.growth(state)[1]
+
+    def measures(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the methane produced, shape (1, B)."""
+        return self.methane(state)[None]
 
     def outflow(self, state: Floats, inputs: Floats) -> Floats:
         """Return ṁ12 = f_r·qC, CO₂ emitted per litre, mmol/(L d), shape (B,)."""

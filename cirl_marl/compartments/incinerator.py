@@ -236,6 +236,18 @@ class Incinerator:
         cost: Floats = (self.target_degc - state[5]) ** 2
         return -cost
 
+    def receive(self, state: Floats, mass_kg: Floats) -> Floats:
+        """Return the state after ``mass_kg``, shape (B,), was tipped onto the wastebed at ambient temperature.
+
+        Bed and grate keep their heat: (c_w M + c_c M_c + C_grate)(T_w − T_a) is the same before and after.
+        """
+        before, _ = self.capacities(state)
+        after = state.copy()
+        after[0] = state[0] + mass_kg
+        share = before / self.capacities(after)[0]
+        after[2] = self.ambient_degc + share * (state[2] - self.ambient_degc)
+        return after
+
     def outflow(self, state: Floats, inputs: Floats) -> Floats:
         """Return the flue gas that leaves the freeboard, kg/min, shape (B,)."""
         flue: Floats = np.zeros_like(state[0]) + self.flows(state).flue

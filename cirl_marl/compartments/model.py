@@ -20,32 +20,77 @@ RewardState = Literal["before", "after"]
 
 
 class CompartmentModel(Protocol):
-    """Dynamics ż = f(z, u) and reward of one kind of compartment.
+    """What every kind of compartment has; how it moves in time is one of the three protocols below.
 
-    Models that exchange material with the network also have ``outflow(state, inputs)``, shape (B,). Models that depend
-    on the network take what they need through keyword arguments; their docstrings name them.
+    Besides, a model may offer
+
+    - ``outflow(state, inputs)``, shape (B,): the output that drives flows of law ``compartment``;
+    - ``measure_names`` and ``measures(state, inputs)``, shape (measures, B): what services and observers may read;
+    - ``success(state, inputs)``, shape (B,): whether the task is done, reported in the infos of the agent;
+    - ``observed``: names of the states that an agent sees, by default all;
+    - ``context_names``: keyword arguments that ``derivative`` or ``advance`` takes from the network: ``stock_kg``, what
+      the node holds, or ``load_kg``, what the vehicle of an arc carries, shape (B,) each;
+    - ``receive(state, mass_kg)``: the state after a delivery of ``mass_kg``, shape (B,);
+    - ``ports``, ``released(state)``, shape (ports, B), and ``complete(state)``, shape (B,): units released into batch
+      arcs in the last step, and whether that completed a batch;
+    - ``boarding(state)``, ``depart(state, where)``, ``arrived(state)``, ``turn_back(state, where)``: a vehicle, which
+      says where it can load and has arrived, shape (B,), and is told where it leaves, loaded or empty.
 
     Attributes:
         kind: name in the registry.
         state_names: the states, with units, in order.
         input_names: the controls, with units, in order.
-        time_unit: unit of the derivative's time, as pint reads it.
+        time_unit: unit of the model's time, as pint reads it.
         reward_state: whether the reward of a step takes the state ``before`` or ``after`` it; the published
             environments differ in this. The input is that of the step in either case.
     """
 
     kind: ClassVar[str]
-    state_names: ClassVar[tuple[str, ...]]
-    input_names: ClassVar[tuple[str, ...]]
     time_unit: ClassVar[str]
     reward_state: ClassVar[RewardState]
+
+    @property
+    def state_names(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def input_names(self) -> tuple[str, ...]: ...  # noqa: D102
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the reward of a step, shape (B,)."""
+        ...
+
+
+class ContinuousModel(CompartmentModel, Protocol):
+    """ż = f(z, u), integrated by the solver of the network."""
 
     def derivative(self, state: Floats, inputs: Floats) -> Floats:
         """Return dz/dt, shape (k, B)."""
         ...
 
-    def reward(self, state: Floats, inputs: Floats) -> Floats:
-        """Return the reward of a step, shape (B,)."""
+
+class OwnStepModel(CompartmentModel, Protocol):
+    """Continuous in time, with a step of its own, for physics that Runge-Kutta cannot follow."""
+
+    def advance(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
+        """Return the state after ``interval``, shape (k, B), and the mean of its outflow over it, shape (B,)."""
+        ...
+
+
+class DiscreteTimeModel(CompartmentModel, Protocol):
+    """Moves once per control interval, which must be its own.
+
+    Attributes:
+        interval: length of its step in its time unit.
+    """
+
+    @property
+    def interval(self) -> float: ...  # noqa: D102
+
+    def start(self, stream: np.random.Generator) -> Floats:
+        """Draw a start, shape (k,)."""
+        ...
+
+    def advance(self, state: Floats, inputs: Floats, interval: float) -> Floats:
+        """Return the state one step later, shape (k, B)."""
         ...
 
 
@@ -81,6 +126,12 @@ class PaperScenario:
         low, high = (np.array(bound)[:, None] for bound in (self.input_low, self.input_high))
         inputs: Floats = (np.clip(action, -1.0, 1.0) + 1.0) / 2.0 * (high - low) + low
         return inputs
+
+
+def check_step(kind: str, interval: float, own: float) -> None:
+    """Raise a ``CirlError`` unless ``interval`` is the step ``own`` of a model in discrete time."""
+    if not math.isclose(interval, own, rel_tol=1e-9):
+        raise CirlError(f"{kind}: moves in steps of {own:g}, not {interval:g}.")
 
 
 def check_form(form: str, known: tuple[str, ...]) -> None:

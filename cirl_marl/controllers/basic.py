@@ -18,7 +18,7 @@ class Controller(Protocol):
     """Maps the observations of all agents to their actions.
 
     ``start`` is called once before an evaluation; ``act`` takes agent → observations (B, k) and returns agent → actions
-    (B, 1) in [−1, 1].
+    (B, entries of its action) in [−1, 1].
     """
 
     def start(self, env: VectorEnv, seed: int) -> None:
@@ -29,7 +29,7 @@ class Controller(Protocol):
 
 
 class Constant:
-    """Holds fixed normalised actions; agents that are not named stay neutral."""
+    """Holds fixed normalised actions, the same for each entry of an action; agents that are not named stay neutral."""
 
     def __init__(self, actions: Mapping[str, float] | None = None) -> None:
         """Hold ``actions``, agent → value in [−1, 1]."""
@@ -48,7 +48,7 @@ class Constant:
             if not -1.0 <= value <= 1.0:
                 raise ControlError(f"constant control of '{agent}' is {value}; it must lie in [-1, 1]")
         self._actions = {
-            agent: np.full((env.num_envs, 1), self._wanted.get(agent, float(neutral[0])))
+            agent: np.tile(np.full_like(neutral, self._wanted.get(agent, neutral)), (env.num_envs, 1))
             for agent, neutral in env.neutral_action.items()
         }
 
@@ -70,10 +70,10 @@ class Random:
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Seed the draws."""
-        self._agents = env.agents
+        self._entries = {agent: len(neutral) for agent, neutral in env.neutral_action.items()}
         self._random = np.random.default_rng([seed, 1])  # not the numbers that the start states are drawn from
 
     def act(self, observations: Arrays) -> Arrays:
         """Return fresh random actions."""
         batch = len(next(iter(observations.values())))
-        return {agent: self._random.uniform(-1.0, 1.0, (batch, 1)) for agent in self._agents}
+        return {agent: self._random.uniform(-1.0, 1.0, (batch, n)) for agent, n in self._entries.items()}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from cirl_marl.elements import Arc, Compartment, Control, ControlKind, Law
+from cirl_marl.elements import Arc, Compartment, ControlKind, Law
 from cirl_marl.network import Floats, Network
 
 
@@ -35,8 +35,7 @@ def nodes_table(network: Network, stock: Floats) -> Table:
     for node, held in zip(network.nodes, stock, strict=True):
         low, high = node.initial
         span = f"{low:g}" if low == high else f"{low:g} – {high:g}"
-        acting = node.control if node.id in network.agents else None
-        table.add_row(node.id, node.role.value, span, f"{held:.5g}", _target(node), control_text(network, acting))
+        table.add_row(node.id, node.role.value, span, f"{held:.5g}", _target(node), control_text(network, node))
     return table
 
 
@@ -47,8 +46,7 @@ def arcs_table(network: Network, flow: Floats) -> Table:
     signs = {1.0: "−", -1.0: "+", 0.0: ""}
     for k, arc in enumerate(network.arcs):
         sign = signs[float(network.sustainability[k])]
-        acting = arc.control if arc.id in network.agents else None
-        table.add_row(arc.id, law_text(arc), f"{flow[k]:.5g}", sign, _target(arc), control_text(network, acting))
+        table.add_row(arc.id, law_text(arc), f"{flow[k]:.5g}", sign, _target(arc), control_text(network, arc))
     return table
 
 
@@ -70,22 +68,34 @@ def law_text(arc: Arc) -> str:
         return f"{arc.rate:g} x({arc.recipient})"
     if arc.law is Law.CONTROLLED:
         return "u"
+    if arc.law is Law.COMPARTMENT:
+        return f"{arc.rate:g} y({arc.by})"
+    if arc.law is Law.BATCH:
+        what = f"{arc.rate:g} x {arc.port} of {arc.by}" if arc.by else f"{len(arc.batches)} on schedule"
+        return f"batches: {what}, " + (f"after {arc.delay:g}" if arc.delay else "by vehicle")
     return "series" if arc.times else f"{arc.flow[0]:g}"
 
 
-def control_text(network: Network, control: Control | None) -> str:
-    """Say what an agent sets: bounds, with the neutral value between them."""
-    if control is None:
+def control_text(network: Network, compartment: Compartment) -> str:
+    """Say what an agent sets: bounds, with the neutral value between them; empty if the compartment does not act."""
+    control = compartment.control
+    if control is None or compartment.id not in network.agents:
         return ""
+    bounds = f"{control.low:g} | {control.neutral:g} | {control.high:g}"
+    if control.kind is ControlKind.INPUT and compartment.model is not None:
+        return f"{', '.join(compartment.model.input_names)}: {bounds}"
     unit = f" {network.mass_unit}/{network.time_unit}" if control.kind is ControlKind.FLOW else ""
-    return f"{control.kind.value} {control.low:g} | {control.neutral:g} | {control.high:g}{unit}"
+    return f"{control.kind.value} {bounds}{unit}"
 
 
 def evaluation_table(figures: Mapping[str, Any]) -> Table:
     """One row a controller: λ̄, gain, service level with confidence intervals; returns as means over the agents."""
     title = f"{figures['episodes']} fresh episodes, mean ± half-width of the 95 % confidence interval"
     table = Table(title=title)
-    columns = ("controller", f"λ̄ ({figures['unit']})", "gain over neutral", "service level", "return", "local return")
+    columns = ["controller", f"λ̄ ({figures['unit']})", "gain over neutral", "service level", "return", "local return"]
+    weighted = all("time_window_circularity" in row for row in figures["controllers"].values())
+    if weighted:
+        columns.append(f"weighted, time window ({figures['unit']})")
     for column in columns:
         table.add_column(column, justify="left" if column == "controller" else "right")
     for name, row in figures["controllers"].items():
@@ -100,6 +110,7 @@ def evaluation_table(figures: Mapping[str, Any]) -> Table:
             _figure(row["service_level"], "{:.4f}"),
             f"{mean['return']:.4g}",
             f"{mean['local_return']:.4g}",
+            *([_figure(row["time_window_circularity"], "{:.4g}")] if weighted else []),
         )
     return table
 

@@ -1,0 +1,216 @@
+"""The paper's tables: every algorithm on every environment with the paper's settings, our tuned recipes beside them.
+
+``python benchmarks/paper.py --out runs/paper`` runs row after row, each in a process of its own, and can be stopped and
+started again: finished rows are kept. ``--table`` only writes the tables, ``--speed`` compares training times.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+import traceback
+from collections import deque
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from cirl_marl.errors import CirlError
+from cirl_marl.paper.plan import planned, study
+from cirl_marl.paper.published import environment_of
+from cirl_marl.paper.results import Results, Row
+from cirl_marl.paper.session import live_bar
+from cirl_marl.paper.table import markdown, result_line
+
+console = Console(width=None if sys.stdout.isatty() else 140)
+processes = get_context("spawn")
+PHASES = ("waiting", "training", "evaluating")
+DOCUMENT = Path(__file__).parent.parent / "docs" / "paper_tables.md"
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="Where results are kept.")] = Path("runs/paper"),
+    only: Annotated[list[str] | None, typer.Option(help="ENV or ENV:ALGORITHM; repeatable. Default: all.")] = None,
+    recipe: Annotated[str | None, typer.Option(help="published or tuned; default: both.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each row; default: the paper's.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Seeds of each row; default: 3, of slow learners 1.")] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Evaluation episodes that count successes.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Rows at a time.")] = 1,
+    table: Annotated[bool, typer.Option("--table", help="Run nothing, only write the tables.")] = False,
+    speed: Annotated[bool, typer.Option("--speed", help="Only compare training times on CopperNet.")] = False,
+    write: Annotated[
+        Path | None, typer.Option(help="The tables; default: docs/paper_tables.md, with --only or --steps in OUT.")
+    ] = None,
+) -> None:
+    """Run what is missing, then write the tables."""
+    signal.signal(signal.SIGTERM, _stop)
+    results = Results(out)
+    if speed:
+        _compare_speed(steps or 200_000)
+        return
+    if not table:
+        if only:
+            choices = [_names(name) for name in only]
+            rows = [row for names in choices for row in planned(*names, steps=steps, seeds=seeds or 1, recipe=recipe)]
+        else:
+            rows = study(steps=steps, seeds=seeds, recipe=recipe)
+        try:
+            Study(results, rows, jobs, episodes).run()
+        except KeyboardInterrupt:
+            message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
+            console.print(message, soft_wrap=True, highlight=False)
+            raise typer.Exit(130) from None
+    path = write or (out / DOCUMENT.name if only or steps else DOCUMENT)
+    path.write_text(markdown(results.all()), encoding="utf-8")
+    console.print(f"tables: {path}", soft_wrap=True)
+
+
+@dataclass(slots=True)
+class Job:
+    """A row that runs in a process of its own."""
+
+    row: Row
+    process: BaseProcess
+    state: Any
+    bar: TaskID
+
+
+class Study:
+    """Runs rows in processes, some at a time; a row that fails has a second try after all others."""
+
+    def __init__(self, results: Results, rows: list[Row], jobs: int, episodes: int | None) -> None:
+        """Leave out the rows that are done."""
+        self._results, self._jobs, self._episodes = results, jobs, episodes
+        self._queue = deque(row for row in rows if not results.has(row))
+        self._failed: list[Row] = []
+        self._again = True
+        self._running: list[Job] = []
+        console.print(f"{len(rows)} rows, {len(rows) - len(self._queue)} done, results in {results.path}")
+
+    def run(self) -> None:
+        """Run every row.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C, when the rows that ran are stopped.
+        """
+        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+            finished = 0.0
+            whole = bars.add_task("all rows", total=sum(_minutes(row) for row in self._queue))
+            try:
+                while self._queue or self._running or self._retry():
+                    while self._queue and len(self._running) < self._jobs:
+                        self._start(self._queue.popleft(), bars)
+                    time.sleep(0.2)
+                    underway = 0.0
+                    for job in list(self._running):
+                        phase, done, total = job.state
+                        bars.update(job.bar, description=f"{job.row}: {PHASES[phase]}", completed=done, total=total)
+                        if job.process.exitcode is not None:
+                            self._finish(job, bars)
+                            finished += _minutes(job.row)
+                        elif PHASES[phase] == "training":
+                            underway += _minutes(job.row) * done / total
+                    bars.update(whole, completed=finished + underway)
+            finally:
+                for job in self._running:
+                    job.process.terminate()
+                    job.process.join()
+
+    def _start(self, row: Row, bars: Progress) -> None:
+        log = self._results.log(row)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        state = processes.Array("q", [0, 0, 1], lock=False)
+        arguments = (row, str(self._results.path), self._episodes, state)
+        process = processes.Process(target=work, args=arguments, daemon=True)
+        process.start()
+        self._running.append(Job(row, process, state, bars.add_task(str(row), total=1)))
+
+    def _finish(self, job: Job, bars: Progress) -> None:
+        job.process.join()
+        self._running.remove(job)
+        bars.remove_task(job.bar)
+        if self._results.has(job.row):
+            console.print(result_line(self._results.read(job.row)), soft_wrap=True, highlight=False)
+            return
+        self._failed.append(job.row)
+        lines = self._results.log(job.row).read_text().splitlines() or ["no message"]
+        console.print(f"{job.row}: failed: {lines[-1]}", soft_wrap=True, markup=False)
+
+    def _retry(self) -> bool:
+        again = self._again and bool(self._failed)
+        if again:
+            console.print(f"once more: {len(self._failed)} rows that failed")
+            self._queue.extend(self._failed)
+            self._failed, self._again = [], False
+        return again
+
+
+def work(row: Row, folder: str, episodes: int | None, state: Any) -> None:
+    """Run one row in this process; what it says goes into its log."""
+    parent = os.getppid()
+    os.nice(10)
+    results = Results(folder)
+    log = results.log(row).open("w", buffering=1)
+    os.dup2(log.fileno(), 1)
+    os.dup2(log.fileno(), 2)
+    said = time.perf_counter()
+
+    def report(what: str, done: int, total: int) -> None:
+        nonlocal said
+        state[0], state[1], state[2] = PHASES.index(what), done, total
+        if time.perf_counter() - said > 30:
+            said = time.perf_counter()
+            log.write(f"{what}: {done:,} of {total:,}\n")
+            if os.getppid() != parent:
+                raise KeyboardInterrupt("the study that started this row is gone")
+
+    try:
+        from cirl_marl.paper.training import run_row
+
+        results.write(run_row(row, report=report, success_episodes=episodes))
+        log.write("done\n")
+    except BaseException:
+        log.write(traceback.format_exc())
+        raise SystemExit(1) from None
+
+
+def _minutes(row: Row) -> float:
+    """Guess how long a row takes, relative to others: as long as it took the authors."""
+    environment = environment_of(row.environment)
+    published = environment.runs.get(row.algorithm)
+    minutes = 2.0 if row.recipe == "tuned" else (published.minutes if published else None) or 40.0
+    return minutes * row.steps / environment.steps
+
+
+def _names(text: str) -> tuple[str, str | None]:
+    environment, _, algorithm = text.partition(":")
+    return environment, algorithm or None
+
+
+def _stop(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _compare_speed(steps: int) -> None:
+    from cirl_marl.paper.speed import compare, speed_table
+
+    with live_bar(console, "CopperNet") as report:
+        found = compare(steps, report)
+    console.print(speed_table(found))
+
+
+if __name__ == "__main__":
+    try:
+        typer.run(main)
+    except CirlError as error:
+        console.print(f"error: {error}", markup=False, soft_wrap=True)
+        sys.exit(2)

@@ -1,0 +1,203 @@
+"""Material that moves in whole batches: collected at the donor, in transit for a while, delivered at once.
+
+Batch arcs are compartments that hold mass, so they have rows of their own in the stocks, between the nodes and the unit
+row. An arc with a ``delay`` of n control intervals is a line of n slots, one per interval; an arc with a vehicle holds
+what is aboard until the vehicle's model says that it has arrived. Batches leave on schedule, at the start of an
+interval, or when the model of the compartment ``by`` has completed one, at its end::
+
+    collecting --complete--> packed --vehicle at the donor--> aboard --arrived--> recipient
+    collecting --complete--> slots, n intervals --> recipient
+
+Mass is only ever taken from one row and added to another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cirl_marl.elements import Arc, Law, Role
+from cirl_marl.network import Floats, Integers, Network
+
+if TYPE_CHECKING:
+    from cirl_marl.inner import InnerPhysics
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One batch arc and its rows.
+
+    Attributes:
+        id: the arc.
+        by: compartment whose model releases batches; empty for a schedule.
+        port: what it releases into this arc.
+        unit: mass per unit released.
+        donor: row of the node that gives.
+        recipient: row of the node that receives.
+        collecting: row of the batch that is being put together.
+        packed: row of complete batches that wait for the vehicle; None without a vehicle.
+        first: first row of the slots, or the row of what is aboard.
+        slots: number of slots; 0 with a vehicle.
+        leaves: weight with which mass that leaves the donor counts in m_fb.
+        arrives: weight with which mass that reaches the recipient counts in m_fb.
+    """
+
+    id: str
+    by: str
+    port: str
+    unit: float
+    donor: int
+    recipient: int
+    collecting: int
+    packed: int | None
+    first: int
+    slots: int
+    leaves: float
+    arrives: float
+
+    @property
+    def rows(self) -> range:
+        """All rows of the arc."""
+        return range(self.collecting, self.first + max(self.slots, 1))
+
+
+class Batches:
+    """The batch arcs of a network, compiled.
+
+    Attributes:
+        names: what each row holds.
+        held: rows of each batch arc, by its id.
+        aboard: row of what the vehicle of an arc carries, by the arc's id.
+        arcs: position of each batch arc among the arcs.
+        lines: the batch arcs.
+    """
+
+    def __init__(self, network: Network) -> None:
+        """Lay out the rows after those of the nodes."""
+        self._network = network
+        self.arcs = [k for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH]
+        self.names: tuple[str, ...] = ()
+        self.lines: list[Line] = []
+        for k in self.arcs:
+            self._add(k)
+        self.held = {line.id: line.rows for line in self.lines}
+        self.aboard = {line.id: line.first for line in self.lines if not line.slots}
+        self._schedule = [_schedule(network.arcs[k], network) for k in self.arcs]
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.names)
+
+    def _add(self, k: int) -> None:
+        network, arc = self._network, self._network.arcs[k]
+        start = len(network.nodes) + len(self.names)
+        slots = round(arc.delay / network.episode.control_interval)
+        tail = [f"slot_{i}" for i in range(slots)] if slots else ["packed", "aboard"]
+        self.names += tuple(f"{arc.id}.{name}" for name in ("collecting", *tail))
+        sign = float(network.sustainability[k])
+        donor = network.nodes[network.node_index[arc.donor]]
+        early = donor.role in (Role.NONRENEWABLE_RESERVOIR, Role.ENVIRONMENT)
+        self.lines.append(
+            Line(
+                id=arc.id,
+                by=arc.by,
+                port=arc.port,
+                unit=arc.rate,
+                donor=network.node_index[arc.donor],
+                recipient=network.node_index[arc.recipient],
+                collecting=start,
+                packed=None if slots else start + 1,
+                first=start + (1 if slots else 2),
+                slots=slots,
+                leaves=sign if early else 0.0,
+                arrives=0.0 if early else sign,
+            )
+        )
+
+    def dispatch(self, stock: Floats, step: Integers) -> Floats:
+        """Send off, in place, what is scheduled for the start of the interval; return its m_fb, shape (B,).
+
+        A donor that holds less than a scheduled batch sends what it has.
+        """
+        counted = np.zeros(stock.shape[1])
+        copies = np.arange(stock.shape[1])
+        for line, schedule in zip(self.lines, self._schedule, strict=True):
+            if schedule is None:
+                continue
+            mass = np.minimum(schedule[step], stock[line.donor])
+            stock[line.donor] -= mass
+            # the slot that is read at the end of the last interval of the delay
+            stock[line.first + (step - 1) % line.slots, copies] += mass
+            counted += line.leaves * mass
+        return counted
+
+    def settle(self, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> tuple[Floats, Floats]:
+        """Deliver, release and send off, in place, what is due at the end of the interval.
+
+        Args:
+            stock: all masses and the unit row, shape (rows, B).
+            inner: inner states, shape (states, B); vehicles turn, plants receive.
+            step: index of the interval in each copy, shape (B,).
+            physics: the models that release batches, drive vehicles and receive deliveries.
+
+        Returns:
+            Mass delivered by each batch arc, shape (batch arcs, B), and m_fb of the interval's end, shape (B,).
+        """
+        counted = np.zeros(stock.shape[1])
+        delivered = np.empty((len(self.lines), stock.shape[1]))
+        copies = np.arange(stock.shape[1])
+        for i, line in enumerate(self.lines):
+            if line.slots:
+                slot = line.first + step % line.slots
+                delivered[i] = stock[slot, copies]
+                stock[slot, copies] = 0.0
+            else:
+                delivered[i] = np.where(physics.arrive(line.id, inner), stock[line.first], 0.0)
+                stock[line.first] -= delivered[i]
+            stock[line.recipient] += delivered[i]
+            counted += line.arrives * delivered[i]
+            physics.receive(line.recipient, inner, delivered[i])
+        for line in self.lines:
+            if line.by:
+                counted += line.leaves * self._collect(line, stock, physics.released(line.by, line.port, inner))
+                self._send(line, stock, inner, step, physics)
+        return delivered, counted
+
+    def _collect(self, line: Line, stock: Floats, released: Floats) -> Floats:
+        """Move what the model of ``by`` released in this interval out of the donor."""
+        mass: Floats = np.minimum(line.unit * released, stock[line.donor])
+        stock[line.donor] -= mass
+        stock[line.collecting] += mass
+        return mass
+
+    def _send(self, line: Line, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> None:
+        """Send complete batches on their way."""
+        complete = np.where(physics.complete(line.by, inner), stock[line.collecting], 0.0)
+        stock[line.collecting] -= complete
+        if line.packed is None:
+            stock[line.first + step % line.slots, np.arange(stock.shape[1])] += complete
+            return
+        stock[line.packed] += complete
+        load = np.where(physics.board(line.id, inner, stock[line.packed] > 0.0), stock[line.packed], 0.0)
+        stock[line.packed] -= load
+        stock[line.first] += load
+
+    def loads(self, stock: Floats) -> Floats:
+        """Return the mass that each batch arc holds, shape (batch arcs, B)."""
+        if not self.lines:
+            return np.empty((0, stock.shape[1]))
+        return np.stack([stock[line.rows.start : line.rows.stop].sum(axis=0) for line in self.lines])
+
+
+def _schedule(arc: Arc, network: Network) -> Floats | None:
+    """Mass that leaves at the start of each control interval, shape (horizon,); None without a schedule."""
+    if arc.by:
+        return None
+    masses = np.zeros(network.episode.horizon)
+    for time, mass in arc.batches:
+        step = round(time / network.episode.control_interval)
+        if step < len(masses):
+            masses[step] += mass
+    return masses

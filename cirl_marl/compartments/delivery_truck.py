@@ -1,0 +1,86 @@
+"""The truck as a vehicle of the network: out with a load, back empty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.compartments.model import RewardState, check_positive
+from cirl_marl.compartments.transport_truck import TransportTruck
+from cirl_marl.rowsum import Floats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeliveryTruck(TransportTruck):
+    """The point mass of ``TransportTruck`` with the load that the network gives it, on a road of ``target_m``.
+
+    m v̇ = F − resistances with m = truck + load; the third state is where the truck is heading: ``target_m`` with a
+    load, 0 on the way back and while it waits. It loads and unloads where it is within ``reach_m`` of the place and
+    slower than ``rest_m_s``. Reward: −((destination − x)² + 0.1 v² + weight·F²), after the step.
+
+    Source: the paper's truck and reward (arXiv 2505.21536); the trips are ours, the paper has one trip that never ends.
+
+    Attributes:
+        load_kg: no effect here, the network knows the load.
+        target_m: length of the road. [chosen: scaled to the robot's clock; the paper's is 1000 m]
+        force_weight: weight of F² in the reward, m²/N². [chosen: 10 kN for a second weigh as much as 10 m]
+        reach_m: distance at which the truck is there. [chosen]
+        rest_m_s: speed below which it can be loaded. [chosen]
+    """
+
+    kind: ClassVar[str] = "delivery_truck"
+    state_names: ClassVar[tuple[str, ...]] = ("position_m", "speed_m_s", "destination_m")
+    reward_state: ClassVar[RewardState] = "after"
+    context_names: ClassVar[tuple[str, ...]] = ("load_kg",)
+
+    load_kg: float = 0.0
+    target_m: float = 10.0
+    force_weight: float = 1e-8
+    reach_m: float = 0.5
+    rest_m_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        TransportTruck.__post_init__(self)
+        check_positive(self.kind, target_m=self.target_m, reach_m=self.reach_m, rest_m_s=self.rest_m_s)
+
+    def derivative(self, state: Floats, inputs: Floats, *, load_kg: Floats | float | None = None) -> Floats:
+        """Return (ẋ, v̇, 0), shape (3, B); arguments as of ``TransportTruck``."""
+        moving = TransportTruck.derivative(self, state[:2], inputs, load_kg=load_kg)
+        return np.concatenate([moving, np.zeros_like(state[2:])])
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return −((destination − x)² + 0.1 v² + weight·F²), shape (B,)."""
+        position_m, speed_m_s, destination_m = state
+        distance = (destination_m - position_m) ** 2
+        cost: Floats = distance + self.speed_weight * speed_m_s**2 + self.force_weight * inputs[0] ** 2
+        return -cost
+
+    def boarding(self, state: Floats) -> NDArray[np.bool_]:
+        """Return where the truck rests at the donor and heads nowhere, shape (B,)."""
+        return self._at(state, 0.0)
+
+    def arrived(self, state: Floats) -> NDArray[np.bool_]:
+        """Return where the truck rests at the recipient with its load, shape (B,)."""
+        return self._at(state, self.target_m)
+
+    def depart(self, state: Floats, where: NDArray[np.bool_]) -> Floats:
+        """Return the state with the recipient as destination ``where`` the truck was loaded."""
+        return self._heading(state, where, self.target_m)
+
+    def turn_back(self, state: Floats, where: NDArray[np.bool_]) -> Floats:
+        """Return the state with the donor as destination ``where`` the truck was unloaded."""
+        return self._heading(state, where, 0.0)
+
+    def _at(self, state: Floats, place_m: float) -> NDArray[np.bool_]:
+        position_m, speed_m_s, destination_m = state
+        near: NDArray[np.bool_] = np.abs(position_m - place_m) <= self.reach_m
+        return near & (np.abs(speed_m_s) <= self.rest_m_s) & (destination_m == place_m)
+
+    def _heading(self, state: Floats, where: NDArray[np.bool_], place_m: float) -> Floats:
+        turned = state.copy()
+        turned[2] = np.where(where, place_m, state[2])
+        return turned

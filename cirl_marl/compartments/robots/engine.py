@@ -1,0 +1,92 @@
+"""A MuJoCo environment of a library, used as a pure function of its state.
+
+One environment object is loaded with a column of numbers, stepped by the library's own methods and read out again, copy
+after copy. The column is the simulator's whole state (``mjSTATE_INTEGRATION``: positions, velocities, controls, warm
+start, mocap, time) with what the library reads before the next step computes it anew: after ``mj_step`` the positions
+of bodies lag behind the joints by one substep, so observations and the pose of a body welded to a mocap are kept, too.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from cirl_marl.rowsum import Floats
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class Engine(ABC):
+    """An environment as a function.
+
+    Attributes:
+        env: the library's environment, unwrapped.
+        shown: names of the rows that the library shows.
+        names: names of all rows.
+        interval: time of a step, s.
+    """
+
+    def __init__(self, env: Any, shown: Sequence[str]) -> None:
+        """Take an environment of gymnasium or gymnasium-robotics."""
+        self.env = env
+        self.interval = float(env.dt)
+        self.shown = tuple(shown)
+        self._welded = _welded_bodies(env.model)
+        self._size = mujoco.mj_stateSize(env.model, STATE)
+        pose = [f"weld{i}_{part}" for i in range(len(self._welded)) for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+        self.names = (*self.shown, *pose, *(f"mujoco_{i}" for i in range(self._size)))
+
+    def start(self, stream: np.random.Generator) -> Floats:
+        """Reset as the library does, with its draws from ``stream``; return the column, shape (rows,)."""
+        self.env.np_random = stream
+        self.env.reset()
+        return self._read()
+
+    def step(self, state: Floats, inputs: Floats) -> Floats:
+        """Return every column one step later, shape (rows, B)."""
+        after = np.empty_like(state)
+        for i in range(state.shape[1]):
+            self._load(state[:, i])
+            self._act(inputs[:, i])
+            after[:, i] = self._read()
+        return after
+
+    def _load(self, column: Floats) -> None:
+        """Put the simulator into the state of a column."""
+        model, data = self.env.model, self.env.data
+        mujoco.mj_setState(model, data, np.ascontiguousarray(column[-self._size :]), STATE)
+        poses = column[len(self.shown) : -self._size].reshape(-1, 7)
+        data.xpos[self._welded], data.xquat[self._welded] = poses[:, :3], poses[:, 3:]
+        self._load_task(column)
+
+    def _read(self) -> Floats:
+        data = self.env.data
+        physics = np.empty(self._size)
+        mujoco.mj_getState(self.env.model, data, physics, STATE)
+        poses = np.concatenate([data.xpos[self._welded], data.xquat[self._welded]], axis=1)
+        return np.concatenate([self._show(), poses.ravel(), physics])
+
+    def _load_task(self, column: Floats) -> None:
+        """Load what the library keeps outside the simulator."""
+        return
+
+    @abstractmethod
+    def _act(self, inputs: Floats) -> None:
+        """Step the library's environment."""
+
+    @abstractmethod
+    def _show(self) -> Floats:
+        """Return what the library shows, in the order of ``shown``."""
+
+
+def _welded_bodies(model: Any) -> list[int]:
+    """Return the bodies that are welded to a mocap body."""
+    welded = []
+    for kind, first, second in zip(model.eq_type, model.eq_obj1id, model.eq_obj2id, strict=True):
+        if kind == mujoco.mjtEq.mjEQ_WELD:
+            welded.append(int(second if model.body_mocapid[first] != -1 else first))
+    return welded

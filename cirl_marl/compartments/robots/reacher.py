@@ -1,0 +1,99 @@
+"""Gymnasium's Reacher: an arm of two joints that moves its tip to a target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.compartments.model import RewardState, check_step
+from cirl_marl.compartments.robots.engine import Engine
+from cirl_marl.rowsum import Floats
+
+OBSERVED = (
+    "cos_0",
+    "cos_1",
+    "sin_0",
+    "sin_1",
+    "target_x_m",
+    "target_y_m",
+    "speed_0_rad_s",
+    "speed_1_rad_s",
+    "to_target_x_m",
+    "to_target_y_m",
+)
+
+
+class ReacherEngine(Engine):
+    """``Reacher-v5`` of Gymnasium."""
+
+    def __init__(self) -> None:
+        """Make the environment."""
+        super().__init__(gymnasium.make("Reacher-v5").unwrapped, (*OBSERVED, "distance_m"))
+
+    def _act(self, inputs: Floats) -> None:
+        self.env.do_simulation(inputs, self.env.frame_skip)
+
+    def _show(self) -> Floats:
+        apart = self.env.get_body_com("fingertip") - self.env.get_body_com("target")
+        return np.array([*self.env._get_obs(), np.linalg.norm(apart)])
+
+
+@cache
+def engine() -> ReacherEngine:
+    """Return the engine of this process."""
+    return ReacherEngine()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reacher:
+    """Gymnasium's Reacher-v5, unchanged, as in the paper.
+
+    Inputs are the control signals of both joints in [−1, 1], which Gymnasium documents as torques in N·m. Reward:
+    −|tip − target| − |inputs|², after the step. The task is done while the tip is within 0.04 m of the target and both
+    torques are below 0.005 N·m (arXiv 2505.21536).
+
+    The state holds Gymnasium's ten observations, the distance of tip and target, and the simulator's state.
+
+    Attributes:
+        reach_m: distance that counts as a success. [published]
+        torque_n_m: torque below which the arm counts as at rest. [published]
+    """
+
+    kind: ClassVar[str] = "reacher"
+    input_names: ClassVar[tuple[str, ...]] = ("torque_0_n_m", "torque_1_n_m")
+    time_unit: ClassVar[str] = "s"
+    reward_state: ClassVar[RewardState] = "after"
+    interval: ClassVar[float] = 0.02
+    observed: ClassVar[tuple[str, ...]] = OBSERVED
+
+    reach_m: float = 0.04
+    torque_n_m: float = 0.005
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Observations, distance, state of the simulator."""
+        return engine().names
+
+    def start(self, stream: np.random.Generator) -> Floats:
+        """Return a start as Gymnasium draws it, shape (k,)."""
+        return engine().start(stream)
+
+    def advance(self, state: Floats, inputs: Floats, interval: float) -> Floats:
+        """Return the state after two steps of the simulator, shape (k, B)."""
+        check_step(self.kind, interval, self.interval)
+        return engine().step(state, inputs)
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return −|tip − target| − |inputs|², shape (B,)."""
+        reward: Floats = -state[len(OBSERVED)] - np.square(inputs).sum(axis=0)
+        return reward
+
+    def success(self, state: Floats, inputs: Floats) -> NDArray[np.bool_]:
+        """Return whether the tip is at the target and the joints are at rest, shape (B,)."""
+        near: NDArray[np.bool_] = state[len(OBSERVED)] < self.reach_m
+        return near & (np.abs(inputs) < self.torque_n_m).all(axis=0)

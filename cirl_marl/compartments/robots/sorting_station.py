@@ -1,0 +1,134 @@
+"""A station at which a robot sorts one item after another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.compartments.model import RewardState, check_form, check_positive, check_step
+from cirl_marl.compartments.robots.fetch import Fetch
+from cirl_marl.compartments.robots.reacher import Reacher
+from cirl_marl.errors import CirlError
+from cirl_marl.rowsum import Floats
+
+ROBOTS: dict[str, Fetch | Reacher] = {"fetch": Fetch(), "reacher": Reacher()}
+BOOKS = ("busy", "attempt_step", "done_in_batch", "sorted_now", "missed_now", "complete_now", "key", "attempt")
+BUSY, STEP, DONE, SORTED, MISSED, COMPLETE, KEY, ATTEMPT = range(len(BOOKS))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SortingStation:
+    """A robot makes one attempt at each item; what it does not finish in time is missed.
+
+    While the node holds an item and the robot is free, one control interval presents the item: the robot takes the
+    start of a new attempt and the action of that interval has no effect. An attempt ends when the robot's task is done
+    (the item is sorted) or after ``attempt_steps`` (missed); a batch is complete after ``items_per_batch`` attempts.
+    Nothing moves while there is no item. The start of attempt n is drawn from a stream of its own, (key, n) with a
+    key drawn at the start of the episode, so the next state is a function of the state alone.
+
+    Reward: the robot's while it works, else 0.
+
+    Attributes:
+        form: the robot, ``fetch`` or ``reacher``.
+        items_per_batch: items of a batch.
+        item_kg: mass of an item.
+        attempt_steps: control intervals of an attempt.
+    """
+
+    kind: ClassVar[str] = "sorting_station"
+    time_unit: ClassVar[str] = "s"
+    reward_state: ClassVar[RewardState] = "after"
+    context_names: ClassVar[tuple[str, ...]] = ("stock_kg",)
+    ports: ClassVar[tuple[str, ...]] = ("sorted", "unsorted")
+
+    form: Literal["fetch", "reacher"] = "fetch"
+    items_per_batch: float = 4
+    item_kg: float = 100.0
+    attempt_steps: float = 50
+
+    def __post_init__(self) -> None:
+        """Refuse what has no meaning."""
+        check_form(self.form, tuple(ROBOTS))
+        check_positive(self.kind, item_kg=self.item_kg)
+        for name in ("items_per_batch", "attempt_steps"):
+            value = getattr(self, name)
+            if value != int(value) or value < 1:
+                raise CirlError(f"{self.kind}: {name} = {value!r}, but it must be a whole number of at least 1.")
+
+    @property
+    def robot(self) -> Any:
+        """The robot's own model."""
+        return ROBOTS[self.form]
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Bookkeeping, then the robot's states."""
+        return (*BOOKS, *self.robot.state_names)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """The robot's inputs."""
+        names: tuple[str, ...] = self.robot.input_names
+        return names
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """Whether the robot works, and what it sees."""
+        return ("busy", *self.robot.observed)
+
+    @property
+    def interval(self) -> float:
+        """The robot's control interval, s."""
+        interval: float = self.robot.interval
+        return interval
+
+    def start(self, stream: np.random.Generator) -> Floats:
+        """Return an idle station with a random key, the robot at the start of an attempt, shape (k,)."""
+        robot = self.robot.start(stream)
+        books = np.zeros(len(BOOKS))
+        books[KEY] = stream.integers(2**32)
+        return np.concatenate([books, robot])
+
+    def advance(self, state: Floats, inputs: Floats, interval: float, *, stock_kg: Floats) -> Floats:
+        """Return the state one interval later, shape (k, B); ``stock_kg`` is what the node holds, shape (B,)."""
+        check_step(self.kind, interval, self.interval)
+        after = state.copy()
+        books = after[: len(BOOKS)]
+        busy = books[BUSY] > 0
+        presented = ~busy & (stock_kg >= self.item_kg * (1.0 - 1e-9))
+        books[[SORTED, MISSED, COMPLETE]] = 0.0
+        for i in np.flatnonzero(presented):
+            stream = np.random.default_rng([int(books[KEY, i]), int(books[ATTEMPT, i])])
+            after[len(BOOKS) :, i] = self.robot.start(stream)
+        working = np.flatnonzero(busy)
+        moved = self.robot.advance(state[len(BOOKS) :, working], inputs[:, working], interval)
+        after[len(BOOKS) :, working] = moved
+        succeeded = np.zeros_like(busy)
+        succeeded[working] = self.robot.success(moved, inputs[:, working])
+        books[STEP] = np.where(busy, books[STEP] + 1.0, 0.0)
+        missed = busy & ~succeeded & (books[STEP] >= self.attempt_steps)
+        ended = succeeded | missed
+        done = books[DONE] + ended
+        complete = ended & (done >= self.items_per_batch)
+        books[SORTED], books[MISSED], books[COMPLETE] = succeeded, missed, complete
+        books[DONE] = np.where(complete, 0.0, done)
+        books[ATTEMPT] += presented
+        books[BUSY] = (busy & ~ended) | presented
+        return after
+
+    def released(self, state: Floats) -> Floats:
+        """Return the items sorted and missed in the last interval, shape (2, B)."""
+        return state[[SORTED, MISSED]]
+
+    def complete(self, state: Floats) -> NDArray[np.bool_]:
+        """Return where the last interval completed a batch, shape (B,)."""
+        complete: NDArray[np.bool_] = state[COMPLETE] > 0
+        return complete
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the robot's reward where it worked in the last interval, else 0, shape (B,)."""
+        worked = state[STEP] > 0
+        return np.where(worked, self.robot.reward(state[len(BOOKS) :], inputs), 0.0)

@@ -1,0 +1,132 @@
+"""Scripts: what an engineer would do, as plain functions of what an agent sees, and a controller of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cirl_marl.controllers.basic import Arrays, Neutral
+from cirl_marl.elements import ControlKind
+from cirl_marl.network import Floats
+from cirl_marl.vector_env import VectorEnv
+
+Seen = dict[str, Floats]
+"""Observed states of an agent's own model by name, shape (B,) each, in physical units."""
+
+OPEN, CLOSED = 1.0, -1.0
+"""Input of the fingers."""
+MOVE_M = 0.05
+"""Displacement of the gripper that an input of 1 asks for."""
+HOVER_M = 0.08
+"""Height above an object at which the gripper moves sideways."""
+CARRY_M = 0.06
+"""Height above the target at which the object is carried."""
+HOLDING_M = 0.03
+"""Opening of each finger below which the gripper holds something; an object of 5 cm leaves them at 0.025."""
+
+
+def fetch(seen: Seen) -> Floats:
+    """Return the inputs of the Fetch robot that reach, grasp, lift, carry and place, shape (4, B).
+
+    A function of the observation alone. Away from the object the gripper is open and goes above it, then down; around
+    it the fingers close; once they hold, it is lifted, carried and set down; at the target it is let go.
+    """
+    grip, item, target = (
+        np.stack([seen[f"{what}_{axis}"] for axis in "xyz"]) for what in ("grip", "object", "desired")
+    )
+    aside = np.hypot(*(item - grip)[:2])
+    around = (aside < 0.02) & (np.abs(item[2] - grip[2]) < 0.015)
+    held = around & (0.5 * (seen["finger_r"] + seen["finger_l"]) < HOLDING_M)
+    left = np.hypot(*(target - item)[:2])
+    placed = (left < 0.02) & (item[2] < target[2] + 0.03)
+    reach, carry = item.copy(), target.copy()
+    reach[2] += np.where(aside < 0.015, 0.0, HOVER_M)
+    carry[2] += np.where(left > 0.03, CARRY_M, 0.02)
+    towards = np.where(held, carry, np.where(around, item, reach))
+    towards = np.where(placed, np.stack([grip[0], grip[1], target[2] + HOVER_M]), towards)
+    move = np.clip((towards - grip) / MOVE_M * np.where(held, 1.0, 1.5), -1.0, 1.0)
+    fingers = np.where(around & ~placed, CLOSED, OPEN)
+    return np.concatenate([move, fingers[None]])
+
+
+def reacher(seen: Seen) -> Floats:
+    """Return the torques of the Reacher that move its tip to the target and let it rest, shape (2, B).
+
+    Inverse kinematics give the joint angles, a damped spring the torques.
+    """
+    first = np.arctan2(seen["sin_0"], seen["cos_0"])
+    second = np.arctan2(seen["sin_1"], seen["cos_1"])
+    speed = np.stack([seen["speed_0_rad_s"], seen["speed_1_rad_s"]])
+    wanted = _joint_angles(seen["target_x_m"], seen["target_y_m"], second)
+    turn = np.stack([wanted[0] - first, wanted[1] - second])
+    turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
+    return np.clip(STIFFNESS * turn - DAMPING * speed, -1.0, 1.0)
+
+
+UPPER_M, LOWER_M = 0.1, 0.11
+"""Lengths of the Reacher's arms, from its model file."""
+STIFFNESS, DAMPING = 0.4, 0.05
+"""Torque per rad and per rad/s. [chosen: fast and hardly overshooting]"""
+
+
+def _joint_angles(x_m: Floats, y_m: Floats, second: Floats) -> tuple[Floats, Floats]:
+    """Return the angles of both joints that put the tip at (x, y), the elbow bent to the side it already is."""
+    squared = x_m**2 + y_m**2
+    cosine = np.clip((squared - UPPER_M**2 - LOWER_M**2) / (2.0 * UPPER_M * LOWER_M), -1.0, 1.0)
+    elbow = np.where(second >= 0.0, 1.0, -1.0) * np.arccos(cosine)
+    shoulder = np.arctan2(y_m, x_m) - np.arctan2(LOWER_M * np.sin(elbow), UPPER_M + LOWER_M * np.cos(elbow))
+    return shoulder, elbow
+
+
+def truck(seen: Seen) -> Floats:
+    """Return the force that drives a truck to its destination and stops it there, shape (1, B), N: a damped spring."""
+    return SPRING_N_M * (seen["destination_m"] - seen["position_m"])[None] - BRAKE_N_S_M * seen["speed_m_s"][None]
+
+
+SPRING_N_M, BRAKE_N_S_M = 4e3, 6e3
+"""[chosen: about critical for 3.2 t]"""
+
+
+def incinerator(seen: Seen) -> Floats:
+    """Return the heat to take from the freeboard, shape (1, B), kJ/min: more where it is hotter than 1000 °C."""
+    return HOLD_KJ_MIN + GAIN_KJ_MIN_K * (seen["freeboard_degc"] - 1000.0)[None]
+
+
+HOLD_KJ_MIN, GAIN_KJ_MIN_K = 6.4e5, 3e4
+"""Heat that the stationary plant gives at 1000 °C, and a proportional gain. [chosen]"""
+
+SCRIPTS: dict[str, Callable[[Seen], Floats]] = {
+    "fetch": fetch,
+    "reacher": reacher,
+    "delivery_truck": truck,
+    "incinerator": incinerator,
+}
+"""Script of each kind of model; that of a sorting station is its robot's."""
+
+
+class Scripted:
+    """Acts by the script for the agent's kind of model; agents without one stay neutral."""
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        """Find the script of each agent and what it reads."""
+        self._neutral = Neutral()
+        self._neutral.start(env, seed)
+        self._scripts: dict[str, tuple[Callable[[Seen], Floats], dict[str, int], float, float]] = {}
+        for agent in env.agents:
+            compartment = env.network.compartments[agent]
+            model, control = compartment.model, compartment.control
+            kind = getattr(getattr(model, "robot", model), "kind", None)
+            if kind not in SCRIPTS or control is None or control.kind is not ControlKind.INPUT:
+                continue
+            own = {name.split(".")[1]: i for i, name in enumerate(env.layout.names[agent]) if f"{agent}." in name}
+            middle, half = (control.high + control.low) / 2, (control.high - control.low) / 2
+            self._scripts[agent] = SCRIPTS[kind], own, middle, half
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return each agent's action."""
+        actions = dict(self._neutral.act(observations))
+        for agent, (script, own, middle, half) in self._scripts.items():
+            seen = {name: observations[agent][:, i].astype(np.float64) for name, i in own.items()}
+            actions[agent] = np.clip((script(seen) - middle) / half, -1.0, 1.0).T
+        return actions

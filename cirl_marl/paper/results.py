@@ -1,0 +1,181 @@
+"""Results of the paper's runs on disk: a directory with one JSON file per row.
+
+A file is written whole or not at all, and holds everything that the row's figures depend on. A row whose file is there
+is done; an interrupted one has none.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cirl_marl.errors import RunError
+from cirl_marl.learners.run import write_json
+
+CURVE_POINTS = 500
+WINDOW = 100
+"""Training episodes over which r_s and r_e are means, as in the paper."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One training run: what, with which settings, how long.
+
+    Attributes:
+        environment: name in the paper.
+        algorithm: name in the paper; of a tuned row, that of its recipe.
+        recipe: ``published`` for the paper's settings, ``tuned`` for ``agents/paper_*.toml``.
+        steps: environment steps, summed over the copies.
+        seed: of model and environment.
+    """
+
+    environment: str
+    algorithm: str
+    recipe: str = "published"
+    steps: int
+    seed: int = 0
+
+    def __str__(self) -> str:
+        """Name the row in a line of text."""
+        return f"{self.environment} {self.algorithm} ({self.recipe}, {self.steps:,} steps, seed {self.seed})"
+
+    @property
+    def stem(self) -> str:
+        """Name of its files."""
+        return f"{self.environment}-{self.algorithm}-{self.recipe}-{self.steps}-seed{self.seed}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluation:
+    """The final policy, deterministic, on fresh episodes.
+
+    Attributes:
+        episodes: how many.
+        mean: of their returns.
+        deviation: standard deviation of their returns.
+        success: share with a success at any step, percent; None if the environment knows no success.
+    """
+
+    episodes: int
+    mean: float
+    deviation: float
+    success: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """What a finished row measured, and what it depends on.
+
+    Attributes:
+        row: the row.
+        steps_done: environment steps done; on-policy learners finish their last rollout.
+        seconds: wall time of training, without evaluation.
+        episodes: training episodes that ended.
+        start_return: r_s, mean return of the first 100 of them.
+        end_return: r_e, mean return of the last 100.
+        curve: (steps, mean return) of consecutive training episodes, at most 500 points.
+        evaluation: of the final policy.
+        settings: hyperparameters that differ from the library's defaults, copies, the environment's id and arguments.
+        versions: of Python and the packages.
+        machine: processors, torch threads, load at the end.
+        finished: when, UTC.
+        cpu_seconds: processor time of training, which other work on the machine does not lengthen; None if not known.
+    """
+
+    row: Row
+    steps_done: int
+    seconds: float
+    episodes: int
+    start_return: float
+    end_return: float
+    curve: list[tuple[int, float]]
+    evaluation: Evaluation
+    settings: dict[str, Any]
+    versions: dict[str, str]
+    machine: dict[str, Any]
+    finished: str
+    cpu_seconds: float | None = None
+
+    @property
+    def gain(self) -> float:
+        """ζ = r_e − r_s."""
+        return self.end_return - self.start_return
+
+    @property
+    def gain_per_step(self) -> float:
+        """ψ = ζ / steps."""
+        return self.gain / self.row.steps
+
+    @classmethod
+    def from_dict(cls, plain: dict[str, Any]) -> Result:
+        """Read what ``asdict`` returned, after a detour through JSON."""
+        given = {key: value for key, value in plain.items() if key not in ("gain", "gain_per_step")}
+        given["row"] = Row(**given["row"])
+        given["evaluation"] = Evaluation(**given["evaluation"])
+        given["curve"] = [(int(step), float(value)) for step, value in given["curve"]]
+        return cls(**given)
+
+
+class Results:
+    """A directory of results.
+
+    Attributes:
+        path: the directory.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Refer to a directory; it is made when the first result is written."""
+        self.path = Path(path)
+
+    def file(self, row: Row) -> Path:
+        """Return where the result of ``row`` is kept."""
+        return self.path / f"{row.stem}.json"
+
+    def log(self, row: Row) -> Path:
+        """Return where a process that runs ``row`` may write its log."""
+        return self.path / "logs" / f"{row.stem}.log"
+
+    def has(self, row: Row) -> bool:
+        """Return whether ``row`` is done."""
+        return self.file(row).is_file()
+
+    def read(self, row: Row) -> Result:
+        """Return the result of ``row``.
+
+        Raises:
+            RunError: if it is not done, or its file is not a result.
+        """
+        return _read(self.file(row))
+
+    def write(self, result: Result) -> None:
+        """Keep a result, in one step."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        figures = {"gain": result.gain, "gain_per_step": result.gain_per_step}
+        write_json(self.file(result.row), asdict(result) | figures)
+
+    def all(self) -> list[Result]:
+        """Return every result in the directory, by file name."""
+        return [_read(path) for path in sorted(self.path.glob("*.json")) if not path.name.startswith(".")]
+
+
+def _read(path: Path) -> Result:
+    try:
+        return Result.from_dict(json.loads(path.read_text()))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(f"{path}: is not the result of a row: {error!r}; delete it to run the row again") from error
+
+
+def thinned(ends: Sequence[int], returns: Sequence[float]) -> list[tuple[int, float]]:
+    """Return at most 500 points of a learning curve: means of consecutive episodes, at the step where the last ended.
+
+    >>> thinned([50, 100], [-2.0, -1.0])
+    [(50, -2.0), (100, -1.0)]
+    """
+    parts = np.array_split(np.arange(len(returns)), min(CURVE_POINTS, len(returns)))
+    values = np.asarray(returns, dtype=float)
+    return [(int(ends[part[-1]]), float(values[part].mean())) for part in parts]

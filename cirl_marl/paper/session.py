@@ -1,0 +1,58 @@
+"""Rows one after the other in this process, with a live bar; finished rows are kept and not run again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from cirl_marl.paper.published import ENVIRONMENTS
+from cirl_marl.paper.results import Results, Row
+from cirl_marl.paper.table import environment_table, result_line
+from cirl_marl.paper.training import Report, check_registered, run_row
+
+REFRESH_S = 0.2
+
+
+def run_session(rows: Sequence[Row], results: Results, console: Console, *, success_episodes: int | None) -> None:
+    """Run the rows that are not done, and show the tables of their environments.
+
+    Raises:
+        CirlError: if an environment is missing, before anything is run.
+        KeyboardInterrupt: after Ctrl-C; the row that ran leaves nothing.
+    """
+    environments = [ENVIRONMENTS[name] for name in dict.fromkeys(row.environment for row in rows)]
+    for environment in environments:
+        check_registered(environment)
+    for i, row in enumerate(rows):
+        if not results.has(row):
+            with live_bar(
+                console, f"{i + 1} of {len(rows)}: {row.environment} {row.algorithm}, seed {row.seed}"
+            ) as bar:
+                results.write(run_row(row, report=bar, success_episodes=success_episodes))
+        console.print(result_line(results.read(row)), soft_wrap=True, highlight=False)
+    for environment in environments:
+        console.print(environment_table(environment, results.all()))
+
+
+@contextmanager
+def live_bar(console: Console, title: str) -> Iterator[Report]:
+    """Bar with the time remaining; starts anew when the row goes on to something else. Nothing without a terminal."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(title, total=None)
+        current, shown = "", 0.0
+
+        def report(what: str, done: int, total: int) -> None:
+            nonlocal current, shown
+            if what != current:
+                current = what
+                progress.reset(task, description=f"{title}: {what}", total=total)
+            if time.perf_counter() - shown > REFRESH_S:
+                shown = time.perf_counter()
+                progress.update(task, completed=done)
+
+        yield report

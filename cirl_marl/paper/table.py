@@ -1,0 +1,181 @@
+"""The paper's figures and ours side by side: for the terminal, and as Markdown for ``docs/paper_tables.md``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from rich.table import Table
+
+from cirl_marl.paper.published import ENVIRONMENTS, HARDWARE, SOURCE, PaperEnvironment, Published
+from cirl_marl.paper.results import WINDOW, Result
+
+COLUMNS = ("algorithm", "run", "seeds", "r_s", "r_e", "ζ", "ψ", "s (%)", "final policy", "minutes", "CPU min", "remark")
+NUMERIC = COLUMNS[3:11]
+NOT_RUN = "not run"
+INTRODUCTION = f"""# The paper's tables, repeated
+
+Published figures: {SOURCE}. Written by `python benchmarks/paper.py --table`.
+
+- **paper**: what it reports. **ours**: the same run here, `A("MlpPolicy", gymnasium.make(id))` with the library's
+  default hyperparameters (goal tasks: `MultiInputPolicy`, `HerReplayBuffer`). **tuned**: our recipe
+  `agents/paper_….toml`, with as many environment steps.
+- r_s, r_e: mean return of the first and the last {WINDOW} training episodes, exploration included;
+  ζ = r_e − r_s; ψ = ζ / steps.
+- s: share of evaluation episodes with a success at any step, deterministic policy.
+- final policy: mean return of the trained policy, deterministic, on fresh episodes that no training saw.
+- Several seeds: mean ± standard deviation over them. Minutes: training alone, on the machine named below; the paper's
+  on a {HARDWARE}. CPU min: processor time, which other work on the machine does not lengthen.
+- Time limits are truncations here. The published CarboNet and CopperNet end their episodes otherwise
+  ([networks.md](networks.md)), which shifts saturated returns by some percent.
+"""
+
+
+def result_line(result: Result) -> str:
+    """Say in one line what a row gave."""
+    success = "" if result.evaluation.success is None else f", s {result.evaluation.success:.1f} %"
+    return (
+        f"{result.row}: r_s {number(result.start_return)}, r_e {number(result.end_return)}, "
+        f"ζ {number(result.gain)}{success}, {result.seconds / 60:.1f} min"
+    )
+
+
+def environment_table(environment: PaperEnvironment, results: Sequence[Result]) -> Table:
+    """Return the table of one environment for the terminal."""
+    table = Table(title=f"{environment.name}, {environment.steps:,} steps", caption=_notes(environment, results))
+    for column in COLUMNS:
+        table.add_column(column, justify="right" if column in NUMERIC else "left")
+    for row in table_rows(environment, results):
+        table.add_row(*row, end_section=row[1] == "ours")
+    return table
+
+
+def markdown(results: Sequence[Result]) -> str:
+    """Return the document: one table an environment, what was not run, versions and machine."""
+    parts = [INTRODUCTION]
+    for environment in ENVIRONMENTS.values():
+        lines = [f"## {environment.name} ({environment.steps:,} steps)", ""]
+        lines += ["| " + " | ".join(COLUMNS) + " |", "|" + "|".join("-" for _ in COLUMNS) + "|"]
+        lines += ["| " + " | ".join(row) + " |" for row in table_rows(environment, results)]
+        parts.append("\n".join(lines) + "\n\n" + _notes(environment, results) + "\n")
+    parts.append(_provenance(results))
+    return "\n".join(parts)
+
+
+def table_rows(environment: PaperEnvironment, results: Iterable[Result]) -> list[tuple[str, ...]]:
+    """Return the cells of one environment: for each algorithm the paper's row and ours, then the tuned rows."""
+    own = [result for result in results if result.row.environment == environment.name]
+    rows = []
+    for algorithm, published in environment.runs.items():
+        rows.append(_paper_row(environment, algorithm, published))
+        found = [r for r in own if (r.row.algorithm, r.row.recipe) == (algorithm, "published")]
+        rows.append(_our_row(environment, algorithm, "ours", found))
+    tuned = {result.row.algorithm: None for result in own if result.row.recipe == "tuned"}
+    for algorithm in tuned:
+        found = [r for r in own if (r.row.algorithm, r.row.recipe) == (algorithm, "tuned")]
+        rows.append(_our_row(environment, algorithm, "tuned", found))
+    if not tuned:
+        rows.append(_our_row(environment, "", "tuned", []))
+    return rows
+
+
+def number(value: float | None) -> str:
+    """Write a figure with three or four digits.
+
+    >>> number(-4.43e8), number(17.8), number(None)
+    ('-4.43e8', '17.8', '')
+    """
+    if value is None:
+        return ""
+    mantissa, exponent = _scaled(value)
+    return f"{value:.4g}" if exponent == 0 else f"{mantissa:.2f}e{exponent}"
+
+
+def over_seeds(values: Sequence[float]) -> str:
+    """Write mean ± standard deviation; one value alone as it is.
+
+    >>> over_seeds([-4.0e8, -5.0e8]), over_seeds([3.0])
+    ('-4.50e8 ± 0.71e8', '3')
+    """
+    mean = float(np.mean(values))
+    if len(values) == 1:
+        return number(mean)
+    deviation = float(np.std(values, ddof=1))
+    exponent = _scaled(mean)[1]
+    if exponent:
+        return f"{number(mean)} ± {deviation / 10.0**exponent:.2f}e{exponent}"
+    return f"{mean:.4g} ± {number(deviation)}"
+
+
+def _scaled(value: float) -> tuple[float, int]:
+    """Split large and tiny figures into mantissa and exponent; the exponent of others is 0."""
+    if value == 0 or not math.isfinite(value) or 1e-3 <= abs(value) < 1e4:
+        return value, 0
+    mantissa, exponent = f"{value:.2e}".split("e")
+    return float(mantissa), int(exponent)
+
+
+def _paper_row(environment: PaperEnvironment, algorithm: str, run: Published) -> tuple[str, ...]:
+    gain = None if run.start_return is None or run.end_return is None else run.end_return - run.start_return
+    figures = (run.start_return, run.end_return, gain, None if gain is None else gain / environment.steps, run.success)
+    minutes = "" if run.minutes is None else f"{run.minutes:.1f}"
+    return (algorithm, "paper", "", *map(number, figures), "", minutes, "", "")
+
+
+def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Sequence[Result]) -> tuple[str, ...]:
+    """Average the seeds that have as many steps as the paper; failing these, those with the most steps."""
+    if not found:
+        return (algorithm, run, *("" for _ in NUMERIC), "", NOT_RUN)
+    steps = environment.steps
+    if all(result.row.steps != steps for result in found):
+        steps = max(result.row.steps for result in found)
+    seeds = sorted((result for result in found if result.row.steps == steps), key=lambda result: result.row.seed)
+
+    def cell(figure: Callable[[Result], float]) -> str:
+        return over_seeds([figure(result) for result in seeds])
+
+    successes = [result.evaluation.success for result in seeds if result.evaluation.success is not None]
+    cpu = [result.cpu_seconds for result in seeds if result.cpu_seconds is not None]
+    return (
+        algorithm,
+        run,
+        ", ".join(str(result.row.seed) for result in seeds),
+        cell(lambda result: result.start_return),
+        cell(lambda result: result.end_return),
+        cell(lambda result: result.gain),
+        cell(lambda result: result.gain_per_step),
+        over_seeds(successes) if successes else "",
+        cell(lambda result: result.evaluation.mean),
+        f"{np.mean([result.seconds for result in seeds]) / 60:.1f}",
+        f"{np.mean(cpu) / 60:.1f}" if cpu else "",
+        "" if steps == environment.steps else f"{steps:,} of {environment.steps:,} steps",
+    )
+
+
+def _notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
+    """Say how many episodes the final policies played, and what is the best possible."""
+    best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
+    own = [result.evaluation.episodes for result in results if result.row.environment == environment.name]
+    played = f"Final policy: {' or '.join(_distinct(own))} episodes a seed. " if own else ""
+    return f"{played}Optimum: {best}."
+
+
+def _provenance(results: Sequence[Result]) -> str:
+    """Name what our figures were made with; a version that changed between rows is listed with all its values."""
+    if not results:
+        return "## Made with\n\nNothing has been run yet.\n"
+    names = list(dict.fromkeys(name for result in results for name in result.versions))
+    versions = [f"{name} {' and '.join(_distinct(r.versions.get(name, 'none') for r in results))}" for name in names]
+    cpus = ", ".join(_distinct(result.machine["cpus"] for result in results))
+    threads = ", ".join(_distinct(result.machine["torch_threads"] for result in results))
+    hours = sum(result.seconds for result in results) / 3600
+    days = sorted(result.finished[:10] for result in results)
+    return (
+        f"## Made with\n\n{len(results)} rows, {hours:.1f} hours of training on {cpus} CPUs "
+        f"({threads} torch thread each, no GPU), {days[0]} to {days[-1]}.\n\n{', '.join(versions)}.\n"
+    )
+
+
+def _distinct(values: Iterable[object]) -> list[str]:
+    return sorted({str(value) for value in values})

@@ -1,0 +1,268 @@
+"""One row of the paper's tables: train one learner in one environment, evaluate what it learnt."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from hashlib import sha256
+from importlib import metadata
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from cirl_marl.catalogue import load_network
+from cirl_marl.errors import CirlError, RunError
+from cirl_marl.evaluate import EVALUATION_SEEDS, SEED_SPACING
+from cirl_marl.learners.algorithms import algorithm_class
+from cirl_marl.learners.run import versions
+from cirl_marl.paper.published import PaperEnvironment, environment_of
+from cirl_marl.paper.results import WINDOW, Evaluation, Result, Row, thinned
+
+EVALUATION_EPISODES = 100
+EVALUATION_COPIES = 20
+PACKAGES = ("gymnasium-robotics", "mujoco")
+"""On which the two robots depend, beside what every training run records."""
+
+Report = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and how much there is."""
+Predict = Callable[[Any, Any, NDArray[np.bool_]], tuple[NDArray[Any], Any]]
+"""From observations, recurrent state and episode starts to deterministic actions and the next recurrent state."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trained:
+    """What a training hands over to be measured.
+
+    Attributes:
+        predict: the final policy.
+        ends: environment steps at which each training episode ended.
+        returns: undiscounted return of each.
+        steps: environment steps done.
+        seconds: wall time.
+        cpu_seconds: processor time.
+        settings: what the row depends on.
+        options: options of the environment to evaluate in.
+    """
+
+    predict: Predict
+    ends: list[int]
+    returns: list[float]
+    steps: int
+    seconds: float
+    cpu_seconds: float
+    settings: dict[str, Any]
+    options: dict[str, Any]
+
+
+def run_row(row: Row, *, report: Report | None = None, success_episodes: int | None = None) -> Result:
+    """Train and evaluate one row.
+
+    Args:
+        row: what to run.
+        report: called now and then.
+        success_episodes: evaluation episodes where the environment knows a success; None takes the paper's number.
+
+    Raises:
+        CirlError: if the environment is missing in this version, or no training episode ended.
+    """
+    environment = environment_of(row.environment)
+    check_registered(environment)
+    if environment.success_episodes:
+        _check_success(environment)
+    report = report or _silent
+    with one_torch_thread():
+        if row.recipe == "published":
+            trained = train_published(environment, row, report)
+        else:
+            from cirl_marl.paper.tuned import train_tuned
+
+            trained = train_tuned(environment, row, report)
+        if not trained.returns:
+            raise CirlError(f"{row}: no training episode ended; use more steps")
+        wanted = environment.success_episodes if success_episodes is None else success_episodes
+        episodes = wanted if environment.success_episodes else EVALUATION_EPISODES
+        seed = EVALUATION_SEEDS + SEED_SPACING * row.seed
+        evaluation = evaluate(environment.id, trained.predict, episodes, seed, report, trained.options)
+        threads = torch.get_num_threads()
+    return Result(
+        row=row,
+        steps_done=trained.steps,
+        seconds=trained.seconds,
+        episodes=len(trained.returns),
+        start_return=float(np.mean(trained.returns[:WINDOW])),
+        end_return=float(np.mean(trained.returns[-WINDOW:])),
+        curve=thinned(trained.ends, trained.returns),
+        evaluation=evaluation,
+        settings=trained.settings,
+        versions=versions() | {package: metadata.version(package) for package in PACKAGES},
+        machine={"cpus": os.cpu_count(), "torch_threads": threads, "load": os.getloadavg()[0], "device": "cpu"},
+        finished=datetime.now(UTC).isoformat(timespec="seconds"),
+        cpu_seconds=trained.cpu_seconds,
+    )
+
+
+def check_registered(environment: PaperEnvironment) -> gymnasium.envs.registration.EnvSpec:
+    """Return the Gymnasium specification of an environment of the paper.
+
+    Raises:
+        RunError: if this version does not have it.
+    """
+    found = gymnasium.registry.get(environment.id)
+    if found is None:
+        raise RunError(f"{environment.id}: this version of cirl_marl does not register it")
+    return found
+
+
+def _check_success(environment: PaperEnvironment) -> None:
+    """Find out before the training, not after it, whether successes can be counted."""
+    env = gymnasium.make(environment.id)
+    env.reset(seed=0)
+    info = env.step(env.action_space.sample())[-1]
+    env.close()
+    if "success" not in info:
+        raise RunError(f"{environment.id}: its info lacks 'success', whose share is a figure of this row")
+
+
+def train_published(environment: PaperEnvironment, row: Row, report: Report) -> Trained:
+    """Train with the paper's settings: the library's default hyperparameters, one copy; hindsight for goal tasks."""
+    env = Monitor(gymnasium.make(environment.id))
+    name, _, hindsight = row.algorithm.partition("-")
+    policy = "MultiInputPolicy" if hindsight else "MlpPolicy"
+    extra: dict[str, Any] = {"replay_buffer_class": HerReplayBuffer} if hindsight else {}
+    model = algorithm_class(name)(policy, env, seed=row.seed, device="cpu", **extra)
+    elapsed = stopwatch()
+    model.learn(row.steps, callback=Watch(report, row.steps))
+    seconds, cpu_seconds = elapsed()
+    settings = {"policy": policy, "hyperparameters": "defaults of the library", "copies": 1, **described(environment)}
+    if hindsight:
+        settings["replay_buffer_class"] = "HerReplayBuffer, defaults of the library"
+    ends, returns = episodes_of([env])
+    env.close()
+    return Trained(
+        predict=predictor(model),
+        ends=ends,
+        returns=returns,
+        steps=model.num_timesteps,
+        seconds=seconds,
+        cpu_seconds=cpu_seconds,
+        settings=settings,
+        options={},
+    )
+
+
+def described(environment: PaperEnvironment) -> dict[str, Any]:
+    """Return id, arguments and fingerprint of the definition of an environment, for the record."""
+    spec = check_registered(environment)
+    found = {"environment": spec.id, "arguments": {key: str(value) for key, value in spec.kwargs.items()}}
+    source = load_network(spec.kwargs["network"]).source if "network" in spec.kwargs else None
+    if source is not None and source.is_file():
+        found["definition_sha256"] = sha256(source.read_bytes()).hexdigest()
+    return found
+
+
+def predictor(model: BaseAlgorithm, normalise: Callable[[Any], Any] = lambda observation: observation) -> Predict:
+    """Return the deterministic policy of ``model`` behind the normalisation that it was trained with."""
+
+    def predict(observation: Any, state: Any, starts: NDArray[np.bool_]) -> tuple[NDArray[Any], Any]:
+        return model.predict(normalise(observation), state, starts, deterministic=True)
+
+    return predict
+
+
+def episodes_of(monitors: list[Monitor[Any, Any]]) -> tuple[list[int], list[float]]:
+    """Return when the episodes of several copies ended, in steps summed over the copies, and their returns, in order.
+
+    What the monitor of each copy saw counts, as ARS keeps its episodes from callbacks.
+    """
+    found = [
+        (int(end) * len(monitors), copy, value)
+        for copy, monitor in enumerate(monitors)
+        for end, value in zip(np.cumsum(monitor.get_episode_lengths()), monitor.get_episode_rewards(), strict=True)
+    ]
+    found.sort()
+    return [end for end, _, _ in found], [value for _, _, value in found]
+
+
+def evaluate(
+    id_: str, predict: Predict, episodes: int, seed: int, report: Report, options: dict[str, Any]
+) -> Evaluation:
+    """Return mean return and share of successes of ``episodes`` fresh episodes.
+
+    Each copy plays a fixed number of episodes, so that short ones are not favoured.
+    """
+    copies = min(EVALUATION_COPIES, episodes)
+    env = DummyVecEnv([lambda: Monitor(gymnasium.make(id_, **options))] * copies)
+    env.seed(seed)
+    quota = np.array([(episodes + copy) // copies for copy in range(copies)])
+    played = np.zeros(copies, dtype=int)
+    reached, starts = np.zeros(copies, dtype=bool), np.ones(copies, dtype=bool)
+    returns: list[float] = []
+    successes: list[bool] = []
+    knows_success, state, observation = False, None, env.reset()
+    while (played < quota).any():
+        actions, state = predict(observation, state, starts)
+        observation, _, starts, infos = env.step(actions)
+        for copy, info in enumerate(infos):
+            knows_success |= "success" in info
+            reached[copy] |= bool(info.get("success", False))
+            if starts[copy]:
+                if played[copy] < quota[copy]:
+                    returns.append(float(info["episode"]["r"]))
+                    successes.append(bool(reached[copy]))
+                played[copy] += 1
+                reached[copy] = False
+        report("evaluating", len(returns), episodes)
+    env.close()
+    return Evaluation(
+        episodes=len(returns),
+        mean=float(np.mean(returns)),
+        deviation=float(np.std(returns)),
+        success=100 * float(np.mean(successes)) if knows_success else None,
+    )
+
+
+class Watch(BaseCallback):
+    """Reports the steps done."""
+
+    def __init__(self, report: Report, total: int) -> None:
+        """Report to ``report``."""
+        super().__init__()
+        self._report = report
+        self._total = total
+
+    def _on_step(self) -> bool:
+        self._report("training", min(self.num_timesteps, self._total), self._total)
+        return True
+
+
+def stopwatch() -> Callable[[], tuple[float, float]]:
+    """Start to measure; the function returned gives wall time and processor time since then, in seconds."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    return lambda: (time.perf_counter() - wall, time.process_time() - cpu)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Small networks learn fastest on one thread, and rows may run side by side."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _silent(what: str, done: int, total: int) -> None:
+    del what, done, total

@@ -1,0 +1,292 @@
+"""The paper's tables: rows are trained, kept, not run again, and shown beside the published figures."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cirl_marl import CirlError, RecipeError, cli
+from cirl_marl.errors import RunError
+from cirl_marl.learners import Recipe
+from cirl_marl.paper import published, session
+from cirl_marl.paper.plan import planned, study
+from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
+from cirl_marl.paper.results import Evaluation, Result, Results, Row, thinned
+from cirl_marl.paper.table import markdown, table_rows
+from cirl_marl.paper.training import run_row
+from cirl_marl.paper.tuned import train_tuned
+
+COPPER = ENVIRONMENTS["CopperNet"]
+
+
+class Toy(gymnasium.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
+    """A goal task of ten steps; it succeeds in every other episode."""
+
+    def __init__(self) -> None:
+        """Make the spaces."""
+        box = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+        names = ("observation", "achieved_goal", "desired_goal")
+        self.observation_space = gymnasium.spaces.Dict({name: box for name in names})  # type: ignore[assignment]
+        self.action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+        self._episode = self._step = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start the next episode; a seed starts counting anew."""
+        super().reset(seed=seed)
+        self._episode = 0 if seed is not None else self._episode + 1
+        self._step = 0
+        return self._observe(), {}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Succeed in the third step of even episodes, though not for long."""
+        self._step += 1
+        success = self._step == 3 and self._episode % 2 == 0
+        return self._observe(), -1.0, False, self._step == 10, {"success": success, "is_success": success}
+
+    def compute_reward(self, achieved: NDArray[Any], desired: NDArray[Any], info: Any) -> NDArray[Any]:
+        """Reward of any goal."""
+        return -np.ones(len(achieved), dtype=np.float32)
+
+    def _observe(self) -> dict[str, NDArray[np.float32]]:
+        return {name: np.zeros(2, dtype=np.float32) for name in self.observation_space.spaces}  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch) -> Iterator[PaperEnvironment]:
+    """Put a goal task among the environments of the paper."""
+    found = PaperEnvironment(name="Toy", steps=1000, runs={"SAC-HER": Published(end_return=-1.0)}, success_episodes=7)
+    gymnasium.register(found.id, entry_point=lambda **_: Toy())
+    monkeypatch.setattr(published, "ENVIRONMENTS", {"Toy": found})
+    yield found
+    del gymnasium.registry[found.id]
+
+
+def result(algorithm: str = "A2C", steps: int = 200_000, seed: int = 0, end: float = -5e7, **changes: Any) -> Result:
+    """Return a result as a training would."""
+    made = Result(
+        row=Row(environment="CopperNet", algorithm=algorithm, steps=steps, seed=seed),
+        steps_done=steps,
+        seconds=90.0,
+        episodes=4000,
+        start_return=-1.5e8,
+        end_return=end,
+        curve=[(50, -1.5e8)],
+        evaluation=Evaluation(episodes=100, mean=-4.9e7, deviation=0.0, success=None),
+        settings={},
+        versions={"torch": "2.13.0"},
+        machine={"cpus": 2, "torch_threads": 1},
+        cpu_seconds=60.0,
+        finished="2025-01-02T03:04:05+00:00",
+    )
+    return replace(made, **changes)
+
+
+def cirl(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run ``cirl paper CopperNet …`` and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["cirl", "paper", "CopperNet", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.parametrize(("algorithm", "steps", "done"), [("A2C", 300, 300), ("ARS", 300, 800), ("DDPG", 150, 150)])
+def test_row_is_trained_kept_and_not_run_again(
+    algorithm: str,
+    steps: int,
+    done: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Every finished training episode counts, also of ARS; a second call shows the same figures without training."""
+    arguments = (algorithm, "--steps", str(steps), "--out", str(tmp_path))
+    assert cirl(monkeypatch, *arguments) == 0
+    shown = capsys.readouterr().out
+    assert f"{steps} of 200,000" in shown
+    (path,) = tmp_path.iterdir()
+    kept = json.loads(path.read_text())
+    assert kept["row"] == {
+        "environment": "CopperNet",
+        "algorithm": algorithm,
+        "recipe": "published",
+        "steps": steps,
+        "seed": 0,
+    }
+    assert (kept["steps_done"], kept["episodes"]) == (done, done // 50)
+    assert kept["curve"][-1][0] == done
+    assert kept["evaluation"]["episodes"] == 100
+    assert kept["evaluation"]["success"] is None
+    assert {"torch", "stable-baselines3", "mujoco"} <= set(kept["versions"])
+    assert kept["settings"]["environment"] == "cirl_marl/CopperNet-v0"
+    assert len(kept["settings"]["definition_sha256"]) == 64
+    returns = np.array([value for _, value in kept["curve"]])
+    assert kept["start_return"] == pytest.approx(returns.mean())
+    assert (returns < 0).all()
+
+    monkeypatch.setattr(session, "run_row", lambda *_, **__: pytest.fail("the row was run again"))
+    assert cirl(monkeypatch, *arguments) == 0
+    assert capsys.readouterr().out == shown
+
+
+def test_same_seed_same_figures() -> None:
+    """The seed decides model and environment."""
+    first, second, other = (
+        run_row(Row(environment="CopperNet", algorithm="A2C", steps=100, seed=seed)) for seed in (1, 1, 2)
+    )
+    assert first.curve == second.curve != other.curve
+    assert first.evaluation == second.evaluation
+
+
+def test_interrupted_row_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ctrl-C ends with code 130 and says how to go on; the rows done before stay."""
+    results = Results(tmp_path)
+    results.write(result())
+
+    def interrupted(*_: Any, **__: Any) -> Result:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(session, "run_row", interrupted)
+    assert cirl(monkeypatch, "A2C", "--seeds", "2", "--out", str(tmp_path)) == 130
+    assert "The same command goes on" in capsys.readouterr().out
+    assert results.all() == [result()]
+
+
+def test_result_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A crash while writing leaves no result, and a damaged file is named."""
+    results = Results(tmp_path)
+    with monkeypatch.context() as broken, pytest.raises(OSError, match="disk"):
+        broken.setattr("os.fsync", lambda _: (_ for _ in ()).throw(OSError("disk")))
+        results.write(result())
+    assert not results.has(result().row)
+    assert results.all() == []
+    results.write(result())
+    assert results.read(result().row) == result()
+    results.file(result().row).write_text('{"row": 1}')
+    with pytest.raises(RunError, match="is not the result of a row"):
+        results.all()
+
+
+def test_gain_and_gain_per_step() -> None:
+    """ζ = r_e − r_s and ψ = ζ/steps."""
+    assert result().gain == 1.0e8
+    assert result().gain_per_step == 500.0
+
+
+def test_curves_are_thinned_to_means() -> None:
+    """At most 500 points; their mean, weighted by length, is that of the episodes."""
+    ends, returns = list(range(50, 50 * 1234, 50)), list(np.random.default_rng(0).normal(size=1233))
+    curve = thinned(ends, returns)
+    assert len(curve) == 500
+    assert curve[-1][0] == ends[-1]
+    assert curve[0][0] == 150
+    assert curve[0][1] == pytest.approx(np.mean(returns[:3]))
+
+
+def test_table_shows_both_and_what_was_not_run() -> None:
+    """The paper's figures, ours over the seeds with all steps, shorter runs as such, and what is missing."""
+    runs = [result(end=-5e7), result(seed=1, end=-4e7), result(steps=500, end=-1.0), result("PPO", 50_000)]
+    rows = {(row[0], row[1]): row for row in table_rows(COPPER, runs)}
+    assert rows["A2C", "paper"][3:7] == ("-1.34e8", "-5.30e7", "8.10e7", "405")
+    assert rows["A2C", "ours"][2:5] == ("0, 1", "-1.50e8 ± 0.00e8", "-4.50e7 ± 0.71e7")
+    assert rows["A2C", "ours"][-3:] == ("1.5", "1.0", "")
+    assert rows["PPO", "ours"][-1] == "50,000 of 200,000 steps"
+    assert rows["SAC", "ours"][-1] == rows["", "tuned"][-1] == "not run"
+    text = markdown(runs)
+    assert "| DDPG | paper |  | -60.2 | -5.5 | 54.7 | 5.47e-4 | 72.3 |  | 13.7 |  |  |" in text
+    assert "| TQC-HER | paper |  |  | -11.45 |" in text
+    assert "Optimum: -4.60e7" in text
+    assert "torch 2.13.0" in text
+    assert markdown([]).count("not run") == sum(len(found.runs) for found in ENVIRONMENTS.values()) + len(ENVIRONMENTS)
+
+
+def test_published_table_is_whole() -> None:
+    """Five algorithms on seven environments and four on one, with the relations that the paper states."""
+    assert [len(found.runs) for found in ENVIRONMENTS.values()] == [5] * 7 + [4]
+    assert {name for found in ENVIRONMENTS.values() for name in found.runs} == set(ALGORITHMS)
+    assert all(run.end_return is not None for found in ENVIRONMENTS.values() for run in found.runs.values())
+    minutes = {
+        (found.name, name): run.minutes or 0 for found in ENVIRONMENTS.values() for name, run in found.runs.items()
+    }
+    assert max(minutes, key=lambda key: minutes[key]) == ("TransportTruck", "SAC")
+    assert minutes["TransportTruck", "SAC"] == pytest.approx(88.3)
+
+
+def test_study_runs_fast_learners_first() -> None:
+    """ARS, PPO and A2C with three seeds on every Box environment, then one seed of the slow ones, then the goals."""
+    rows = [row for row in study() if row.recipe == "published"]
+    assert len(rows) == 3 * 3 * 7 + 2 * 7 + 4
+    assert {row.algorithm for row in rows[:63]} == {"ARS", "PPO", "A2C"}
+    assert [row.seed for row in rows[:63]] == sorted(row.seed for row in rows[:63])
+    assert [row.algorithm for row in rows[63:70]] == ["DDPG"] * 7
+    assert all("HER" in row.algorithm for row in rows[-4:])
+    assert len(set(map(str, rows))) == len(rows) == len({row.stem for row in rows})
+
+
+def test_names_choose_rows() -> None:
+    """No environment means all, no algorithm means all that the paper ran there."""
+    assert len(planned(None, None)) == 39
+    assert [row.algorithm for row in planned("FetchWasteSorting", None)] == list(ENVIRONMENTS["FetchWasteSorting"].runs)
+    assert [row.seed for row in planned("CopperNet", "ARS", seeds=3)] == [0, 1, 2]
+    assert len(planned(None, "SAC")) == 7
+
+
+def test_goal_task_learns_with_hindsight(toy: PaperEnvironment) -> None:
+    """Successes count when they come, in the number of episodes asked for."""
+    del toy
+    found = run_row(Row(environment="Toy", algorithm="SAC-HER", steps=110), success_episodes=40)
+    assert found.evaluation.episodes == 40
+    assert found.evaluation.success == 50.0
+    assert found.evaluation.mean == found.end_return == -10.0
+    assert found.settings["policy"] == "MultiInputPolicy"
+
+
+def recipe(algorithm: str, environment: dict[str, Any] | None = None, **parameters: Any) -> Recipe:
+    """Return a recipe with four copies."""
+    return Recipe.model_validate(
+        {
+            "name": "mine",
+            "title": "a recipe",
+            "run": {"envs": 4},
+            "environment": environment or {},
+            "learner": {"algorithm": algorithm, "parameters": parameters},
+        }
+    )
+
+
+def test_tuned_network_counts_steps_and_episodes_over_the_copies() -> None:
+    """As many environment steps as asked for, the returns of all copies, the paper's reward."""
+    row = Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=800)
+    trained = train_tuned(COPPER, row, lambda *_: None, recipe("PPO", n_steps=50, batch_size=100))
+    assert (trained.steps, len(trained.returns), trained.ends[-1]) == (800, 16, 800)
+    assert all(-5e8 < value < -4.6e7 for value in trained.returns)
+    with pytest.raises(RecipeError, match="keeps the paper's problem"):
+        train_tuned(COPPER, row, lambda *_: None, recipe("PPO", {"reward": "circularity"}))
+    with pytest.raises(RecipeError, match="uses SAC, but the row says PPO"):
+        train_tuned(COPPER, row, lambda *_: None, recipe("SAC"))
+
+
+def test_tuned_robot_trains_in_copies(toy: PaperEnvironment) -> None:
+    """A goal task gets hindsight and as many steps as asked for."""
+    row = Row(environment="Toy", algorithm="SAC", recipe="tuned", steps=120)
+    trained = train_tuned(toy, row, lambda *_: None, recipe("SAC", learning_starts=100, batch_size=16))
+    assert (trained.steps, trained.returns) == (120, [-10.0] * 12)
+
+
+def test_rows_that_cannot_run_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Too few steps for an episode, and an environment that is not there, are errors."""
+    with pytest.raises(CirlError, match="no training episode ended"):
+        run_row(Row(environment="CopperNet", algorithm="A2C", steps=5))
+    monkeypatch.delitem(gymnasium.registry, COPPER.id)
+    with pytest.raises(RunError, match="does not register it"):
+        run_row(Row(environment="CopperNet", algorithm="A2C", steps=5))
