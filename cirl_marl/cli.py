@@ -16,10 +16,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from cirl_marl.catalogue import load_network, networks, recipes
-from cirl_marl.controllers import Constant, Controller, Neutral, Random, Scripted
+from cirl_marl.controllers import Constant, Controller, Random, Scripted
 from cirl_marl.errors import CirlError, DefinitionError, LearnerError, unknown
 from cirl_marl.evaluate import Rollout, interval_ends, rollout
-from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
 
 app = typer.Typer(
@@ -83,7 +82,8 @@ def show(
     for service in found.services:
         high = "" if np.isinf(service.high) else f" and at most {service.high:g}"
         console.print(
-            f"service '{service.id}': {service.quantity} of {service.provider} at least {service.low:g}{high}"
+            f"service '{service.id}': {service.measure or service.quantity} of {service.provider} "
+            f"at least {service.low:g}{high}"
         )
     console.print(f"λ of the start state: {float(found.circularity(flow)):.5g} {found.mass_unit}")
     path = picture or Path(f"{found.name}.png")
@@ -121,14 +121,17 @@ def simulate(
     network: NetworkName,
     control: Annotated[str, typer.Option(help=f"Who acts: {', '.join(CONTROLS)}.")] = "neutral",
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="AGENT=VALUE in [-1, 1] for --control constant; repeatable.")
+        list[str] | None,
+        typer.Option(
+            "--set", help="AGENT=VALUE in [-1, 1], held constant under --control constant or scripted; repeatable."
+        ),
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Control intervals; default: the horizon.")] = None,
     seed: Seed = 0,
     scenario: Scenario = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
 ) -> None:
-    """Simulate a network under neutral, constant or random control; write a CSV and a picture."""
+    """Simulate a network under neutral, constant, random or scripted control; write a CSV and a picture."""
     from cirl_marl.report.curves import save_trajectory
 
     controller = _controller(control, set_ or [])
@@ -140,8 +143,8 @@ def simulate(
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{found.name}_{control}"
     time = interval_ends(found)
-    _write_csv(folder / f"{name}.csv", found, time, run)
-    save_trajectory(folder / f"{name}.png", found, time, run.stock.T, run.flow.T, run.circularity[0])
+    _write_csv(folder / f"{name}.csv", env, time, run)
+    save_trajectory(folder / f"{name}.png", found, time, run.stock.T, run.flow.T, run.circularity[0], load=run.load.T)
     console.print(
         f"λ̄ = {float(run.episode_circularity[0]):.5g} {found.mass_unit}, "
         f"service level {float(run.episode_service[0]):.4f}"
@@ -275,12 +278,8 @@ def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:
 def _controller(control: str, settings: list[str]) -> Controller:
     if control not in CONTROLS:
         raise CirlError(f"--control: {unknown('control', control, CONTROLS)}")
-    if settings and control != "constant":
-        raise CirlError(f"--set goes with --control constant, not with {control}")
-    if control == "neutral":
-        return Neutral()
-    if control in ("random", "scripted"):
-        return Random() if control == "random" else Scripted()
+    if settings and control not in ("constant", "scripted"):
+        raise CirlError(f"--set goes with --control constant or scripted, not with {control}")
     actions = {}
     for setting in settings:
         agent, _, value = setting.partition("=")
@@ -288,21 +287,26 @@ def _controller(control: str, settings: list[str]) -> Controller:
             actions[agent] = float(value)
         except ValueError:
             raise CirlError(f"--set {setting}: needs AGENT=VALUE with a number in [-1, 1]") from None
-    return Constant(actions)
+    if control == "random":
+        return Random()
+    return Scripted(actions) if control == "scripted" else Constant(actions)
 
 
-def _write_csv(path: Path, network: Network, time: np.ndarray, run: Rollout) -> None:
+def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> None:
     from cirl_marl.learners.run import write_atomically
 
+    network, physics = env.network, env.dynamics.inner
     header = [f"time ({network.time_unit})", f"circularity ({network.mass_unit})", "service level"]
     header += [f"stock of {node.id} ({network.mass_unit})" for node in network.nodes]
     header += [f"flow of {arc.id} ({network.mass_unit}/{network.time_unit})" for arc in network.arcs]
+    header += [f"mass on {line.id} ({network.mass_unit})" for line in env.dynamics.batches.lines]
+    header += [physics.names[row] for row in physics.visible]
 
     def write(target: Path) -> None:
         with target.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(header)
-            columns = (time, run.circularity[0], run.service[0], *run.stock.T, *run.flow.T)
+            columns = (time, run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
             writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
 
     write_atomically(path, write)

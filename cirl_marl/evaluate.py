@@ -33,6 +33,8 @@ class Rollout:
         returns: sum of the rewards of each agent, shape (agents, B).
         stock: stocks after each interval in the first copy, shape (steps, nodes), mass.
         flow: mean flows of each interval in the first copy, shape (steps, arcs), mass/time.
+        load: masses that batch arcs hold after each interval in the first copy, shape (steps, batch arcs), mass.
+        inner: inner states after each interval in the first copy, those that an agent may see, shape (steps, states).
         final_stock: mean over copies of the last stocks, shape (nodes,), mass.
         mean_flow: mean over copies and time of the flows, shape (arcs,), mass/time.
     """
@@ -44,6 +46,8 @@ class Rollout:
     returns: Floats
     stock: Floats
     flow: Floats
+    load: Floats
+    inner: Floats
     final_stock: Floats
     mean_flow: Floats
 
@@ -117,6 +121,8 @@ def rollout(
     nodes = len(env.network.nodes)
     stock = np.empty((steps, nodes))
     flow = np.empty((steps, len(env.network.arcs)))
+    batches, physics = env.dynamics.batches, env.dynamics.inner
+    load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
     for t in range(steps):
         outcome = env.advance(env.stack(controller.act(observations)))
@@ -125,12 +131,13 @@ def rollout(
         local += outcome.local
         returns += outcome.reward
         stock[t], flow[t] = env.physical.stock[:nodes, 0], outcome.flow[:, 0]
+        load[t], inner[t] = batches.loads(env.physical.stock)[:, 0], env.physical.inner[physics.visible, 0]
         total_flow += outcome.flow.mean(axis=1)
         observations = env.by_agent(outcome.observation)
         if progress is not None:
             progress(t + 1)
     final = env.physical.stock[:nodes].mean(axis=1)
-    return Rollout(circularity, mean, service, local, returns, stock, flow, final, total_flow / steps)
+    return Rollout(circularity, mean, service, local, returns, stock, flow, load, inner, final, total_flow / steps)
 
 
 def interval_ends(network: Network) -> Floats:

@@ -50,7 +50,7 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         }
         box = self.flat.observation_space
         assert isinstance(box, spaces.Box)
-        self.observation_space = spaces.Dict(
+        self.observation_space: spaces.Space[Any] = spaces.Dict(
             {part: spaces.Box(box.low[rows], box.high[rows], dtype=np.float32) for part, rows in self._parts.items()}
         )
         self.action_space = self.flat.action_space

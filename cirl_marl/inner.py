@@ -26,6 +26,7 @@ class InnerPhysics:
         owners: compartments with a model, in network order.
         rows: rows of each owner's state.
         observed: rows of each owner's state that an agent sees.
+        visible: all of them, in order; the others are states of a simulator.
         measure_names: ``compartment.measure`` of each measured quantity.
         ranged: rows whose start is drawn from a range; the others are drawn by their models.
         low: lower ends of the initial ranges, shape (ranged rows,).
@@ -44,6 +45,8 @@ class InnerPhysics:
         edges = np.cumsum([0, *(len(model.state_names) for model in self._models)]).tolist()
         self.rows = {owner: slice(edges[i], edges[i + 1]) for i, owner in enumerate(self.owners)}
         self.observed = {owner: self._observed(owner) for owner in self.owners}
+        visible = [row for rows in self.observed.values() for row in sorted(rows)]
+        self.visible = np.array(visible, dtype=np.intp)
         euler = network.episode.solver == "euler"
         self._discrete = [i for i, model in enumerate(self._models) if hasattr(model, "interval")]
         self._own_step = [

@@ -116,7 +116,7 @@ class ObservationLayout:
         self._measures = inner.measure_names
         for row, name in enumerate(inner.measure_names, signals.measures.start):
             self._inner[name.split(".")[0]].append(row)
-        self._load = {line.id: signals.loads.start + i for i, line in enumerate(batches.lines)}
+        self._load: dict[str, int] = {line.id: signals.loads.start + i for i, line in enumerate(batches.lines)}
         self._hidden = {*range(first, signals.states.stop)}.difference(*self._inner.values())
         self._observed = {**network.node_index, **{name: first + i for i, name in enumerate(inner.names)}}
         self._network = network
@@ -168,9 +168,8 @@ class ObservationLayout:
         if quantity == "measure":
             first: int = self.signals.measures.start
             return first + self._measures.index(f"{compartment}.{measure}")
-        if quantity == "stock" and compartment in self._load:
-            return self._load[compartment]
-        return self._position[compartment]
+        rows = self._load if quantity == "stock" and compartment in self._load else self._position
+        return rows[compartment]
 
     def _rows(self, agent: str, mode: str) -> Iterator[int]:
         network, signals = self._network, self.signals

@@ -77,8 +77,9 @@ class DeliveryTruck(TransportTruck):
 
     def _at(self, state: Floats, place_m: float) -> NDArray[np.bool_]:
         position_m, speed_m_s, destination_m = state
-        near: NDArray[np.bool_] = np.abs(position_m - place_m) <= self.reach_m
-        return near & (np.abs(speed_m_s) <= self.rest_m_s) & (destination_m == place_m)
+        near, slow = np.abs(position_m - place_m) <= self.reach_m, np.abs(speed_m_s) <= self.rest_m_s
+        there: NDArray[np.bool_] = near & slow & (destination_m == place_m)
+        return there
 
     def _heading(self, state: Floats, where: NDArray[np.bool_], place_m: float) -> Floats:
         turned = state.copy()

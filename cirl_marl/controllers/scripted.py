@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Arrays, Neutral
+from cirl_marl.controllers.basic import Arrays, Constant
 from cirl_marl.elements import ControlKind
+from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
 from cirl_marl.vector_env import VectorEnv
 
 Seen = dict[str, Floats]
 """Observed states of an agent's own model by name, shape (B,) each, in physical units."""
+
+Script = Callable[[Seen], Floats]
+"""Physical inputs, shape (inputs, B), from what is seen."""
 
 OPEN, CLOSED = 1.0, -1.0
 """Input of the fingers."""
@@ -96,7 +100,7 @@ def incinerator(seen: Seen) -> Floats:
 HOLD_KJ_MIN, GAIN_KJ_MIN_K = 6.4e5, 3e4
 """Heat that the stationary plant gives at 1000 °C, and a proportional gain. [chosen]"""
 
-SCRIPTS: dict[str, Callable[[Seen], Floats]] = {
+SCRIPTS: dict[str, Script] = {
     "fetch": fetch,
     "reacher": reacher,
     "delivery_truck": truck,
@@ -106,27 +110,46 @@ SCRIPTS: dict[str, Callable[[Seen], Floats]] = {
 
 
 class Scripted:
-    """Acts by the script for the agent's kind of model; agents without one stay neutral."""
+    """Acts by the script for the agent's kind of model; agents without one, and those held constant, do not listen."""
+
+    def __init__(self, constant: Mapping[str, float] | None = None) -> None:
+        """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral."""
+        self._constant = Constant(constant)
+        self._held = frozenset(constant or ())
+        self._scripts: dict[str, tuple[Script, dict[str, int], float, float]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
-        """Find the script of each agent and what it reads."""
-        self._neutral = Neutral()
-        self._neutral.start(env, seed)
-        self._scripts: dict[str, tuple[Callable[[Seen], Floats], dict[str, int], float, float]] = {}
+        """Find the script of each agent and what it reads.
+
+        Raises:
+            ControlError: if an agent that is held constant does not act or its value is out of bounds.
+        """
+        self._constant.start(env, seed)
+        self._scripts = {}
         for agent in env.agents:
             compartment = env.network.compartments[agent]
             model, control = compartment.model, compartment.control
-            kind = getattr(getattr(model, "robot", model), "kind", None)
-            if kind not in SCRIPTS or control is None or control.kind is not ControlKind.INPUT:
+            script = SCRIPTS.get(getattr(getattr(model, "robot", model), "kind", ""))
+            if script is None or agent in self._held or control is None or control.kind is not ControlKind.INPUT:
                 continue
-            own = {name.split(".")[1]: i for i, name in enumerate(env.layout.names[agent]) if f"{agent}." in name}
-            middle, half = (control.high + control.low) / 2, (control.high - control.low) / 2
-            self._scripts[agent] = SCRIPTS[kind], own, middle, half
+            own = f"{agent}."
+            columns = {
+                name.removeprefix(own): i for i, name in enumerate(env.layout.names[agent]) if name.startswith(own)
+            }
+            self._scripts[agent] = script, columns, (control.high + control.low) / 2, (control.high - control.low) / 2
 
     def act(self, observations: Arrays) -> Arrays:
-        """Return each agent's action."""
-        actions = dict(self._neutral.act(observations))
-        for agent, (script, own, middle, half) in self._scripts.items():
-            seen = {name: observations[agent][:, i].astype(np.float64) for name, i in own.items()}
-            actions[agent] = np.clip((script(seen) - middle) / half, -1.0, 1.0).T
+        """Return each agent's action.
+
+        Raises:
+            ControlError: if an agent does not see a state that its script needs.
+        """
+        actions = dict(self._constant.act(observations))
+        for agent, (script, columns, middle, half) in self._scripts.items():
+            seen = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}
+            try:
+                inputs = script(seen)
+            except KeyError as missing:
+                raise ControlError(f"scripted control of '{agent}' needs to see its state {missing}") from None
+            actions[agent] = np.clip((inputs - middle) / half, -1.0, 1.0).T
         return actions

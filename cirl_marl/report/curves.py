@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
+from cirl_marl.elements import Law
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.report.style import DASHES, MUTED, SERIES, dressed, save, spoken
@@ -104,7 +105,14 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
 
 
 def save_trajectory(
-    path: str | Path, network: Network, time: Floats, stock: Floats, flow: Floats, circularity: Floats
+    path: str | Path,
+    network: Network,
+    time: Floats,
+    stock: Floats,
+    flow: Floats,
+    circularity: Floats,
+    *,
+    load: Floats | None = None,
 ) -> Path:
     """Save stocks, flows and λ over time as a PNG.
 
@@ -117,6 +125,7 @@ def save_trajectory(
         stock: stocks, shape (nodes, steps), mass.
         flow: flows, shape (arcs, steps), mass/time.
         circularity: λ, shape (steps,), mass.
+        load: masses on batch arcs, shape (batch arcs, steps), mass; None leaves them out.
 
     Returns:
         The path.
@@ -128,9 +137,14 @@ def save_trajectory(
     stock = _shaped("stock", stock, (len(network.nodes), *steps))
     flow = _shaped("flow", flow, (len(network.arcs), *steps))
     circularity = _shaped("circularity", circularity, steps)
+    held = [node.id for node in network.nodes]
+    if load is not None:
+        on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
+        held += [f"on {arc}" for arc in on_the_way]
+        stock = np.concatenate([stock, _shaped("load", load, (len(on_the_way), *steps))])
     figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
     above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.25, 0.8))
-    _draw_largest(above, time, stock, [node.id for node in network.nodes], "Stocks", mass)
+    _draw_largest(above, time, stock, held, "Stocks", mass)
     _draw_largest(middle, time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}")
     below.plot(time, circularity, color=SERIES[0], linewidth=1.8, marker=_dots(time))
     dressed(below, title="Circularity", ylabel=f"λ / {mass}")
