@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cirl_marl.elements import Arc, Law, Role
+from cirl_marl.elements import Law, Role
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.rowsum import RowSum
 
 if TYPE_CHECKING:
     from cirl_marl.inner import InnerPhysics
@@ -68,7 +69,6 @@ class Batches:
 
     Attributes:
         names: what each row holds.
-        held: rows of each batch arc, by its id.
         aboard: row of what the vehicle of an arc carries, by the arc's id.
         arcs: position of each batch arc among the arcs.
         lines: the batch arcs.
@@ -78,59 +78,88 @@ class Batches:
         """Lay out the rows after those of the nodes."""
         self._network = network
         self.arcs = [k for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH]
-        self.names: tuple[str, ...] = ()
-        self.lines: list[Line] = []
-        for k in self.arcs:
-            self._add(k)
-        self.held = {line.id: line.rows for line in self.lines}
+        names: list[str] = []
+        self.lines = [self._line(k, names) for k in self.arcs]
+        self.names = tuple(names)
         self.aboard = {line.id: line.first for line in self.lines if not line.slots}
-        self._schedule = [_schedule(network.arcs[k], network) for k in self.arcs]
+        self._releasing = [line for line in self.lines if line.by]
+        self._vehicles = [(i, line) for i, line in enumerate(self.lines) if not line.slots]
+        self._receiving = sorted({line.recipient for line in self.lines})
+        count, rows = len(self.lines), len(network.nodes) + len(self.names) + 1
+        every, lines = np.arange(count), self.lines
+        self._delivery = RowSum([line.recipient for line in lines], every, np.ones(count), (rows, count))
+        self._arrivals = RowSum(np.zeros(count, int), every, [line.arrives for line in lines], (1, count))
+        self._held = RowSum(
+            [i for i, line in enumerate(lines) for _ in line.rows],
+            [row for line in lines for row in line.rows],
+            np.ones(sum(len(line.rows) for line in lines)),
+            (count, rows),
+        )
+        self._delayed = np.flatnonzero([line.slots > 0 for line in lines])
+        self._first = np.array([lines[i].first for i in self._delayed], dtype=np.intp)[:, None]
+        self._slots = np.array([lines[i].slots for i in self._delayed], dtype=np.intp)[:, None]
+        self._compile_schedule()
+
+    def _compile_schedule(self) -> None:
+        """Collect the masses that leave on schedule, and the donors of them."""
+        network, lines = self._network, [line for line in self.lines if not line.by]
+        count, rows = len(lines), len(network.nodes) + len(self.names) + 1
+        self._schedule = np.zeros((count, network.episode.horizon))
+        for masses, line in zip(self._schedule, lines, strict=True):
+            for time, mass in network.arcs[network.arc_index[line.id]].batches:
+                step = round(time / network.episode.control_interval)
+                if step < len(masses):
+                    masses[step] += mass
+        self._sent_first = np.array([line.first for line in lines], dtype=np.intp)[:, None]
+        self._sent_slots = np.array([line.slots for line in lines], dtype=np.intp)[:, None]
+        self._sent_donor = np.array([line.donor for line in lines], dtype=np.intp)
+        self._departure = RowSum(self._sent_donor, np.arange(count), -np.ones(count), (rows, count))
+        self._departures = RowSum(np.zeros(count, int), np.arange(count), [line.leaves for line in lines], (1, count))
 
     def __len__(self) -> int:
         """Number of rows."""
         return len(self.names)
 
-    def _add(self, k: int) -> None:
+    def _line(self, k: int, names: list[str]) -> Line:
+        """Lay out the rows of one arc after those that have ``names``, and name them."""
         network, arc = self._network, self._network.arcs[k]
-        start = len(network.nodes) + len(self.names)
+        start = len(network.nodes) + len(names)
         slots = round(arc.delay / network.episode.control_interval)
         tail = [f"slot_{i}" for i in range(slots)] if slots else ["packed", "aboard"]
-        self.names += tuple(f"{arc.id}.{name}" for name in ("collecting", *tail))
+        names += (f"{arc.id}.{name}" for name in ("collecting", *tail))
         sign = float(network.sustainability[k])
         donor = network.nodes[network.node_index[arc.donor]]
         early = donor.role in (Role.NONRENEWABLE_RESERVOIR, Role.ENVIRONMENT)
-        self.lines.append(
-            Line(
-                id=arc.id,
-                by=arc.by,
-                port=arc.port,
-                unit=arc.rate,
-                donor=network.node_index[arc.donor],
-                recipient=network.node_index[arc.recipient],
-                collecting=start,
-                packed=None if slots else start + 1,
-                first=start + (1 if slots else 2),
-                slots=slots,
-                leaves=sign if early else 0.0,
-                arrives=0.0 if early else sign,
-            )
+        return Line(
+            id=arc.id,
+            by=arc.by,
+            port=arc.port,
+            unit=arc.rate,
+            donor=network.node_index[arc.donor],
+            recipient=network.node_index[arc.recipient],
+            collecting=start,
+            packed=None if slots else start + 1,
+            first=start + (1 if slots else 2),
+            slots=slots,
+            leaves=sign if early else 0.0,
+            arrives=0.0 if early else sign,
         )
 
     def dispatch(self, stock: Floats, step: Integers) -> Floats:
         """Send off, in place, what is scheduled for the start of the interval; return its m_fb, shape (B,).
 
-        A donor that holds less than a scheduled batch sends what it has.
+        A donor that holds less than is scheduled sends what it has, split in proportion.
         """
-        counted = np.zeros(stock.shape[1])
-        copies = np.arange(stock.shape[1])
-        for line, schedule in zip(self.lines, self._schedule, strict=True):
-            if schedule is None:
-                continue
-            mass = np.minimum(schedule[step], stock[line.donor])
-            stock[line.donor] -= mass
-            # the slot that is read at the end of the last interval of the delay
-            stock[line.first + (step - 1) % line.slots, copies] += mass
-            counted += line.leaves * mass
+        mass = self._schedule[:, step]
+        if not mass.any():
+            return np.zeros(stock.shape[1])
+        asked = -self._departure(mass)
+        share = np.divide(stock * (1.0 - 1e-12), asked, out=np.ones_like(asked), where=asked > stock)
+        mass = mass * share.take(self._sent_donor, axis=0)
+        self._departure.add_to(stock, mass)
+        # the slot that is read at the end of the last interval of the delay
+        stock[self._sent_first + (step - 1) % self._sent_slots, np.arange(stock.shape[1])] += mass
+        counted: Floats = self._departures(mass)[0]
         return counted
 
     def settle(self, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> tuple[Floats, Floats]:
@@ -145,24 +174,21 @@ class Batches:
         Returns:
             Mass delivered by each batch arc, shape (batch arcs, B), and m_fb of the interval's end, shape (B,).
         """
-        counted = np.zeros(stock.shape[1])
         delivered = np.empty((len(self.lines), stock.shape[1]))
-        copies = np.arange(stock.shape[1])
-        for i, line in enumerate(self.lines):
-            if line.slots:
-                slot = line.first + step % line.slots
-                delivered[i] = stock[slot, copies]
-                stock[slot, copies] = 0.0
-            else:
-                delivered[i] = np.where(physics.arrive(line.id, inner), stock[line.first], 0.0)
-                stock[line.first] -= delivered[i]
-            stock[line.recipient] += delivered[i]
-            counted += line.arrives * delivered[i]
-            physics.receive(line.recipient, inner, delivered[i])
-        for line in self.lines:
-            if line.by:
-                counted += line.leaves * self._collect(line, stock, physics.released(line.by, line.port, inner))
-                self._send(line, stock, inner, step, physics)
+        slots, copies = self._first + step % self._slots, np.arange(stock.shape[1])
+        delivered[self._delayed] = stock[slots, copies]
+        stock[slots, copies] = 0.0
+        for i, line in self._vehicles:
+            delivered[i] = np.where(physics.arrive(line.id, inner), stock[line.first], 0.0)
+            stock[line.first] -= delivered[i]
+        arrived = self._delivery(delivered)
+        stock += arrived
+        for node in self._receiving:
+            physics.receive(node, inner, arrived[node])
+        counted: Floats = self._arrivals(delivered)[0]
+        for line in self._releasing:
+            counted += line.leaves * self._collect(line, stock, physics.released(line.by, line.port, inner))
+            self._send(line, stock, inner, step, physics)
         return delivered, counted
 
     def _collect(self, line: Line, stock: Floats, released: Floats) -> Floats:
@@ -186,18 +212,4 @@ class Batches:
 
     def loads(self, stock: Floats) -> Floats:
         """Return the mass that each batch arc holds, shape (batch arcs, B)."""
-        if not self.lines:
-            return np.empty((0, stock.shape[1]))
-        return np.stack([stock[line.rows.start : line.rows.stop].sum(axis=0) for line in self.lines])
-
-
-def _schedule(arc: Arc, network: Network) -> Floats | None:
-    """Mass that leaves at the start of each control interval, shape (horizon,); None without a schedule."""
-    if arc.by:
-        return None
-    masses = np.zeros(network.episode.horizon)
-    for time, mass in arc.batches:
-        step = round(time / network.episode.control_interval)
-        if step < len(masses):
-            masses[step] += mass
-    return masses
+        return self._held(stock)

@@ -91,7 +91,7 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
     if arc.law is Law.COMPARTMENT:
         yield from _model_flow_problems(where, arc, network)
     if arc.law is Law.BATCH:
-        yield from _batch_problems(where, arc, network)
+        yield from _batch_problems(where, arc, network.episode.control_interval, nodes)
     if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and arc.rate == 0:
         yield f"{where}: law '{arc.law}' needs a positive rate"
     if not arc.flow or any(not math.isfinite(f) or f < 0 for f in arc.flow):
@@ -121,8 +121,7 @@ def _model_flow_problems(where: str, arc: Arc, network: Network) -> Iterator[str
         yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
 
 
-def _batch_problems(where: str, arc: Arc, network: Network) -> Iterator[str]:
-    interval = network.episode.control_interval
+def _batch_problems(where: str, arc: Arc, interval: float, nodes: Mapping[str, Node]) -> Iterator[str]:
     vehicle = hasattr(arc.model, "boarding")
     if vehicle == (arc.delay > 0):
         yield f"{where}: law 'batch' needs a delay or a vehicle as its model, and not both"
@@ -140,7 +139,7 @@ def _batch_problems(where: str, arc: Arc, network: Network) -> Iterator[str]:
     for what, given in (("set_point", arc.set_point), ("control of kind 'rate'", _rate_control(arc))):
         if given is not None:
             yield f"{where}: law 'batch' takes no {what}"
-    donor = {node.id: node for node in network.nodes}.get(arc.donor)
+    donor = nodes.get(arc.donor)
     if arc.by and donor is not None:
         ports = getattr(donor.model, "ports", ())
         if arc.by != donor.id or not ports:

@@ -70,6 +70,8 @@ def reacher(seen: Seen) -> Floats:
 
 UPPER_M, LOWER_M = 0.1, 0.11
 """Lengths of the Reacher's arms, from its model file."""
+ELBOW_RAD = 2.95
+"""Most that the script bends the elbow; at the joint's end, 3.0, the torque would never fall to zero."""
 STIFFNESS, DAMPING = 0.4, 0.05
 """Torque per rad and per rad/s. [chosen: fast and hardly overshooting]"""
 
@@ -78,7 +80,7 @@ def _joint_angles(x_m: Floats, y_m: Floats, second: Floats) -> tuple[Floats, Flo
     """Return the angles of both joints that put the tip at (x, y), the elbow bent to the side it already is."""
     squared = x_m**2 + y_m**2
     cosine = np.clip((squared - UPPER_M**2 - LOWER_M**2) / (2.0 * UPPER_M * LOWER_M), -1.0, 1.0)
-    elbow = np.where(second >= 0.0, 1.0, -1.0) * np.arccos(cosine)
+    elbow = np.where(second >= 0.0, 1.0, -1.0) * np.minimum(np.arccos(cosine), ELBOW_RAD)
     shoulder = np.arctan2(y_m, x_m) - np.arctan2(LOWER_M * np.sin(elbow), UPPER_M + LOWER_M * np.cos(elbow))
     return shoulder, elbow
 

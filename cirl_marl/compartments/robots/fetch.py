@@ -59,8 +59,9 @@ class FetchEngine(Engine):
         self.env.goal = column[len(OBSERVATION) + 3 : len(OBSERVATION) + 6].copy()
 
     def _act(self, inputs: Floats) -> None:
-        self.env._set_action(inputs)
-        self.env._mujoco_step(inputs)
+        action = np.clip(inputs, -1.0, 1.0)  # as the library's own step does
+        self.env._set_action(action)
+        self.env._mujoco_step(action)
         self.env._step_callback()
 
     def _show(self) -> Floats:

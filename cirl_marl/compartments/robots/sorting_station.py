@@ -55,7 +55,7 @@ class SortingStation:
         check_positive(self.kind, item_kg=self.item_kg)
         for name in ("items_per_batch", "attempt_steps"):
             value = getattr(self, name)
-            if value != int(value) or value < 1:
+            if not (float(value).is_integer() and value >= 1):
                 raise CirlError(f"{self.kind}: {name} = {value!r}, but it must be a whole number of at least 1.")
 
     @property

@@ -1,0 +1,343 @@
+"""The robots are the libraries' own, as pure functions; the station keeps its books; the scripts do the task."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cirl_marl.compartments import model_class, models
+from cirl_marl.compartments.robots import sorting_station
+from cirl_marl.compartments.robots.fetch import BIN, Fetch, WasteSorting
+from cirl_marl.compartments.robots.fetch import engine as fetch_engine
+from cirl_marl.compartments.robots.reacher import Reacher
+from cirl_marl.compartments.robots.reacher import engine as reacher_engine
+from cirl_marl.compartments.robots.sorting_station import BOOKS, SortingStation
+from cirl_marl.controllers.scripted import Seen, fetch, reacher
+from cirl_marl.errors import CirlError
+from cirl_marl.rowsum import Floats
+
+Robot = Fetch | Reacher
+ROBOTS: tuple[Robot, ...] = (Fetch(), Reacher())
+ITEM_KG = 100.0
+
+
+def reference(robot: Robot) -> Any:
+    """Return the library's environment of a robot, made by its own id."""
+    if isinstance(robot, Reacher):
+        return gymnasium.make("Reacher-v5")
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    return gymnasium.make("FetchPickAndPlace-v4")
+
+
+def library_start(env: Any, seed: int) -> Floats:
+    """Reset the library's environment; return what it shows, with our target."""
+    seen, _ = env.reset(seed=seed)
+    if isinstance(seen, dict):
+        env.unwrapped.goal = np.array(BIN)
+        seen["desired_goal"] = np.array(BIN)
+    return flat(seen)
+
+
+def flat(seen: Any) -> Floats:
+    """Return an observation of the library as one column."""
+    if isinstance(seen, dict):
+        seen = np.concatenate([seen[part] for part in ("observation", "achieved_goal", "desired_goal")])
+    column: Floats = np.asarray(seen)
+    return column
+
+
+def starts(robot: Robot | SortingStation, copies: int, first: int = 0) -> Floats:
+    """Return starts of seeds ``first``, ``first`` + 1, …, shape (k, copies)."""
+    return np.stack([robot.start(np.random.default_rng(first + i)) for i in range(copies)], axis=1)
+
+
+def actions(robot: Robot | SortingStation, steps: int, copies: int, seed: int = 7) -> Floats:
+    """Return random inputs, shape (steps, c, copies)."""
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, len(robot.input_names), copies))
+
+
+def roll(robot: Robot, state: Floats, inputs: Floats) -> Floats:
+    """Return the state after all the inputs."""
+    for held in inputs:
+        state = robot.advance(state, held, robot.interval)
+    return state
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: str(robot.kind))
+class TestRobots:
+    """What both robots have in common."""
+
+    @pytest.mark.parametrize("seed", [0, 1, 2])
+    def test_is_the_library_bit_for_bit(self, robot: Robot, seed: int) -> None:
+        """Equal seeds and actions give equal observations and rewards over an episode of 50 steps."""
+        env = reference(robot)
+        state = starts(robot, 1, seed)
+        shown = len(library_start(env, seed))
+        np.testing.assert_array_equal(state[:shown, 0], library_start(env, seed))
+        for held in actions(robot, 50, 1, seed):
+            seen, reward, *_ = env.step(held[:, 0])
+            state = robot.advance(state, held, robot.interval)
+            np.testing.assert_array_equal(state[:shown, 0], flat(seen))
+            assert robot.reward(state, held)[0] == reward
+        env.close()
+
+    def test_start_does_not_remember(self, robot: Robot) -> None:
+        """A start is a function of its stream, whatever the engine did before."""
+        fresh = starts(robot, 2)
+        roll(robot, starts(robot, 1, 50), actions(robot, 10, 1))
+        np.testing.assert_array_equal(starts(robot, 2), fresh)
+        assert (fresh[:, 0] != fresh[:, 1]).any()
+
+    def test_batch_is_its_columns(self, robot: Robot) -> None:
+        """A copy does not notice who else is in the batch, nor in what order."""
+        state, inputs = starts(robot, 4), actions(robot, 12, 4)
+        together = roll(robot, state, inputs)
+        order = np.array([2, 0, 3, 1])
+        np.testing.assert_array_equal(roll(robot, state[:, order], inputs[:, :, order]), together[:, order])
+        for i in range(4):
+            alone = roll(robot, state[:, [i]], inputs[:, :, [i]])
+            np.testing.assert_array_equal(alone[:, 0], together[:, i])
+
+    def test_snapshot_and_restore(self, robot: Robot) -> None:
+        """A copy of the array in mid-episode is a snapshot: going back repeats the same bits."""
+        inputs = actions(robot, 40, 1)
+        middle = roll(robot, starts(robot, 1), inputs[:20])
+        kept = middle.copy()
+        end = roll(robot, middle, inputs[20:])
+        other = roll(robot, middle, -inputs[20:])
+        assert (other != end).any()
+        np.testing.assert_array_equal(roll(robot, kept, inputs[20:]), end)
+
+    def test_advance_leaves_its_arguments_alone(self, robot: Robot) -> None:
+        """Pure: nothing is written into, nothing is shared."""
+        state, inputs = starts(robot, 2), actions(robot, 1, 2)[0]
+        kept = state.copy(), inputs.copy()
+        after = robot.advance(state, inputs, robot.interval)
+        np.testing.assert_array_equal(state, kept[0])
+        np.testing.assert_array_equal(inputs, kept[1])
+        assert not np.shares_memory(after, state)
+
+    def test_empty_batch(self, robot: Robot) -> None:
+        """No copies are no error."""
+        none, held = np.empty((len(robot.state_names), 0)), np.empty((len(robot.input_names), 0))
+        assert robot.advance(none, held, robot.interval).shape == none.shape
+        assert robot.reward(none, held).shape == robot.success(none, held).shape == (0,)
+
+    def test_names_and_interval(self, robot: Robot) -> None:
+        """As many names as rows; what is observed is a part of them; the step is the engine's."""
+        state = starts(robot, 1)
+        assert len(robot.state_names) == len(set(robot.state_names)) == len(state)
+        assert set(robot.observed) <= set(robot.state_names)
+        engine = fetch_engine() if isinstance(robot, Fetch) else reacher_engine()
+        assert robot.interval == engine.interval
+        with pytest.raises(CirlError, match=r"moves in steps of 0\.0[24], not 0\.1"):
+            robot.advance(state, np.zeros((len(robot.input_names), 1)), 0.1)
+
+
+class TestTasks:
+    """Rewards and successes."""
+
+    def test_goal_reward_is_the_library_s(self) -> None:
+        """For goals of any leading shape, as hindsight needs."""
+        rng = np.random.default_rng(0)
+        achieved = np.array(BIN) + rng.uniform(-0.06, 0.06, (5, 4, 3))
+        desired = np.broadcast_to(np.array(BIN), achieved.shape)
+        found = Fetch().goal_reward(achieved, desired)
+        np.testing.assert_array_equal(found, WasteSorting().compute_reward(achieved, desired, {}))
+        assert found.shape == (5, 4)
+        assert set(np.unique(found)) == {-1.0, 0.0}
+
+    def test_no_item_starts_in_the_bin(self) -> None:
+        """The target is out of the range in which objects appear, so nothing is sorted by doing nothing."""
+        state = starts(Fetch(), 40)
+        assert not Fetch().success(state, np.zeros((4, 40))).any()
+        offset = np.abs(state[3:5] - state[0:2])
+        assert offset.max() <= 0.16
+        assert 1.05 + 0.05 < BIN[0] < 1.55 - 0.05
+        assert 0.4 + 0.05 < BIN[1] < 1.1 - 0.05
+
+    def test_reacher_must_be_near_and_at_rest(self) -> None:
+        """Both conditions, both joints."""
+        state = np.zeros((len(Reacher().state_names), 4))
+        state[Reacher().state_names.index("distance_m")] = 0.0399, 0.0401, 0.0, 0.0
+        inputs = np.array([[0.0049, 0.0, 0.0051, 0.0], [-0.0049, 0.0, 0.0, -0.0051]])
+        np.testing.assert_array_equal(Reacher().success(state, inputs), [True, False, False, False])
+
+    @pytest.mark.parametrize(("robot", "script", "least"), [(Fetch(), fetch, 0.95), (Reacher(), reacher, 0.95)])
+    def test_scripts_do_the_task(self, robot: Robot, script: Callable[[Seen], Floats], least: float) -> None:
+        """Within 50 steps, in at least 95 of 100 attempts."""
+        copies = 40
+        state, done = starts(robot, copies, 1000), np.zeros(copies, dtype=bool)
+        for _ in range(50):
+            inputs = act(robot, script, state)
+            state = robot.advance(state, inputs, robot.interval)
+            done |= robot.success(state, inputs)
+        assert done.mean() >= least
+
+
+def act(robot: Robot, script: Callable[[Seen], Floats], state: Floats) -> Floats:
+    """Return the script's inputs, from what the robot's agent sees."""
+    rows = [robot.state_names.index(name) for name in robot.observed]
+    inputs: Floats = np.clip(script(dict(zip(robot.observed, state[rows], strict=True))), -1.0, 1.0)
+    return inputs
+
+
+@dataclass
+class Books:
+    """The rules of the station once more, for one copy, in plain Python."""
+
+    robot: Reacher
+    key: int
+    column: Floats
+    busy: bool = False
+    step: int = 0
+    done: int = 0
+    attempt: int = 0
+    now: tuple[bool, bool, bool] = field(default=(False, False, False))
+    reward: float = 0.0
+
+    def advance(self, inputs: Floats, stock_kg: float, items: int, steps: int) -> None:
+        """Move one interval."""
+        self.now, self.reward = (False, False, False), 0.0
+        if not self.busy:
+            self.step = 0
+            if stock_kg >= ITEM_KG * (1 - 1e-9):
+                self.column = self.robot.start(np.random.default_rng([self.key, self.attempt]))
+                self.attempt, self.busy = self.attempt + 1, True
+            return
+        self.column = self.robot.advance(self.column[:, None], inputs[:, None], self.robot.interval)[:, 0]
+        self.step += 1
+        self.reward = float(self.robot.reward(self.column[:, None], inputs[:, None])[0])
+        good = bool(self.robot.success(self.column[:, None], inputs[:, None])[0])
+        missed = not good and self.step == steps
+        if good or missed:
+            self.busy, self.done = False, self.done + 1
+        self.now = good, missed, self.done == items
+        self.done %= items
+
+
+class TestSortingStation:
+    """One item after another."""
+
+    @settings(max_examples=15)
+    @given(
+        seed=st.integers(0, 2**31),
+        items=st.integers(1, 3),
+        steps=st.integers(1, 5),
+        stocks=st.lists(st.sampled_from([0.0, 99.999, ITEM_KG * (1 - 1e-12), 250.0]), min_size=1, max_size=30),
+    )
+    def test_books(self, seed: int, items: int, steps: int, stocks: list[float]) -> None:
+        """Whatever the stock does, the station is its rules, bit for bit, in every copy and every row."""
+        easy = Reacher(reach_m=0.15, torque_n_m=0.6)  # often done at random, so that both ends of an attempt occur
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(sorting_station.ROBOTS, "reacher", easy)
+            station = SortingStation(form="reacher", items_per_batch=items, attempt_steps=steps, item_kg=ITEM_KG)
+            state = starts(station, 2, seed)
+            books = [Books(easy, int(state[BOOKS.index("key"), i]), state[len(BOOKS) :, i]) for i in range(2)]
+            rng = np.random.default_rng(seed)
+            for stock in stocks:
+                stock_kg, inputs = np.array([stock, 100.0]), rng.uniform(-1.0, 1.0, (2, 2))
+                state = station.advance(state, inputs, station.interval, stock_kg=stock_kg)
+                for i, own in enumerate(books):
+                    own.advance(inputs[:, i], stock_kg[i], items, steps)
+                    ledger = own.busy, own.step, own.done, *own.now, own.key, own.attempt
+                    np.testing.assert_array_equal(state[: len(BOOKS), i], ledger)
+                    np.testing.assert_array_equal(state[len(BOOKS) :, i], own.column)
+                np.testing.assert_array_equal(station.reward(state, inputs), [own.reward for own in books])
+                np.testing.assert_array_equal(station.released(state).T, [own.now[:2] for own in books])
+                np.testing.assert_array_equal(station.complete(state), [own.now[2] for own in books])
+
+    def test_sorts_a_batch(self) -> None:
+        """With the script every item of a batch of 3 is sorted; without an action every one is missed."""
+        for script, ports in ((fetch, [3, 0]), (lambda seen: np.zeros((4, 1)), [0, 3])):
+            station = SortingStation(items_per_batch=3, attempt_steps=30)
+            state, released, completed = starts(station, 1, 5), np.zeros((2, 1)), 0
+            for _ in range(3 * 31):
+                inputs = act(Fetch(), script, state[len(BOOKS) :])
+                stock_kg = 300.0 - 100.0 * released.sum(axis=0)
+                state = station.advance(state, inputs, 0.04, stock_kg=stock_kg)
+                released, completed = released + station.released(state), completed + int(station.complete(state)[0])
+            np.testing.assert_array_equal(released[:, 0], ports)
+            assert completed == 1
+            assert state[BOOKS.index("busy"), 0] == 0.0
+
+    def test_items_depend_on_the_key_only(self) -> None:
+        """What is done with one item does not change the next; another key gives others; presenting ignores actions."""
+        station = SortingStation(form="reacher", attempt_steps=3)
+        state = np.repeat(starts(station, 1), 3, axis=1)
+        state[BOOKS.index("key"), 2] += 1
+        rng, presented = np.random.default_rng(0), 0
+        for _ in range(12):
+            was_idle = state[BOOKS.index("busy"), 0] == 0
+            state = station.advance(state, rng.uniform(-1, 1, (2, 3)), station.interval, stock_kg=np.full(3, 1e3))
+            if was_idle:
+                presented += 1
+                np.testing.assert_array_equal(state[:, 0], state[:, 1])
+                assert (state[len(BOOKS) :, 0] != state[len(BOOKS) :, 2]).any()
+        assert presented == 3
+
+    def test_names_follow_the_form(self) -> None:
+        """State, inputs, observation and interval are the robot's, with the books."""
+        for robot in ROBOTS:
+            station = SortingStation(form=robot.kind)  # type: ignore[arg-type]
+            assert station.state_names == (*BOOKS, *robot.state_names)
+            assert station.observed == ("busy", *robot.observed)
+            assert (station.input_names, station.interval) == (robot.input_names, robot.interval)
+            assert len(station.ports) == len(station.released(starts(station, 1)))
+
+    @pytest.mark.parametrize(
+        ("given_", "message"),
+        [
+            ({"form": "fetcher"}, "Did you mean 'fetch'"),
+            ({"items_per_batch": 0}, "items_per_batch = 0"),
+            ({"attempt_steps": 2.5}, r"attempt_steps = 2\.5"),
+            ({"item_kg": 0.0}, r"item_kg = 0\.0"),
+        ],
+    )
+    def test_errors(self, given_: dict[str, Any], message: str) -> None:
+        """What has no meaning is refused by name."""
+        with pytest.raises(CirlError, match=message):
+            SortingStation(**given_)
+        with pytest.raises(CirlError, match=r"moves in steps of 0\.04, not 0\.02"):
+            SortingStation().advance(np.zeros((1, 1)), np.zeros((4, 1)), 0.02, stock_kg=np.zeros(1))
+
+
+class TestRegistry:
+    """Robots are found, and nobody else pays for them."""
+
+    def test_robots_are_found(self) -> None:
+        """By the registry, each by its kind."""
+        assert {"fetch", "reacher", "sorting_station"} <= set(models())
+        assert model_class("fetch") is Fetch
+        with pytest.raises(CirlError, match="Did you mean 'reacher'"):
+            model_class("reachers")
+
+    def test_light_kinds_do_not_load_mujoco(self) -> None:
+        """Only asking for a robot imports MuJoCo; the station's class alone makes no engine."""
+        code = (
+            "import sys, cirl_marl; from cirl_marl.compartments import model_class; model_class('digester');"
+            "print('mujoco' in sys.modules); model_class('fetch'); print('mujoco' in sys.modules)"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.split() == ["False", "True"]
+        assert done.stderr == ""
+
+    def test_models_are_pickled_without_an_engine(self) -> None:
+        """A model is its parameters, also after it has been used."""
+        for model in (*ROBOTS, SortingStation()):
+            model.start(np.random.default_rng(0))
+            packed = pickle.dumps(model)
+            assert len(packed) < 500
+            assert pickle.loads(packed) == model
