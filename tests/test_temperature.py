@@ -1,0 +1,51 @@
+"""carbo_net with the temperature of the urban troposphere as one more state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+
+from cirl_marl import VectorEnv, load_network
+from cirl_marl.controllers import Neutral
+from cirl_marl.evaluate import rollout
+from cirl_marl.network import Floats
+
+STEPS = 40
+
+
+def test_temperature_follows_the_stock() -> None:
+    """The stocks are those of the default scenario, and the temperature obeys the radiation balance driven by them."""
+    plain = rollout(VectorEnv("carbo_net", num_envs=1, horizon=STEPS), Neutral(), seed=0)
+    env = VectorEnv("carbo_net", num_envs=1, horizon=STEPS, scenario="temperature")
+    warm = rollout(env, Neutral(), seed=0)
+    np.testing.assert_allclose(warm.stock, plain.stock, rtol=1e-7)
+    assert env.dynamics.inner.names == ("urban_air.temperature_k",)
+
+    network = env.network
+    air = network.node_index["urban_air"]
+    env.reset(seed=0)
+    start = env.physical.stock[air, 0]
+    time = np.arange(STEPS + 1) * network.episode.control_interval
+    stock = CubicSpline(time, [start, *plain.stock[:, air]])
+    model = network.nodes[air].model
+
+    def slope(at: float, state: Floats) -> Floats:
+        return model.derivative(state[:, None], stock(np.array([[at]])))[:, 0]  # type: ignore[union-attr,no-any-return]
+
+    expected = solve_ivp(slope, (0.0, time[-1]), [288.33], rtol=1e-10, atol=1e-10, t_eval=time[1:]).y[0]
+    np.testing.assert_allclose(warm.inner[:, 0], expected, atol=1e-6)
+    assert abs(expected[-1] - 288.33) > 1e-3, "a temperature that does not move would prove nothing"
+
+
+def test_more_carbon_dioxide_is_warmer() -> None:
+    """The published sign: more of it in the air, less radiation leaves."""
+    env = VectorEnv(load_network("carbo_net", scenario="temperature"), num_envs=2, horizon=20)
+    env.reset(seed=0, options={"initial_state": {"urban_air": np.array([830.0, 1000.0])}})
+    neutral = env.stack({agent: np.tile(action, (2, 1)) for agent, action in env.neutral_action.items()})
+    for _ in range(20):
+        env.advance(neutral)
+    cold, warm = env.physical.inner[0]
+    assert warm > cold
+    assert cold == pytest.approx(288.33, abs=1.0)
