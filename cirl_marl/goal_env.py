@@ -23,7 +23,7 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
     """A ``SingleAgentEnv`` whose observation is a dictionary, as in gymnasium-robotics.
 
     The entries ``observation``, ``achieved_goal`` and ``desired_goal`` are what the agent's model calls so; the reward
-    is a function of the two goals, which ``compute_reward`` gives for any pair of them.
+    is its local one, a function of the two goals, which ``compute_reward`` gives for any pair of them.
 
     Attributes:
         flat: the same environment with all entries in one array.
@@ -36,7 +36,7 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         """Make the environment; arguments are those of ``SingleAgentEnv``.
 
         Raises:
-            CirlError: if the agent's model knows no goals, or they are not all observed.
+            CirlError: if the agent's model knows no goals, they are not all observed, or the reward is not ``local``.
         """
         self.flat = SingleAgentEnv(network, agent, **options)
         self.agent = self.flat.agent
@@ -45,6 +45,9 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         wanted = [getattr(self._model, f"{part.removesuffix('_goal')}_names", ()) for part in PARTS]
         if not all(wanted) or any(name not in names for part in wanted for name in part):
             raise CirlError(f"agent '{self.agent}' of '{self.flat.network.name}' has no goals to observe")
+        reward = options.get("reward") or self.flat.network.objective.reward
+        if reward != "local":  # hindsight would learn from two rewards that disagree
+            raise CirlError(f"agent '{self.agent}': a function of the goals is the reward 'local', not '{reward}'")
         self._parts = {
             part: np.array([names.index(name) for name in entries]) for part, entries in zip(PARTS, wanted, strict=True)
         }
@@ -63,6 +66,7 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Goals, dict[str, Any]]:
         """Start an episode; see ``SingleAgentEnv.reset``."""
+        super().reset(seed=seed)
         observation, info = self.flat.reset(seed=seed, options=options)
         return self._split(observation), info
 
@@ -73,7 +77,8 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:
         """Return the reward for goals of shape (..., 3); ``info`` has no influence."""
-        return self._model.goal_reward(np.asarray(achieved_goal), np.asarray(desired_goal))
+        reward = self._model.goal_reward(np.asarray(achieved_goal), np.asarray(desired_goal))
+        return reward / self.flat.network.compartments[self.agent].reward_scale
 
     def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> bool:
         """Return False: the task goes on when the goal is reached."""

@@ -55,6 +55,8 @@ class InnerPhysics:
             if i not in self._discrete and hasattr(model, "advance") and not (euler and hasattr(model, "derivative"))
         ]
         self._continuous = [i for i in range(len(owners)) if i not in {*self._discrete, *self._own_step}]
+        moving = [self.rows[self.owners[i]] for i in self._continuous]
+        self._moving = np.array([row for rows in moving for row in range(rows.start, rows.stop)], dtype=np.intp)
         self._starting = [i for i, model in enumerate(self._models) if hasattr(model, "start")]
         drawn = [self.rows[owner] for i, owner in enumerate(self.owners) if i not in self._starting]
         self.ranged = np.array([row for rows in drawn for row in range(rows.start, rows.stop)], dtype=np.intp)
@@ -94,6 +96,14 @@ class InnerPhysics:
             context = self._context(i, stock)
             slope[rows] = model.derivative(inner[rows], controls[self._inputs[i]], **context) * self._speed[i]
         return slope
+
+    def moved(self, inner: Floats, change: Floats) -> Floats:
+        """Return the states after continuous models changed by ``change``; states of the others keep their bits."""
+        if len(self._moving) == len(inner):
+            return inner + change
+        after = inner.copy()
+        after[self._moving] += change[self._moving]
+        return after
 
     def own_steps(self, inner: Floats, controls: Floats, interval: float, stock: Floats) -> tuple[Floats, Floats]:
         """Let models that bring their own step move by ``interval``.

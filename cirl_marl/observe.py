@@ -87,6 +87,8 @@ class ObservationLayout:
     Attributes:
         slices: rows of each agent in the stacked observation.
         names: what each entry of an agent's observation is.
+        array_order: stocks and inner states in the order in which all agents observe them and nothing else; empty if
+            they see other things too, or different ones.
         spaces: observation space of each agent; float32.
     """
 
@@ -137,6 +139,7 @@ class ObservationLayout:
             agent: Box(low[seen], high[seen], dtype=np.float32) for agent, seen in zip(agents, rows, strict=True)
         }
         self.names = {agent: tuple(self._names[row] for row in seen) for agent, seen in zip(agents, rows, strict=True)}
+        self.array_order = self._common_order(agents, mode)
         scales = np.array([c.scale for c in (*network.nodes, *network.arcs)])
         inside = np.ones(signals.inner + signals.measured)
         inverse_scale = 1.0 / np.concatenate([scales, inside, scales[signals.nodes :][batches.arcs]])
@@ -162,6 +165,14 @@ class ObservationLayout:
         table[self.signals.time] = time
         table[self.signals.levels] = levels
         return table.take(self._index, axis=0)
+
+    def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:
+        if mode == "stocks":
+            return self._network.observation.nodes
+        known = set(self._observed)
+        if mode == "model" and len(agents) == 1 and known.issuperset(self.names[agents[0]]):
+            return self.names[agents[0]]
+        return ()
 
     def row(self, compartment: str, quantity: str, measure: str = "") -> int:
         """Return the row of a compartment's ``stock``, ``flow`` or ``measure`` among the quantities."""

@@ -219,7 +219,7 @@ class Dynamics(FlowLaws):
             stock, moved, rate = self._move_what_is_there(stock, moved, rate)
         else:
             stock = self.incidence.add_to(stock.copy(), moved)
-        return stock, ahead + change, moved, rate
+        return stock, self.inner.moved(ahead, change), moved, rate
 
     def _move_what_is_there(self, stock: Floats, moved: Floats, rate: Floats) -> tuple[Floats, Floats, Floats]:
         """Move mass; scale the outflows of nodes that would be overdrawn to the stock they started with."""

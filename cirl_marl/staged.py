@@ -88,7 +88,8 @@ def time_window_circularity(
         raise CirlError(f"{len(masses)} masses, but {len(criticality)} criticalities")
     if not 0.0 <= success <= 100.0:
         raise CirlError(f"success is {success!r}; it must be a percentage")
-    if min(use, sorting, truck, incineration) < 0.0 or truck > use or use == 0.0:
+    finite = all(0.0 <= time < np.inf for time in (use, sorting, truck, incineration))
+    if not finite or truck > use or use == 0.0:
         raise CirlError(f"times use {use!r}, sorting {sorting!r}, truck {truck!r}, incineration {incineration!r}")
     weighted = float(np.dot(masses, criticality))
     window = use + sorting + use + incineration

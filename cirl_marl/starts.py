@@ -22,12 +22,20 @@ class Starts:
         streams: one generator per copy.
     """
 
-    def __init__(self, network: Network, dynamics: Dynamics, num_envs: int) -> None:
-        """Compile the initial ranges; the streams are seeded from the operating system."""
+    def __init__(self, network: Network, dynamics: Dynamics, num_envs: int, order: Sequence[str]) -> None:
+        """Compile the initial ranges; the streams are seeded from the operating system.
+
+        Args:
+            network: whose starts they are.
+            dynamics: its compiled dynamics.
+            num_envs: B.
+            order: names of the rows that an array of initial values gives; empty if only mappings are taken.
+        """
         inner = dynamics.inner
         self.names = (*network.node_index, *inner.names)
         self.streams = [np.random.default_rng() for _ in range(num_envs)]
         self._network = network
+        self._array_order = tuple(order)
         self._physical = dynamics.physical
         nodes = len(network.nodes)
         self._nodes, self._inner = nodes, inner
@@ -98,14 +106,14 @@ class Starts:
                 raise ControlError(f"reset options: {unknown('option', key, ['initial_state'])}")
         given = options.get("initial_state", {})
         if not isinstance(given, Mapping):
-            nodes = self._network.observation.nodes
+            names = self._array_order
             values = _numbers("initial_state", given)
-            if not nodes or values.shape != (len(nodes),):
+            if not names or values.shape != (len(names),):
                 raise ControlError(
                     f"initial_state has shape {values.shape}: give a mapping node → stock"
-                    + (f", or the stocks of {', '.join(nodes)} in this order" if nodes else "")
+                    + (f", or the values of {', '.join(names)} in this order" if names else "")
                 )
-            given = dict(zip(nodes, values, strict=True))
+            given = dict(zip(names, values, strict=True))
         checked = {self._row(id_): self._initial(id_, values) for id_, values in given.items()}
         most = (self._low + self._width)[: self._nodes]
         limit = float(most.sum())

@@ -91,7 +91,7 @@ class VectorEnv:
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
         self.scoring = Scoring(found, self.layout, self.agents, num_envs)
         self.observation_spaces = self.layout.spaces
-        self._starts = Starts(found, self.dynamics, num_envs)
+        self._starts = Starts(found, self.dynamics, num_envs, self.layout.array_order)
         self.state_names = (*self._starts.names, *self.dynamics.batches.names)
         self._batched = slice(len(found.nodes), self.dynamics.unit)
         self._state: State | None = None
@@ -122,8 +122,8 @@ class VectorEnv:
             seed: an integer s seeds copy i with s + i; a sequence gives each copy its own; None goes on with the
                 streams.
             options: ``{"initial_state": …}``: a mapping of node → stock and ``compartment.state`` → inner state (a
-                number or shape (num_envs,)), the rest being drawn; or, in a scenario that observes ``stocks``, an array
-                in the order of the observation.
+                number or shape (num_envs,)), the rest being drawn; or, if a single agent observes ``stocks`` or its
+                ``model``, an array in the order of its observation.
 
         Raises:
             ControlError: for a seed, option or state that cannot be used; the environment is left as it was.

@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from cirl_marl import compartments
-from cirl_marl.compartments import CompartmentModel, PaperScenario, model_class, models
+from cirl_marl.compartments import ContinuousModel, PaperScenario, model_class, models
 from cirl_marl.compartments.atmosphere import Atmosphere
+from cirl_marl.compartments.delivery_truck import DeliveryTruck
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.compartments.incinerator import PUBLISHED_FLOWS, Incinerator
@@ -35,7 +36,7 @@ REFERENCE = Path(__file__).parent / "reference"
 HELPERS = {"model", "light", "nutrient"}
 """Modules of the package that hold no model."""
 
-PAPER: dict[str, tuple[CompartmentModel, PaperScenario, tuple[int, ...]]] = {
+PAPER: dict[str, tuple[ContinuousModel, PaperScenario, tuple[int, ...]]] = {
     "TransportTruck": (TransportTruck(form="published"), TransportTruck.paper, (0,)),
     "Incinerator": (Incinerator(form="published"), Incinerator.paper, (0, 1, 2, 3, 4)),
     "CO2MicroalgaeMonod": (MicroalgaeMonod(form="published"), MicroalgaeMonod.paper, ()),
@@ -43,9 +44,10 @@ PAPER: dict[str, tuple[CompartmentModel, PaperScenario, tuple[int, ...]]] = {
 }
 """Model, scenario, and the states that the published first step rounds to float32."""
 
-FORMS: list[CompartmentModel] = [
+FORMS: list[ContinuousModel] = [
     *(entry[0] for entry in PAPER.values()),
     TransportTruck(),
+    DeliveryTruck(),
     Incinerator(form="energy_balance"),
     Incinerator(),
     MicroalgaeMonod(),
@@ -59,6 +61,7 @@ FORMS: list[CompartmentModel] = [
 
 RANGES: dict[str, tuple[list[float], list[float], list[float], list[float]]] = {
     "transport_truck": ([0, -5], [1000, 25], [-12e3], [12e3]),
+    "delivery_truck": ([-5, -5, 0], [15, 5, 10], [-12e3], [12e3]),
     "incinerator": ([500, 20, 200, 20, 20, 800], [3000, 200, 500, 60, 60, 1200], [-1e5], [6e5]),
     "microalgae_monod": ([10, 0.5], [40, 20], [1], [150]),
     "microalgae_droop": ([10, 2, 0.5], [40, 4, 20], [1], [150]),
@@ -73,12 +76,12 @@ SPAN: dict[str, float] = {"s": 5.0, "min": 5.0, "day": 0.5}
 """How long a model runs, in its unit."""
 
 
-def name_of(model: CompartmentModel) -> str:
+def name_of(model: ContinuousModel) -> str:
     """Return the name of a test case."""
     return f"{model.kind}-{getattr(model, 'form', 'only')}"
 
 
-def sample(model: CompartmentModel, size: int) -> tuple[Floats, Floats]:
+def sample(model: ContinuousModel, size: int) -> tuple[Floats, Floats]:
     """Return states (k, B) and inputs (c, B) drawn from the model's ranges."""
     rng = np.random.default_rng(7)
     low, high, input_low, input_high = (np.array(bound, dtype=np.float64)[:, None] for bound in RANGES[model.kind])
@@ -86,7 +89,7 @@ def sample(model: CompartmentModel, size: int) -> tuple[Floats, Floats]:
     return state, rng.uniform(input_low, input_high, size=(len(input_low), size))
 
 
-def rk4(model: CompartmentModel, state: Floats, inputs: Floats, span: float, steps: int) -> Floats:
+def rk4(model: ContinuousModel, state: Floats, inputs: Floats, span: float, steps: int) -> Floats:
     """Return the state after ``span`` at constant inputs, by the classical Runge-Kutta method."""
     h = span / steps
     for _ in range(steps):
@@ -98,7 +101,7 @@ def rk4(model: CompartmentModel, state: Floats, inputs: Floats, span: float, ste
     return state
 
 
-def solve(model: CompartmentModel, state: Floats, inputs: Floats, times: list[float], method: str = "DOP853") -> Floats:
+def solve(model: ContinuousModel, state: Floats, inputs: Floats, times: list[float], method: str = "DOP853") -> Floats:
     """Return the states (k, times) of one column at constant inputs, by scipy at a tolerance of 1e-11."""
 
     def rate(_: float, z: Floats) -> Floats:
@@ -110,7 +113,7 @@ def solve(model: CompartmentModel, state: Floats, inputs: Floats, times: list[fl
     return found
 
 
-def euler(model: CompartmentModel, paper: PaperScenario, start: Floats, actions: Floats) -> tuple[Floats, Floats]:
+def euler(model: ContinuousModel, paper: PaperScenario, start: Floats, actions: Floats) -> tuple[Floats, Floats]:
     """Return the states (k, n + 1) and rewards (n,) of the published environment for one action sequence."""
     states, rewards = [start], []
     for action in actions:
@@ -350,8 +353,19 @@ def check_temperature() -> None:
     np.testing.assert_allclose(model.derivative(model.steady_state_k(co2), co2), 0.0, atol=1e-15)
 
 
+def check_delivery_truck() -> None:
+    """Without resistance a constant force gives a parabola; the destination stays; the load counts."""
+    truck = DeliveryTruck(form="published")
+    state, inputs = np.array([[1.0], [2.0], [10.0]]), np.array([[3.4e3]])
+    found = rk4(truck, state, inputs, 4.0, 1)
+    np.testing.assert_allclose(found[:, 0], [1.0 + 8.0 + 0.5 * 3.4 / 3.0 * 16.0, 2.0 + 4 * 3.4 / 3.0, 10.0], rtol=1e-13)
+    loaded = truck.derivative(state, inputs, load_kg=np.array([400.0]))
+    np.testing.assert_allclose(loaded[:, 0], [2.0, 1.0, 0.0], rtol=1e-14)
+
+
 ANALYTIC: dict[str, Callable[[], None]] = {
     "transport_truck": check_truck,
+    "delivery_truck": check_delivery_truck,
     "incinerator": check_incinerator,
     "microalgae_monod": check_monod,
     "microalgae_droop": check_droop,
@@ -363,17 +377,21 @@ ANALYTIC: dict[str, Callable[[], None]] = {
 """The analytic answer of each kind."""
 
 
+LIGHT = {kind: model for kind, model in models().items() if ".robots." not in model.__module__}
+"""Kinds without an engine; test_robots.py tests the robots."""
+
+
 class TestRegistry:
     """What lies in the folder is what there is, and all of it is tested."""
 
     def test_every_model_has_an_analytic_answer(self) -> None:
         """A model without a test fails here, and so does a test without a model."""
-        assert set(models()) == set(ANALYTIC) == set(RANGES) == {model.kind for model in FORMS}
+        assert set(LIGHT) == set(ANALYTIC) == set(RANGES) == {model.kind for model in FORMS}
 
     def test_every_module_holds_a_model(self) -> None:
         """Each module but the helpers is found by the registry."""
         modules = {info.name for info in pkgutil.iter_modules(compartments.__path__) if not info.ispkg}
-        assert {kind.__module__.rpartition(".")[2] for kind in models().values()} == modules - HELPERS
+        assert {kind.__module__.rpartition(".")[2] for kind in LIGHT.values()} == modules - HELPERS
 
     @pytest.mark.parametrize("kind", ANALYTIC)
     def test_analytic_answer(self, kind: str) -> None:
@@ -382,7 +400,10 @@ class TestRegistry:
 
     def test_discovery_is_light(self) -> None:
         """Finding the models loads neither torch nor mujoco."""
-        code = "import sys, cirl_marl.compartments as c; c.models(); print({'torch', 'mujoco'} & {*sys.modules})"
+        code = (
+            "import sys, cirl_marl.compartments as c; c.model_class('digester');"
+            "print({'torch', 'mujoco'} & {*sys.modules})"
+        )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert done.stdout.strip() == "set()"
 
@@ -423,7 +444,7 @@ class TestRegistry:
 class TestEveryModel:
     """The contract of a compartment model."""
 
-    def test_shapes_units_purity(self, model: CompartmentModel) -> None:
+    def test_shapes_units_purity(self, model: ContinuousModel) -> None:
         """Shapes and dtypes are as stated, inputs stay as they were, the time unit can be read."""
         state, inputs = sample(model, 5)
         kept = state.copy(), inputs.copy()
@@ -442,7 +463,7 @@ class TestEveryModel:
             setattr(model, fields(model)[0].name, 1.0)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("size", [2, 7, 64])
-    def test_batched_equals_alone(self, model: CompartmentModel, size: int) -> None:
+    def test_batched_equals_alone(self, model: ContinuousModel, size: int) -> None:
         """A column's bits do not depend on the batch it is in."""
         state, inputs = sample(model, size)
         rate, reward = model.derivative(state, inputs), model.reward(state, inputs)
@@ -451,7 +472,7 @@ class TestEveryModel:
             np.testing.assert_array_equal(model.derivative(own_state, own_inputs), rate[:, b : b + 1])
             np.testing.assert_array_equal(model.reward(own_state, own_inputs), reward[b : b + 1])
 
-    def test_agrees_with_scipy(self, model: CompartmentModel) -> None:
+    def test_agrees_with_scipy(self, model: ContinuousModel) -> None:
         """Runge-Kutta at a fine step and scipy's DOP853 at 1e-11 agree."""
         state, inputs = sample(model, 3)
         span = SPAN[model.time_unit]
@@ -616,3 +637,49 @@ class TestBalances:
         state, inputs = sample(Digester(), 8)
         published = DigesterPublished(misprint=False).derivative(state, np.repeat(inputs, 6, axis=0))
         np.testing.assert_allclose(published, Digester().derivative(state, inputs), rtol=1e-12, atol=1e-9)
+
+
+class TestVehicleAndDeliveries:
+    """What models do for the network besides moving in time."""
+
+    def test_a_truck_loads_and_unloads_where_it_rests(self) -> None:
+        """Boarding and arrival need the place, rest and the right destination; turning changes the destination only."""
+        truck = DeliveryTruck()
+        #                 waiting  moving  away  bound   there  too fast  empty there
+        position = np.array([0.2, 0.2, 3.0, 0.2, 9.8, 9.8, 9.8])
+        speed = np.array([0.1, 2.0, 0.0, 0.0, -0.3, 1.5, 0.0])
+        destination = np.array([0.0, 0.0, 0.0, 10.0, 10.0, 10.0, 0.0])
+        state = np.stack([position, speed, destination])
+        assert truck.boarding(state).tolist() == [True, *[False] * 6]
+        assert truck.arrived(state).tolist() == [False] * 4 + [True, False, False]
+        left = truck.depart(state, truck.boarding(state))
+        assert left[2].tolist() == [10.0, 0.0, 0.0, 10.0, 10.0, 10.0, 0.0]
+        back = truck.turn_back(state, truck.arrived(state))
+        assert back[2].tolist() == [0.0, 0.0, 0.0, 10.0, 0.0, 10.0, 0.0]
+        np.testing.assert_array_equal(left[:2], state[:2])
+        assert state[2].tolist() == destination.tolist()
+
+    @pytest.mark.parametrize("form", ["published", "energy_balance", "sound"])
+    def test_a_delivery_cools_the_bed_and_keeps_its_heat(self, form: str) -> None:
+        """(c M + c M_c + C)(T_w − T_a) is the same before and after; nothing but M and T_w changes."""
+        plant = Incinerator(form=form)  # type: ignore[arg-type]
+        state, _ = sample(plant, 20)
+        mass = np.random.default_rng(0).uniform(0.0, 500.0, 20)
+        after = plant.receive(state, mass)
+
+        def heat(z: Floats) -> Floats:
+            stored: Floats = plant.capacities(z)[0] * (z[2] - plant.ambient_degc)
+            return stored
+
+        np.testing.assert_allclose(heat(after), heat(state), rtol=1e-13)
+        np.testing.assert_allclose(after[0] - state[0], mass, rtol=1e-12, atol=1e-12)
+        assert (after[2] < state[2]).all()
+        np.testing.assert_array_equal(after[[1, 3, 4, 5]], state[[1, 3, 4, 5]])
+
+    def test_methane_is_what_the_digester_measures(self) -> None:
+        """k6·μ2·X2 at the published equilibrium, 695.6 mmol/(L d)."""
+        digester = Digester()
+        state = digester.equilibrium(0.5)[:, None]
+        assert digester.measure_names == ("methane_mmol_l_day",)
+        assert digester.measures(state, np.array([[0.5]]))[0, 0] == pytest.approx(695.58, abs=0.01)
+        assert digester.k6 * digester.growth(state)[1][0] == pytest.approx(695.58, abs=0.01)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ KG_PER_MMOL = 44.01e-6
 def digester_network(step: float = 0.0125, horizon: int = 40) -> Network:
     """A digester of 1 m³ that emits CO₂ into the air; its agent sets the dilution."""
     digester = model_class("digester")()
-    start = digester.equilibrium(0.5)  # type: ignore[attr-defined]
+    start = digester.equilibrium(0.5)
     node = Node(
         id="digester",
         initial=(50.0, 50.0),
@@ -49,11 +50,11 @@ def digester_network(step: float = 0.0125, horizon: int = 40) -> Network:
 def paper_network(kind: str) -> Network:
     """The published environment of one compartment: its model alone, Euler steps of 5·10⁻⁵ of its time unit."""
     cls = model_class(kind)
-    paper = cls.paper  # type: ignore[attr-defined]
+    paper = cls.paper
     low, high = paper.input_low[0], paper.input_high[0]
     node = Node(
         id="plant",
-        model=cls(form="published"),  # type: ignore[call-arg]
+        model=cls(form="published"),
         inner=tuple((value, value) for value in paper.reference_start),
         control=Control(kind=ControlKind.INPUT, low=low, neutral=(low + high) / 2, high=high),
     )
@@ -107,14 +108,13 @@ def final(network: Network, dilution: float) -> Floats:
 def test_runge_kutta_has_order_four_and_the_right_limit() -> None:
     """Stocks and inner states, taken together, converge with order 4 to scipy's solution."""
     network = digester_network()
-    digester = network.nodes[0].model
-    assert digester is not None
-    start = np.concatenate([[50.0, 0.0], digester.equilibrium(0.5) * 1.1])  # type: ignore[attr-defined]
+    digester: Any = network.nodes[0].model
+    start = np.concatenate([[50.0, 0.0], digester.equilibrium(0.5) * 1.1])
     inputs = np.array([[0.6]])
 
     def slope(_: float, y: Floats) -> Floats:
         inner = y[2:, None]
-        emitted = LITRES * KG_PER_MMOL * digester.outflow(inner, inputs)[0]  # type: ignore[attr-defined]
+        emitted = LITRES * KG_PER_MMOL * digester.outflow(inner, inputs)[0]
         return np.concatenate([[-emitted, emitted], digester.derivative(inner, inputs)[:, 0]])
 
     exact = solve_ivp(slope, (0, 2), start, method="Radau", rtol=1e-11, atol=1e-11).y[:, -1]
@@ -128,7 +128,7 @@ def test_model_gives_flow_reward_and_observation() -> None:
     """The emission at equilibrium is the published 66.96 mmol/(L d); mass is conserved; the agent sees its states."""
     env = parallel_env(digester_network(), reward="local")
     names = [f"digester.{name}" for name in model_class("digester").state_names]
-    start = model_class("digester")().equilibrium(0.5)  # type: ignore[attr-defined]
+    start = model_class("digester")().equilibrium(0.5)
     env.reset(seed=0, options={"initial_state": dict(zip(names, start, strict=True))})
     before = env.state()[:2].sum()
     observation, rewards, _, _, infos = env.step({"digester": [0.0]})

@@ -9,8 +9,10 @@ import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 
-from cirl_marl import Law, VectorEnv, load_network, parallel_env, single_agent_env
+from cirl_marl import CirlError, Law, SingleAgentEnv, VectorEnv, load_network, parallel_env, single_agent_env
+from cirl_marl.compartments import model_class
 from cirl_marl.simulate import Dynamics
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -51,6 +53,177 @@ def test_initial_state_in_the_papers_order(name: str) -> None:
     np.testing.assert_array_equal(info["state"], published["state"][7])
     *_, info = env.step(published["action"][7:8])
     np.testing.assert_allclose(info["state"], published["state"][8], rtol=1e-9)
+
+
+MODELS = {
+    "TransportTruck": ("transport_truck", 200),
+    "Incinerator": ("incinerator", 100),
+    "CO2MicroalgaeMonod": ("microalgae_monod", 200),
+    "CO2MicroalgaeDroop": ("microalgae_droop", 200),
+}
+
+
+def make(name: str) -> gymnasium.Env[Any, Any]:
+    """Return a registered environment without Gymnasium's checker, whose warnings are errors here."""
+    return gymnasium.make(f"cirl_marl/{name}-v0", disable_env_checker=True)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_published_trajectory_of_one_compartment(name: str) -> None:
+    """Through gymnasium.make, started where the published class starts; the last decision is a truncation."""
+    kind, horizon = MODELS[name]
+    table = np.genfromtxt(REFERENCE / f"{name}.csv", delimiter=",", names=True)
+    states = np.stack([table[column] for column in table.dtype.names or () if column.startswith("x")], axis=1)
+    paper = model_class(kind).paper
+    env = make(name)
+    _, info = env.reset(seed=0, options={"initial_state": np.array(paper.reference_start)})
+    np.testing.assert_array_equal(info["state"], paper.reference_start)
+    for t in range(horizon):
+        action = table["action_normalised"][t : t + 1] if t + 1 < len(table) else np.zeros(1)
+        observation, reward, terminated, truncated, info = env.step(action)
+        assert not terminated
+        assert truncated == (t + 1 == horizon)
+        np.testing.assert_array_equal(observation, info["state"].astype(np.float32))
+        if t + 1 < len(table):
+            np.testing.assert_allclose(info["state"], states[t + 1], rtol=1e-9, atol=1e-9)
+            assert reward == pytest.approx(table["reward"][t], rel=1e-9, abs=1e-8)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_starts_and_bounds(name: str) -> None:
+    """Starts fill the inferred ranges; the observation is the model's state in the paper's order."""
+    kind, horizon = MODELS[name]
+    cls = model_class(kind)
+    env = make(name)
+    low, high = np.array(cls.paper.inferred_initial).T
+    starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(200)])
+    assert (starts >= low).all()
+    assert (starts <= high).all()
+    np.testing.assert_allclose(starts.min(axis=0), low, atol=0.05 * (high - low).max() + 1e-12)
+    np.testing.assert_allclose(starts.max(axis=0), high, atol=0.05 * (high - low).max() + 1e-12)
+    agent: SingleAgentEnv = env.unwrapped  # type: ignore[assignment]
+    assert agent.network.observation.mode in ("stocks", "model")
+    assert [name.split(".")[1] for name in agent.parallel.layout.names[agent.agent]] == list(cls.state_names)
+    control = agent.network.compartments[agent.agent].control
+    assert control is not None
+    assert (control.low, control.high) == (cls.paper.input_low[0], cls.paper.input_high[0])
+    assert agent.network.episode.horizon == horizon
+    assert agent.network.episode.control_interval == 5e-5
+    assert env.action_space.shape == (1,)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_euler_is_first_order(name: str) -> None:
+    """At a constant input a whole episode agrees with scipy, and the error falls with the step, to order 1."""
+    kind, _ = MODELS[name]
+    model = model_class(kind)(form="published")
+    env: Any = make(name).unwrapped
+    start = np.mean(model.paper.inferred_initial, axis=1)
+    span = 0.002
+    value = 0.25 * (model.paper.input_high[0] - model.paper.input_low[0]) + model.paper.input_low[0]
+
+    def slope(_: float, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(model.derivative(z[:, None], np.array([[value]]))[:, 0])
+
+    exact = solve_ivp(slope, (0, span), start, method="Radau", rtol=1e-10, atol=1e-12).y[:, -1]
+    errors = []
+    for refine in (1, 2, 4):
+        step = 5e-5 / refine
+        network = env.network.with_options(
+            episode={"control_interval": step, "solver_step": step, "horizon": round(span / step)}
+        )
+        fine = SingleAgentEnv(network, env.agent)
+        fine.reset(seed=0, options={"initial_state": start})
+        for _ in range(round(span / step)):
+            *_, info = fine.step(np.array([-0.5]))
+        errors.append(np.abs(info["state"] - exact).max())
+    assert errors[0] < 0.05 * np.abs(exact - start).max()
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 1.0, atol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "action", "total", "digits"),
+    [
+        ("CO2MicroalgaeMonod", [26, 2], -1.0, 143.89, 1e-3),
+        ("CO2MicroalgaeMonod", [26, 2], 0.0, 114.7, 1e-3),
+        ("CO2MicroalgaeMonod", [26, 2], 1.0, 95.4, 1e-3),
+        ("CO2MicroalgaeDroop", [26, 2.82, 1], 0.0, 329.0, 3e-3),
+        ("CO2MicroalgaeDroop", [26, 2.82, 2], 0.0, 504.0, 3e-3),
+        ("CO2MicroalgaeDroop", [26, 2.82, 5], 0.0, 550.0, 3e-3),
+        ("TransportTruck", [0, 4], 0.0, -1.99992e8, 2e-6),
+        ("TransportTruck", [0, 4], 1.0, -2.002e11, 1e-4),
+        ("Incinerator", [0, 0, 20, 0, 0, 20], -1.0, -9.52e7, 1e-3),
+    ],
+)
+def test_published_figures_of_constant_actions(
+    name: str, start: list[float], action: float, total: float, digits: float
+) -> None:
+    """Returns that were computed independently; Monod in darkness is the limit, 0/0 in the published code."""
+    env = make(name)
+    env.reset(seed=0, options={"initial_state": np.array(start, dtype=float)})
+    earned, over = 0.0, False
+    while not over:
+        _, reward, _, over, _ = env.step(np.array([action]))
+        earned += float(reward)
+    assert earned == pytest.approx(total, rel=digits)
+
+
+def test_light_does_not_matter_to_droop() -> None:
+    """By 0.1 % at most: differences between the paper's algorithms come from the start."""
+    totals = []
+    for action in (-1.0, 0.0, 1.0):
+        env = make("CO2MicroalgaeDroop")
+        env.reset(seed=0, options={"initial_state": np.array([26.0, 2.82, 0.0])})
+        totals.append(sum(float(env.step(np.array([action]))[1]) for _ in range(200)))
+    assert max(totals) / min(totals) - 1.0 < 1.1e-3
+    assert totals == pytest.approx([98.52, 98.6, 98.62], rel=1e-3)
+
+
+def test_the_papers_scenario_of_an_agent() -> None:
+    """``paper`` means the scenario in which the agent acts alone; where there are two, both are named."""
+    truck = single_agent_env("solids_net", agent="truck", scenario="paper")
+    assert truck.network.scenario_name == "paper_truck"
+    assert single_agent_env("solids_net", agent="incinerator", scenario="paper").network.scenario_name == (
+        "paper_incinerator"
+    )
+    with pytest.raises(CirlError, match="paper_monod, paper_droop"):
+        single_agent_env("net_zero", agent="microalgae", scenario="paper")
+    with pytest.raises(CirlError, match="unknown scenario"):
+        single_agent_env("net_zero", agent="digester", scenario="paper")
+
+
+@pytest.mark.parametrize(("network", "agent"), [("net_zero", "microalgae"), ("solids_net", "truck")])
+def test_one_agent_is_all_agents_with_the_others_neutral(network: str, agent: str) -> None:
+    """Bit for bit, in the default scenario."""
+    one, all_ = single_agent_env(network, agent=agent, horizon=30), parallel_env(network, horizon=30)
+    first, _ = one.reset(seed=5)
+    np.testing.assert_array_equal(first, all_.reset(seed=5)[0][agent])
+    rng = np.random.default_rng(0)
+    neutral = VectorEnv(network, num_envs=1).neutral_action  # in float64, as nobody acting holds it
+    for _ in range(30):
+        action = rng.uniform(-1, 1, 1).astype(np.float32)
+        observation, reward, *_ = one.step(action)
+        observations, rewards, *_ = all_.step(neutral | {agent: action})
+        np.testing.assert_array_equal(observation, observations[agent])
+        assert reward == rewards[agent]
+    np.testing.assert_array_equal(one.parallel.state(), all_.state())
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_published_step_counter(name: str) -> None:
+    """``legacy_episode``: horizon + 1 steps, then horizon − 1 and one more; the limit comes as termination."""
+    _, horizon = MODELS[name]
+    env = gymnasium.make(f"cirl_marl/{name}-v0", legacy_episode=True, disable_env_checker=True)
+    lengths = []
+    for _ in range(2):
+        env.reset(seed=0)
+        steps, over = 0, False
+        while not over:
+            _, _, over, truncated, _ = env.step(np.zeros(1))
+            assert not truncated
+            steps += 1
+        lengths.append(steps)
+    assert lengths == [horizon + 1, horizon]
 
 
 def test_local_rewards_sum_to_the_papers() -> None:

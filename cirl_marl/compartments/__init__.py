@@ -7,10 +7,26 @@ import pkgutil
 from functools import cache
 from typing import Any
 
-from cirl_marl.compartments.model import CompartmentModel, PaperScenario, RewardState
+from cirl_marl.compartments.model import (
+    CompartmentModel,
+    ContinuousModel,
+    DiscreteTimeModel,
+    OwnStepModel,
+    PaperScenario,
+    RewardState,
+)
 from cirl_marl.errors import CirlError, unknown
 
-__all__ = ["CompartmentModel", "PaperScenario", "RewardState", "model_class", "models"]
+__all__ = [
+    "CompartmentModel",
+    "ContinuousModel",
+    "DiscreteTimeModel",
+    "OwnStepModel",
+    "PaperScenario",
+    "RewardState",
+    "model_class",
+    "models",
+]
 
 ROBOTS = f"{__name__}.robots"
 
