@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from cirl_marl.catalogue import load_network, networks, recipes
-from cirl_marl.controllers import Constant, Controller, Random, Scripted
+from cirl_marl.controllers import LQR, Constant, Controller, Random, Scripted
 from cirl_marl.errors import CirlError, DefinitionError, LearnerError, unknown
 from cirl_marl.evaluate import Rollout, interval_ends, rollout
 from cirl_marl.vector_env import VectorEnv
@@ -35,7 +35,7 @@ RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a tra
 Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]
 Episodes = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
-CONTROLS = ("neutral", "constant", "random", "scripted")
+CONTROLS = ("neutral", "constant", "random", "scripted", "lqr")
 
 
 def main() -> None:
@@ -131,7 +131,7 @@ def simulate(
     scenario: Scenario = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
 ) -> None:
-    """Simulate a network under neutral, constant, random or scripted control; write a CSV and a picture."""
+    """Simulate a network under a controller without learning; write a CSV and a picture."""
     from cirl_marl.report.curves import save_trajectory
 
     controller = _controller(control, set_ or [])
@@ -287,8 +287,8 @@ def _controller(control: str, settings: list[str]) -> Controller:
             actions[agent] = float(value)
         except ValueError:
             raise CirlError(f"--set {setting}: needs AGENT=VALUE with a number in [-1, 1]") from None
-    if control == "random":
-        return Random()
+    if control in ("random", "lqr"):
+        return Random() if control == "random" else LQR()
     return Scripted(actions) if control == "scripted" else Constant(actions)
 
 

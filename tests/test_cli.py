@@ -97,6 +97,20 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert run(monkeypatch, "report", "run", "--episodes", "4") == 0
 
 
+def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The CSV holds masses on the way and what an agent may see of inner states; the regulator runs where it can."""
+    monkeypatch.chdir(tmp_path)
+    held = ("simulate", "solids_net", "--control", "scripted", "--set", "sorter=0", "--steps", "40")
+    assert run(monkeypatch, *held) == 0
+    header, *rows = (tmp_path / "solids_net_scripted.csv").read_text().splitlines()
+    assert len(rows) == 40
+    columns = header.split(",")
+    assert "mass on first_use (kg)" in columns
+    assert "truck.position_m" in columns
+    assert not any("mujoco" in column for column in columns)
+    assert run(monkeypatch, "simulate", "carbo_net", "--scenario", "paper", "--control", "lqr", "--steps", "5") == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -113,6 +127,7 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
         (["simulate", "copper_net", "--control", "constant", "--set", "mien=0"], "Did you mean 'mine'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mine=nan"], "must lie in [-1, 1]"),
         (["simulate", "copper_net", "--set", "mine=0"], "goes with --control constant"),
+        (["simulate", "copper_net", "--control", "lqr"], "rate controls multiply flows"),
         (["paper", "CoperNet"], "unknown environment of the paper 'CoperNet'. Did you mean 'CopperNet'?"),
         (["paper", "CopperNet", "A2"], "unknown algorithm of the paper 'A2'. Did you mean 'A2C'?"),
         (["paper", "CopperNet", "SAC-HER"], "did not run SAC-HER on CopperNet; it ran A2C, ARS, DDPG, PPO, SAC"),

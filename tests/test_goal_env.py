@@ -88,7 +88,7 @@ def test_success_is_reported_when_it_happens() -> None:
     for _ in range(50):
         seen, reward, _, _, info = env.step(wanted(env))
         state = info["state"]
-        names = list(env.unwrapped.flat.parallel.state_names)  # type: ignore[attr-defined]
+        names = list(env.unwrapped.flat.parallel.layout.names["sorter"])  # type: ignore[attr-defined]
         item = state[[names.index(f"sorter.object_{axis}") for axis in "xyz"]]
         near = bool(np.linalg.norm(item - BIN) <= 0.05)
         assert info["success"] == near

@@ -51,3 +51,53 @@ def test_step_counter_is_part_of_a_snapshot() -> None:
     first = [env.step(np.zeros(1))[2] for _ in range(60)]
     env.restore(saved)
     assert [env.step(np.zeros(1))[2] for _ in range(60)] == first
+
+
+@pytest.mark.parametrize(
+    ("name", "horizon"),
+    [("TransportTruck", 200), ("Incinerator", 100), ("CO2MicroalgaeMonod", 200), ("CO2MicroalgaeDroop", 200)],
+)
+def test_limit_of_the_compartments(name: str, horizon: int) -> None:
+    """Horizon + 1 steps, then horizon − 1 and one more, which starts anew; the limit comes as termination."""
+    env = gymnasium.make(f"cirl_marl/{name}-v0", legacy_episode=True, disable_env_checker=True)
+    lone: cirl_marl.SingleAgentEnv = env.unwrapped  # type: ignore[assignment]
+    model = lone.network.compartments[lone.agent].model
+    assert model is not None
+    paper = type(model).paper  # type: ignore[attr-defined]
+    low, high = (np.array(end)[:, None] for end in zip(*paper.inferred_initial, strict=True))
+    env.reset(seed=3)
+    for length in (horizon + 1, horizon, horizon):
+        for step in range(1, length + 1):
+            _, _, terminated, truncated, info = env.step(np.ones(1))
+            assert (terminated, truncated) == (step == length, False)
+        # the state is one Euler step at full input away from a start of the inferred range, whatever came before
+        state, inputs = info["state"][:, None], paper.inputs(np.ones((1, 1)))
+        start = state.copy()
+        for _ in range(60):
+            start = state - paper.dt * model.derivative(start, inputs)  # type: ignore[attr-defined]
+        assert (start >= low - 1e-9).all()
+        assert (start <= high + 1e-9).all()
+        env.reset()
+
+
+def test_counter_survives_a_reset() -> None:
+    """An episode that is cut short leaves the counter where it was; the next is so much shorter."""
+    env = gymnasium.make("cirl_marl/CO2MicroalgaeMonod-v0", legacy_episode=True, disable_env_checker=True)
+    env.reset(seed=0)
+    for _ in range(30):
+        env.step(np.zeros(1))
+    assert episode(env, 0.0)[0] == 201 - 30
+    assert episode(env, 0.0)[0] == 200
+    plain = gymnasium.make("cirl_marl/CO2MicroalgaeMonod-v0", disable_env_checker=True)
+    plain.reset(seed=0)
+    for _ in range(30):
+        plain.step(np.zeros(1))
+    assert episode(plain, 0.0)[::2] == (200, False)
+
+
+def test_saturated_truck() -> None:
+    """The return that the paper reports for DDPG, −2.0e11, is full force in every step."""
+    env = gymnasium.make("cirl_marl/TransportTruck-v0", legacy_episode=True, disable_env_checker=True)
+    lengths, returns, _ = zip(*(episode(env, 1.0) for _ in range(3)), strict=True)
+    assert lengths == (201, 200, 200)
+    assert returns[1] == pytest.approx(-2.0e11, rel=2e-3)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
+from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from cirl_marl import CirlError, Law, SingleAgentEnv, VectorEnv, load_network, parallel_env, single_agent_env
 from cirl_marl.compartments import model_class
+from cirl_marl.registration import PAPER_ENVIRONMENTS
 from cirl_marl.simulate import Dynamics
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -63,30 +67,52 @@ MODELS = {
 }
 
 
-def make(name: str) -> gymnasium.Env[Any, Any]:
+def make(name: str, **options: Any) -> gymnasium.Env[Any, Any]:
     """Return a registered environment without Gymnasium's checker, whose warnings are errors here."""
-    return gymnasium.make(f"cirl_marl/{name}-v0", disable_env_checker=True)
+    return gymnasium.make(f"cirl_marl/{name}-v0", disable_env_checker=True, **options)
+
+
+@pytest.mark.parametrize("id_", PAPER_ENVIRONMENTS)
+def test_gymnasiums_own_check(id_: str) -> None:
+    """check_env passes for every id; it only regrets that states have no bounds, as published."""
+    env = gymnasium.make(id_).unwrapped
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*observation space (minimum|maximum) value is -?infinity")
+        check_env(env, skip_render_check=True)
+    assert env.action_space == Box(-1.0, 1.0, env.action_space.shape, np.float32)
+    env.close()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_horizon_is_a_truncation(name: str) -> None:
+    """The last of 200 or 100 decisions truncates the episode and terminates nothing."""
+    _, horizon = MODELS[name]
+    env = make(name)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(1))[2:4] for _ in range(horizon)]
+    assert ends == [(False, False)] * (horizon - 1) + [(False, True)]
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_published_trajectory_of_one_compartment(name: str) -> None:
-    """Through gymnasium.make, started where the published class starts; the last decision is a truncation."""
-    kind, horizon = MODELS[name]
+    """Through gymnasium.make, started where the published class starts, over every published row."""
+    kind, _ = MODELS[name]
     table = np.genfromtxt(REFERENCE / f"{name}.csv", delimiter=",", names=True)
     states = np.stack([table[column] for column in table.dtype.names or () if column.startswith("x")], axis=1)
     paper = model_class(kind).paper
-    env = make(name)
-    _, info = env.reset(seed=0, options={"initial_state": np.array(paper.reference_start)})
+    env = make(name, horizon=len(table))
+    _, info = env.reset(seed=0, options={"initial_state": paper.reference_start})
     np.testing.assert_array_equal(info["state"], paper.reference_start)
-    for t in range(horizon):
-        action = table["action_normalised"][t : t + 1] if t + 1 < len(table) else np.zeros(1)
-        observation, reward, terminated, truncated, info = env.step(action)
-        assert not terminated
-        assert truncated == (t + 1 == horizon)
+    for t, action in enumerate(table["action_normalised"][:-1]):
+        observation, reward, terminated, truncated, info = env.step(np.array([action]))
+        assert not (terminated or truncated)
+        assert info["state"].dtype == np.float64
+        assert observation.dtype == np.float32
         np.testing.assert_array_equal(observation, info["state"].astype(np.float32))
-        if t + 1 < len(table):
-            np.testing.assert_allclose(info["state"], states[t + 1], rtol=1e-9, atol=1e-9)
-            assert reward == pytest.approx(table["reward"][t], rel=1e-9, abs=1e-8)
+        np.testing.assert_allclose(info["state"], states[t + 1], rtol=1e-9, atol=1e-12)
+        # Droop's first reward is K_CO2·ρ at S = 0; the start that stands for it is −1.1e-10
+        assert reward == pytest.approx(table["reward"][t], rel=1e-9, abs=4e-9 if t == 0 else 1e-12)
+    assert t == 199
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -141,9 +167,45 @@ def test_euler_is_first_order(name: str) -> None:
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 1.0, atol=0.15)
 
 
+@pytest.mark.parametrize("name", PAPER)
+def test_euler_of_the_networks_is_first_order(name: str) -> None:
+    """At a constant action the stocks agree with scipy's of the same linear system, and halving the step the error."""
+    network_name, agent = PAPER[name]
+    network, span = load_network(network_name, scenario="paper"), 0.002
+    dynamics = Dynamics(network)
+    control = network.compartments[agent].control
+    assert control is not None
+    held = dynamics.neutral[:, None].copy()
+    held[network.control_rows[agent]] = 0.25 * control.low + 0.75 * control.high
+    rate = dynamics.rate(held)
+
+    def slope(_: float, stock: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(dynamics.incidence(dynamics.flow(stock[:, None], rate))[:, 0])
+
+    errors, start, exact = [], np.empty(0), np.empty(0)
+    for refine in (1, 2, 4):
+        step = 5e-5 / refine
+        episode = {"control_interval": step, "solver_step": step, "horizon": round(span / step)}
+        env = VectorEnv(network.with_options(episode=episode), num_envs=1)
+        env.reset(seed=0)
+        if refine == 1:
+            start = env.physical.stock[:, 0].copy()
+            exact = solve_ivp(slope, (0, span), start, method="Radau", rtol=1e-10, atol=1e-10).y[:, -1]
+        for _ in range(env.network.episode.horizon):
+            env.advance(np.array([[0.5]]))
+        errors.append(np.abs(env.physical.stock[:, 0] - exact).max())
+    assert errors[0] < 1e-3 * np.abs(exact - start).max()
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 1.0, atol=0.05)
+
+
 @pytest.mark.parametrize(
     ("name", "start", "action", "total", "digits"),
     [
+        ("CO2MicroalgaeMonod", [26, 0], -1.0, 103.446, 1e-5),
+        ("CO2MicroalgaeMonod", [26, 0], 0.0, 101.638, 1e-5),
+        ("CO2MicroalgaeMonod", [26, 0], 1.0, 90.823, 1e-5),
+        ("CO2MicroalgaeMonod", [26, 1], -1.0, 143.8, 3e-4),
+        ("CO2MicroalgaeMonod", [26, 1], 0.0, 114.7, 3e-4),
         ("CO2MicroalgaeMonod", [26, 2], -1.0, 143.89, 1e-3),
         ("CO2MicroalgaeMonod", [26, 2], 0.0, 114.7, 1e-3),
         ("CO2MicroalgaeMonod", [26, 2], 1.0, 95.4, 1e-3),
@@ -151,6 +213,8 @@ def test_euler_is_first_order(name: str) -> None:
         ("CO2MicroalgaeDroop", [26, 2.82, 2], 0.0, 504.0, 3e-3),
         ("CO2MicroalgaeDroop", [26, 2.82, 5], 0.0, 550.0, 3e-3),
         ("TransportTruck", [0, 4], 0.0, -1.99992e8, 2e-6),
+        ("TransportTruck", [0, 4], 1e-4, -1.99992e8 - 2000.0, 2e-6),
+        ("TransportTruck", [0, 4], -1.0, -2.002e11, 1e-4),
         ("TransportTruck", [0, 4], 1.0, -2.002e11, 1e-4),
         ("Incinerator", [0, 0, 20, 0, 0, 20], -1.0, -9.52e7, 1e-3),
     ],
@@ -166,6 +230,60 @@ def test_published_figures_of_constant_actions(
         _, reward, _, over, _ = env.step(np.array([action]))
         earned += float(reward)
     assert earned == pytest.approx(total, rel=digits)
+
+
+def best_action(name: str, start: list[float]) -> float:
+    """Return which of some constant actions earns most from a start."""
+    earned = {}
+    for action in (-1.0, -0.5, 0.0, 1e-4, 0.5, 1.0):
+        env, over, total = make(name), False, 0.0
+        env.reset(seed=0, options={"initial_state": start})
+        while not over:
+            _, reward, _, over, _ = env.step(np.array([action]))
+            total += float(reward)
+        earned[action] = total
+    return max(earned, key=lambda action: earned[action])
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "best"),
+    [
+        ("CO2MicroalgaeMonod", [26.0, 1.0], -1.0),
+        ("CO2MicroalgaeDroop", [26.0, 2.82, 0.0], 1.0),
+        ("TransportTruck", [0.0, 4.0], 0.0),
+        ("Incinerator", [0.0, 0.0, 20.0, 0.0, 0.0, 20.0], -1.0),
+    ],
+)
+def test_best_constant_action(name: str, start: list[float], best: float) -> None:
+    """Monod: darkness; Droop: full light, by a hair; truck: no force; incinerator from 20 °C: all the heat there is."""
+    assert best_action(name, start) == best
+
+
+def test_idle_incinerator_from_the_inferred_start() -> None:
+    """T_g(0) ~ U[900, 1100] °C and 100 idle steps: −3.40e5 on average, as the paper's episodes; 9.6e5 from 20 °C."""
+    totals = []
+    for start in np.linspace(900.0, 1100.0, 21):
+        env = make("Incinerator")
+        env.reset(seed=0, options={"initial_state": [0.0, 0.0, 20.0, 0.0, 0.0, start]})
+        totals.append(sum(float(env.step(np.zeros(1))[1]) for _ in range(100)))
+    assert np.trapezoid(totals, dx=1.0 / 20.0) == pytest.approx(-3.40e5, rel=0.02)
+    env.reset(seed=0, options={"initial_state": [0.0, 0.0, 20.0, 0.0, 0.0, 20.0]})
+    assert float(env.step(np.zeros(1))[1]) == pytest.approx(-9.6e5, rel=1e-3)
+
+
+def test_darkness_is_a_limit() -> None:
+    """Monod's f(I) is 0/0 at I = 0 in the published code; here the action −1 is what actions near it tend to."""
+    found = {}
+    for action in (-1.0, -1.0 + 1e-6, -1.0 + 2e-6):
+        env = make("CO2MicroalgaeMonod")
+        env.reset(seed=0, options={"initial_state": [26.0, 3.0]})
+        _, reward, _, _, info = env.step(np.array([action]))
+        found[action] = np.array([float(reward), *info["state"]])
+    dark, near, further = found.values()
+    assert np.isfinite(dark).all()
+    assert dark[0] == pytest.approx(0.72 * dark[2] / (dark[2] + 0.0012), rel=1e-12)
+    np.testing.assert_allclose(2.0 * near - further, dark, rtol=1e-11)
+    assert near[0] < dark[0]
 
 
 def test_light_does_not_matter_to_droop() -> None:
@@ -192,7 +310,10 @@ def test_the_papers_scenario_of_an_agent() -> None:
         single_agent_env("net_zero", agent="digester", scenario="paper")
 
 
-@pytest.mark.parametrize(("network", "agent"), [("net_zero", "microalgae"), ("solids_net", "truck")])
+@pytest.mark.parametrize(
+    ("network", "agent"),
+    [(name, agent) for name in ("net_zero", "solids_net") for agent in load_network(name).agents],
+)
 def test_one_agent_is_all_agents_with_the_others_neutral(network: str, agent: str) -> None:
     """Bit for bit, in the default scenario."""
     one, all_ = single_agent_env(network, agent=agent, horizon=30), parallel_env(network, horizon=30)
@@ -201,29 +322,12 @@ def test_one_agent_is_all_agents_with_the_others_neutral(network: str, agent: st
     rng = np.random.default_rng(0)
     neutral = VectorEnv(network, num_envs=1).neutral_action  # in float64, as nobody acting holds it
     for _ in range(30):
-        action = rng.uniform(-1, 1, 1).astype(np.float32)
+        action = rng.uniform(-1, 1, one.action_space.shape).astype(np.float32)
         observation, reward, *_ = one.step(action)
         observations, rewards, *_ = all_.step(neutral | {agent: action})
         np.testing.assert_array_equal(observation, observations[agent])
         assert reward == rewards[agent]
     np.testing.assert_array_equal(one.parallel.state(), all_.state())
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_published_step_counter(name: str) -> None:
-    """``legacy_episode``: horizon + 1 steps, then horizon − 1 and one more; the limit comes as termination."""
-    _, horizon = MODELS[name]
-    env = gymnasium.make(f"cirl_marl/{name}-v0", legacy_episode=True, disable_env_checker=True)
-    lengths = []
-    for _ in range(2):
-        env.reset(seed=0)
-        steps, over = 0, False
-        while not over:
-            _, _, over, truncated, _ = env.step(np.zeros(1))
-            assert not truncated
-            steps += 1
-        lengths.append(steps)
-    assert lengths == [horizon + 1, horizon]
 
 
 def test_local_rewards_sum_to_the_papers() -> None:

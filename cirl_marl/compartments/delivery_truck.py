@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cirl_marl.compartments.model import RewardState, check_positive
 from cirl_marl.compartments.transport_truck import TransportTruck
+from cirl_marl.errors import CirlError
 from cirl_marl.rowsum import Floats
 
 
@@ -46,6 +47,10 @@ class DeliveryTruck(TransportTruck):
         """Refuse what has no meaning."""
         TransportTruck.__post_init__(self)
         check_positive(self.kind, target_m=self.target_m, reach_m=self.reach_m, rest_m_s=self.rest_m_s)
+        if 2.0 * self.reach_m >= self.target_m:
+            raise CirlError(
+                f"{self.kind}: reach_m = {self.reach_m!r}, but on a road of {self.target_m!r} m it must be below half."
+            )
 
     def derivative(self, state: Floats, inputs: Floats, *, load_kg: Floats | float | None = None) -> Floats:
         """Return (ẋ, v̇, 0), shape (3, B); arguments as of ``TransportTruck``."""

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.model import RewardState, check_not_negative, check_positive
+from cirl_marl.compartments.model import RewardState, check_not_negative, check_positive, check_share
 from cirl_marl.errors import CirlError
 from cirl_marl.rowsum import Floats
 
@@ -94,6 +94,7 @@ class Digester:
         feed = ("substrate_in_g_l", "acids_in_mmol_l", "carbon_in_mmol_l", "released_share")
         check_not_negative(self.kind, **{name: values.pop(name) for name in feed})
         check_positive(self.kind, **values)
+        check_share(self.kind, suspended_share=self.suspended_share, released_share=self.released_share)
 
     @property
     def feed(self) -> Floats:

@@ -7,7 +7,14 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from cirl_marl.compartments.model import PaperScenario, RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.compartments.model import (
+    PaperScenario,
+    RewardState,
+    check_form,
+    check_not_negative,
+    check_positive,
+    check_share,
+)
 from cirl_marl.rowsum import Floats
 
 KELVIN = 273.15
@@ -158,8 +165,9 @@ class Incinerator:
         free = ("ambient_degc", "reference_degc", "target_degc")
         needed = ("grate", "freeboard_kg", "freeboard_heat_kj_kg_k", "reference_kg", "residence")
         positive = {name: values[name] for name in values if any(part in name for part in needed)}
-        check_positive(self.kind, **positive, reference_k=self.reference_degc + KELVIN)
+        check_positive(self.kind, **positive, **{n.replace("degc", "k"): values[n] + KELVIN for n in free})
         check_not_negative(self.kind, **{name: values[name] for name in values if name not in free})
+        check_share(self.kind, bed_share=self.bed_share)
 
     def flows(self, state: Floats, feed_kg_min: Floats | float | None = None) -> Flows:
         """Return every flow and conversion, kg/min."""

@@ -152,3 +152,10 @@ def check_not_negative(kind: str, **parameters: float) -> None:
     for name, value in parameters.items():
         if not (math.isfinite(value) and value >= 0.0):
             raise CirlError(f"{kind}: {name} = {value!r}, but it must be finite and not negative.")
+
+
+def check_share(kind: str, **parameters: float) -> None:
+    """Raise a ``CirlError`` that names the first parameter that is no share of a whole, in [0, 1]."""
+    for name, value in parameters.items():
+        if not 0.0 <= value <= 1.0:
+            raise CirlError(f"{kind}: {name} = {value!r}, but it must lie in [0, 1].")

@@ -75,6 +75,9 @@ class TransportTruck:
         check_not_negative(
             self.kind,
             load_kg=self.load_kg,
+            target_m=self.target_m,
+            speed_weight=self.speed_weight,
+            force_weight=self.force_weight,
             rolling_resistance=self.rolling_resistance,
             drag_area_m2=self.drag_area_m2,
             air_density_kg_m3=self.air_density_kg_m3,

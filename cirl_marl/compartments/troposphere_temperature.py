@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.model import RewardState, check_positive
+from cirl_marl.compartments.model import RewardState, check_not_negative, check_positive
 from cirl_marl.errors import CirlError
 from cirl_marl.rowsum import Floats
 
@@ -61,7 +61,9 @@ class TroposphereTemperature:
             emissivity=self.emissivity,
             volume_km3=self.volume_km3,
             stefan_boltzmann_w_m2_k4=self.stefan_boltzmann_w_m2_k4,
+            set_point_k=self.set_point_k,
         )
+        check_not_negative(self.kind, greenhouse_m3_mg=self.greenhouse_m3_mg)
         if not 0.0 <= self.albedo < 1.0:
             raise CirlError(f"{self.kind}: albedo = {self.albedo!r}, but it must lie in [0, 1).")
 

@@ -1,0 +1,300 @@
+"""Linear-quadratic regulator for networks whose acting compartments set flows.
+
+With u the flows that the acting agents set and every other control neutral, the laws read ẋ = A x + B u + c. The
+papers' regulator feeds back the distance to an equilibrium that suits the set-points: u = u_e − K (x − x_e), or, if
+only outputs y = C x are measured, u = u_e − K (y − y_e).
+
+References: Zocco et al., arXiv 2508.16774 (CarboNet); Kučera and de Souza 1995, Automatica 31(9) (output feedback).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg
+
+from cirl_marl.actuators import Actuators
+from cirl_marl.controllers.basic import Arrays
+from cirl_marl.elements import ControlKind, Law, Role
+from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.flows import FlowLaws
+from cirl_marl.network import Floats, Network
+from cirl_marl.vector_env import VectorEnv
+
+RANK, DECAY = 1e-9, 1e-7
+"""Relative singular value, and rate of decay relative to ‖A‖, below which they count as zero."""
+ITERATIONS, CONVERGED = 500, 1e-12
+"""Most steps of the fixed point of output feedback, and the relative change at which it has converged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinearSystem:
+    """The linear laws ẋ = A x + B u + c of a network, read off its compiled flow laws.
+
+    States are the stocks that drive a flow or have a set-point; the others only count what passes. A non-renewable
+    reservoir without a set-point is held at the middle of its initial range. The laws hold while no donor runs dry.
+
+    Attributes:
+        states: nodes, in network order.
+        inputs: acting agents.
+        A: shape (states, states), 1/time.
+        B: shape (states, inputs), dimensionless.
+        c: shape (states,), mass/time.
+        set_points: of the states, NaN where there is none, mass.
+        scale: reference values of the states, then of the inputs, mass and mass/time.
+        bounds: lower and upper bounds of the inputs, shape (2, inputs), mass/time.
+        neutral: their values while nobody acts, shape (inputs,), mass/time.
+    """
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    A: Floats
+    B: Floats
+    c: Floats
+    set_points: Floats
+    scale: Floats
+    bounds: Floats
+    neutral: Floats
+
+    @classmethod
+    def of(
+        cls, network: Network, agents: Sequence[str] | None = None, set_points: Mapping[str, float] | None = None
+    ) -> LinearSystem:
+        """Read the system off the flows of unit stocks and unit controls.
+
+        Args:
+            network: under the scenario of interest.
+            agents: who acts; the others are neutral. None: the network's own choice.
+            set_points: node → stock, in place of the tracked set-points of the network.
+
+        Raises:
+            CirlError: if an agent or node is unknown, no state can be moved, or the laws are not linear in x and u.
+        """
+        laws = FlowLaws(network)
+        actuators = Actuators(laws, agents, 1)
+        inputs, acting = actuators.agents, actuators.acting
+        if problems := list(_nonlinear(network, inputs)):
+            raise CirlError(f"'{network.name}' ({network.scenario_name}) is no linear system: {'; '.join(problems)}")
+        controls = np.repeat(laws.neutral[:, None], 1 + len(acting), axis=1)
+        controls[acting] = np.eye(1 + len(acting))[1:]
+        rate, units = laws.rate(controls), np.eye(laws.unit + 1)  # no input, then one unit of each
+        A, c = np.split(laws.incidence(laws.flow(units, np.repeat(rate[:, :1], len(units), axis=1)))[:-1], [-1], axis=1)
+        B = laws.incidence(laws.flow(units[:, [-1] * len(acting)], rate[:, 1:] - rate[:, :1]))[:-1]
+        targets = _targets(network, set_points)
+        wanted = np.array([node.id in targets for node in network.nodes], dtype=bool)
+        held = np.array([node.role is Role.NONRENEWABLE_RESERVOIR for node in network.nodes], dtype=bool) & ~wanted
+        c = c[:, 0] + A[:, held] @ np.array([sum(node.initial) / 2 for node in network.nodes])[held]
+        rows = np.flatnonzero((A.any(axis=0) | wanted) & ~held)
+        if not B[rows].any():
+            raise CirlError(f"network '{network.name}': {list(inputs)} move no stock that drives a flow or is tracked")
+        nodes = [network.nodes[i] for i in rows]
+        flows = [next(a for a in network.arcs if a.law is Law.CONTROLLED and id_ in (a.id, a.donor)) for id_ in inputs]
+        return cls(
+            states=tuple(node.id for node in nodes),
+            inputs=inputs,
+            A=A[np.ix_(rows, rows)],
+            B=B[rows],
+            c=c[rows],
+            set_points=np.array([targets.get(node.id, np.nan) for node in nodes]),
+            scale=np.array([each.scale for each in (*nodes, *flows)]),
+            bounds=np.stack([laws.control_low[acting], laws.control_high[acting]]),
+            neutral=laws.neutral[acting],
+        )
+
+    def equilibrium(self) -> tuple[Floats, Floats]:
+        """Return x_e, shape (states,), and u_e, shape (inputs,), the equilibrium nearest to the set-points.
+
+        Of all with A x_e + B u_e + c = 0 it has the smallest Σ((x_e − set-point)/scale)²; where that leaves a choice,
+        inputs nearest to neutral.
+
+        Raises:
+            CirlError: if there is no equilibrium, it is not unique, a stock is negative or an input out of bounds.
+        """
+        count = len(self.states)
+        laws = np.hstack([self.A, self.B]) * self.scale
+        found = linalg.lstsq(laws, -self.c, cond=RANK)[0]
+        if np.abs(laws @ found + self.c).max() > RANK * np.abs(self.c).max():
+            raise CirlError(f"LQR: no equilibrium: whatever constant {list(self.inputs)}, some stock drifts for ever")
+        wanted = np.append(self.set_points, self.neutral) / self.scale
+        free = linalg.null_space(laws, rcond=RANK)
+        for rows in np.flatnonzero(~np.isnan(self.set_points)), np.arange(count, len(wanted)):
+            left, sizes, right = linalg.svd(free[rows])
+            rank = int((sizes > RANK).sum())
+            found = found + free @ (right[:rank].T @ ((left.T @ (wanted - found)[rows])[:rank] / sizes[:rank]))
+            free = free @ right[rank:].T
+        if free.size:
+            loose = self.states[int(np.abs(free[:count]).max(axis=1).argmax())]
+            raise CirlError(f"LQR: the set-points leave '{loose}' free at equilibrium: give it one in set_points")
+        found *= self.scale
+        low, high = np.hstack([[np.zeros(count), np.full(count, np.inf)], self.bounds])
+        if (out := (found < low - RANK * self.scale) | (found > high + RANK * self.scale)).any():
+            name, value = (*self.states, *self.inputs)[out.argmax()], found[out.argmax()]
+            raise CirlError(f"LQR: the set-points want an equilibrium out of bounds, '{name}' = {value:.6g}")
+        return found[:count], found[count:]
+
+
+def full_state_gain(A: Floats, B: Floats, Q: Floats, R: Floats) -> tuple[Floats, Floats]:
+    """Return K, shape (m, n), of u = −K x, which minimises ∫ xᵀQx + uᵀRu dt under ẋ = A x + B u, and P, shape (n, n).
+
+    A and Q have shape (n, n), B (n, m), R (m, m); Q is positive semi-definite, R positive definite. K = R⁻¹BᵀP, where P
+    is the stabilising solution of AᵀP + PA − PBR⁻¹BᵀP + Q = 0, and xᵀPx is the cost from x. The equation is solved on
+    what control reaches; what that feeds back of the rest, one Newton step (Kleinman) gives exactly.
+
+    Raises:
+        CirlError: if a mode that control does not reach is not stable, or the weights leave no stabilising optimum.
+    """
+    reached, rest = _kalman(A, B)
+    _refuse_unstable(rest.T @ A @ rest, A, "no control reaches")
+    try:
+        core = linalg.solve_continuous_are(reached.T @ A @ reached, reached.T @ B, reached.T @ Q @ reached, R)
+    except linalg.LinAlgError as error:
+        raise CirlError(f"LQR: no optimal gain stabilises; does a mode cost nothing? ({error})") from error
+    K = linalg.solve(R, B.T @ reached @ core @ reached.T)
+    _refuse_unstable(A - B @ K, A, "the weights ignore")
+    for _ in range(2):  # the Newton step, then P of the gain it gave
+        P = linalg.solve_continuous_lyapunov((A - B @ K).T, -Q - K.T @ R @ K)
+        K = linalg.solve(R, B.T @ P)
+    return K, P
+
+
+def output_gain(A: Floats, B: Floats, C: Floats, Q: Floats, R: Floats) -> tuple[Floats, Floats]:
+    """Return K, shape (m, p), of the papers' static output feedback u = −K y, y = C x, and P, shape (n, n).
+
+    C has shape (p, n) and rank p, the others are as in ``full_state_gain``. The fixed point of
+    K ← R⁻¹BᵀP(K)Cᵀ(CCᵀ)⁻¹, where (A − BKC)ᵀP + P(A − BKC) + Q + CᵀKᵀRKC = 0, from the full-state gain seen through C.
+    xᵀPx is the cost from x; it is lowest from every x only if C sees all states.
+
+    Raises:
+        CirlError: if a gain on the way does not stabilise, or the iteration does not converge.
+    """
+    seen = linalg.pinv(C)
+    K = full_state_gain(A, B, Q, R)[0] @ seen
+    for _ in range(ITERATIONS):
+        closed = A - B @ K @ C
+        _refuse_unstable(closed, A, "output feedback does not stabilise")
+        P = linalg.solve_continuous_lyapunov(closed.T, -Q - C.T @ K.T @ R @ K @ C)
+        before, K = K, linalg.solve(R, B.T @ P @ seen)
+        if np.abs(K - before).max() <= CONVERGED * np.abs(K).max():
+            return K, P
+    raise CirlError(f"LQR: the gain of output feedback has not converged in {ITERATIONS} iterations")
+
+
+@dataclass(kw_only=True, eq=False)
+class LQR:
+    """Linear-quadratic regulator: measures stocks, feeds them back, clips to the bounds of the controls.
+
+    It reads the stocks from the environment it was started in, whatever the agents observe. Its gains are those of
+    continuous time, while an action is held for a control interval (zero-order hold): the closed loop is the published
+    one only if the interval is short against its time constants.
+
+    Attributes:
+        state_weight: Q, or its diagonal. None: 1/scale² of each measured stock; in the paper scenarios the papers'.
+        input_weight: R, or its diagonal. None: 1/scale² of each flow; likewise.
+        outputs: nodes whose stocks are measured, for output feedback. None: all states.
+        set_points: node → stock, in place of the tracked set-points of the network.
+        agents: whom it drives, the others being held neutral. None: every agent of the environment.
+        system: once started, the network's linear laws.
+        gain: once started, K, shape (inputs, measured stocks).
+    """
+
+    state_weight: ArrayLike | None = None
+    input_weight: ArrayLike | None = None
+    outputs: Sequence[str] | None = None
+    set_points: Mapping[str, float] | None = None
+    agents: Sequence[str] | None = None
+    system: LinearSystem = field(init=False, repr=False)
+    gain: Floats = field(init=False, repr=False)
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        """Keep ``env``, whose stocks it will measure, and find equilibrium and gain; ``seed`` is not used.
+
+        Raises:
+            CirlError: if an agent, output, weight or set-point does not fit, or the network cannot be regulated.
+        """
+        agents = env.agents if self.agents is None else _subset("agent", self.agents, env.agents)
+        system = LinearSystem.of(env.network, agents, self.set_points)
+        states, full = system.states, self.outputs is None
+        outputs = states if self.outputs is None else _subset("output", self.outputs, states)
+        C = np.eye(len(states))[[states.index(node) for node in outputs]]
+        weights = system.scale**-2.0
+        Q = _weight("state_weight", self.state_weight, C.T @ C @ weights[: len(states)], definite=False)
+        R = _weight("input_weight", self.input_weight, weights[len(states) :], definite=True)
+        gain, _ = full_state_gain(system.A, system.B, Q, R) if full else output_gain(system.A, system.B, C, Q, R)
+        stocks, self._feed = system.equilibrium()
+        self.system, self.gain, self._env, self._goal = system, gain, env, C @ stocks
+        self._rows = [env.network.node_index[node] for node in outputs]
+        self._idle = {a: np.tile(n, (env.num_envs, 1)) for a, n in env.neutral_action.items() if a not in agents}
+
+    def demand(self) -> Floats:
+        """Return u = u_e − K (y − y_e) at the present stocks, before clipping, shape (inputs, B), mass/time."""
+        distance = self._env.physical.stock[self._rows] - self._goal[:, None]
+        return np.asarray(self._feed[:, None] - self.gain @ distance)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the actions that set the demanded flows, clipped to the bounds of the controls."""
+        low, high = self.system.bounds[:, :, None]
+        actions = np.clip((2.0 * self.demand() - high - low) / (high - low), -1.0, 1.0)
+        return self._idle | {agent: actions[i, :, None] for i, agent in enumerate(self.system.inputs)}
+
+
+def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:
+    refused = {ControlKind.RATE: "rate controls multiply flows (bilinear)", ControlKind.INPUT: "inputs set no flows"}
+    for kind, reason in refused.items():
+        if acting := [a for a in agents if (control := network.compartments[a].control) and control.kind is kind]:
+            yield f"{reason}, let others act (agents=...) than {', '.join(acting)}"
+    reasons = {Law.COMPARTMENT: "inner physics drives", Law.BATCH: "batches move along"}
+    for arc in network.arcs:
+        if reason := reasons.get(arc.law, "a time series drives" if arc.times else ""):
+            yield f"{reason} '{arc.id}'"
+
+
+def _targets(network: Network, set_points: Mapping[str, float] | None) -> dict[str, float]:
+    tracked = network.objective.tracked or tuple(network.node_index)
+    own = {node.id: node.set_point for node in network.nodes if node.set_point is not None and node.id in tracked}
+    chosen = own if set_points is None else dict(set_points)
+    for node, value in chosen.items():
+        if node not in network.node_index:
+            raise CirlError(f"LQR: set_points: {unknown('node', node, network.node_index)}")
+        if not 0.0 <= value < np.inf:
+            raise CirlError(f"LQR: set_points: '{node}' = {value} must be finite and not negative")
+    return chosen
+
+
+def _subset(kind: str, chosen: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+    for each in chosen or [""]:
+        if each not in known:
+            raise ControlError(f"LQR: {unknown(kind, each, known)}")
+    return tuple(dict.fromkeys(chosen))
+
+
+def _weight(name: str, given: ArrayLike | None, default: Floats, *, definite: bool) -> Floats:
+    values = default if given is None else np.asarray(given, dtype=np.float64)
+    matrix: Floats = np.diag(values) if values.ndim == 1 else values
+    if matrix.shape == 2 * (len(default),) and np.isfinite(matrix).all() and (matrix == matrix.T).all():
+        modes = linalg.eigvalsh(matrix)
+        if modes[-1] > 0 and modes[0] > (RANK if definite else -RANK) * modes[-1]:
+            return matrix
+    wanted = f"positive {'' if definite else 'semi-'}definite matrix, or its diagonal, of {len(default)} rows"
+    raise ControlError(f"LQR: {name} must be a symmetric {wanted}, not {given!r}")
+
+
+def _kalman(A: Floats, B: Floats) -> tuple[Floats, Floats]:
+    """Return orthonormal bases of what control reaches and of the rest, shapes (n, r) and (n, n − r)."""
+    reached, block = np.empty((len(A), 0)), B / max(linalg.norm(B), 1.0)
+    while block.shape[1]:
+        for _ in range(2):  # the second pass removes round-off along what is reached already
+            block = block - reached @ (reached.T @ block)
+        left, sizes, _ = linalg.svd(block, full_matrices=False)
+        block = left[:, sizes > RANK]
+        reached = np.hstack([reached, block])
+        block = A @ block / max(linalg.norm(A), RANK)
+    return reached, linalg.svd(reached)[0][:, reached.shape[1] :]
+
+
+def _refuse_unstable(closed: Floats, A: Floats, why: str) -> None:
+    for mode in linalg.eigvals(closed):
+        if mode.real > -DECAY * linalg.norm(A):
+            raise CirlError(f"LQR: {why} the mode with eigenvalue {mode:.6g}, which is not stable")
