@@ -80,10 +80,11 @@ def show(
     console.print(nodes_table(found, stock))
     console.print(arcs_table(found, flow))
     for service in found.services:
-        high = "" if np.isinf(service.high) else f" and at most {service.high:g}"
+        ends = [f"at least {service.low:g}"] * (service.low > 0) + [f"at most {service.high:g}"] * np.isfinite(
+            service.high
+        )
         console.print(
-            f"service '{service.id}': {service.measure or service.quantity} of {service.provider} "
-            f"at least {service.low:g}{high}"
+            f"service '{service.id}': {service.measure or service.quantity} of {service.provider} {' and '.join(ends)}"
         )
     console.print(f"λ of the start state: {float(found.circularity(flow)):.5g} {found.mass_unit}")
     path = picture or Path(f"{found.name}.png")

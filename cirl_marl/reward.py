@@ -19,7 +19,7 @@ class Scoring:
         r_c = −((q − set_point)/scale)² − Σ_s weight_s · shortfall_s,    s over the services that c owes
 
     plus the reward of its model, if it has one. Here shortfall = 1 − level, and the level of a service with band
-    [low, high] is min(1, q/low, high/q).
+    [low, high] is min(1, q/low, high/q), without q/low if low = 0.
 
     Args of all methods are compartment-major, shape (rows, B).
     """
@@ -39,6 +39,8 @@ class Scoring:
         self._low = np.array([s.low for s in services]).reshape(-1, 1)
         self._high = np.array([s.high for s in services]).reshape(-1, 1)
         self._bounded = bool(np.isfinite(self._high).any())
+        self._no_least = np.flatnonzero(self._low[:, 0] == 0.0)
+        self._low[self._no_least] = 1.0
         modelled = [position[c.id] for c in compartments if c.model is not None]
         count = len(compartments)
         terms = count + len(services) + len(modelled)
@@ -60,6 +62,7 @@ class Scoring:
         """Return the level of each service in [0, 1], shape (services, B)."""
         measured = self._measure(quantities)
         level: Floats = measured / self._low
+        level[self._no_least] = 1.0
         if self._bounded:
             np.divide(self._high, measured, out=level, where=measured > self._high)
         np.minimum(level, 1.0, out=level)

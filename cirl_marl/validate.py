@@ -204,8 +204,10 @@ def _service_problems(service: Service, network: Network, nodes: Mapping[str, No
     for debtor in service.owed_by:
         if debtor not in everyone:
             yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
-    if not 0 < service.low <= service.high:
-        yield f"{where}: the band [{service.low}, {service.high}] must be positive and not empty"
+    if not 0 <= service.low <= service.high or not service.high > 0:
+        yield f"{where}: the band [{service.low}, {service.high}] must not be negative or empty"
+    elif service.low == 0 and math.isinf(service.high):
+        yield f"{where}: the band from 0 without an upper end asks for nothing"
     if not math.isfinite(service.weight) or service.weight < 0:
         yield f"{where}: weight {service.weight} must be finite and not negative"
 

@@ -13,11 +13,12 @@ def episode(env: gymnasium.Env[object, object], action: float) -> tuple[int, flo
     """Return length, return and whether the episode ended by termination, under a constant action."""
     env.reset()
     steps, total = 0, 0.0
-    while True:
+    while steps < 1000:
         _, reward, terminated, truncated, _ = env.step([action])
         steps, total = steps + 1, total + float(reward)
         if terminated or truncated:
             return steps, total, terminated
+    raise AssertionError("the episode does not end")
 
 
 @pytest.mark.parametrize(("name", "action", "published"), [("CopperNet", -1.0, -4.43e8), ("CarboNet", 1.0, -7.07e7)])

@@ -549,3 +549,16 @@ def test_robots_failures_decide_the_coupling() -> None:
     assert (good.episode_service > 0.5).all()
     assert (bad.episode_circularity < good.episode_circularity - 50.0).all()
     assert (stopped.episode_circularity > bad.episode_circularity).all()  # a truck that never arrives is best for λ
+
+
+@pytest.mark.parametrize("scenario", ["default", "reacher"])
+def test_staying_away_does_not_pay(scenario: str) -> None:
+    """A truck that never loads is good for λ, but it owes that nothing piles up, and earns less than one at work."""
+    env = VectorEnv("solids_net", num_envs=1, scenario=scenario)
+    drives = rollout(env, Scripted({"sorter": 0.0}), seed=0)
+    stays = rollout(env, Scripted({"sorter": 0.0, "truck": -0.05}), seed=0)
+    truck = env.agents.index("truck")
+    assert stays.load[-1, 2] > drives.load[-1, 2] == 0.0
+    assert stays.episode_circularity[0] > drives.episode_circularity[0]
+    assert stays.episode_service[0] < drives.episode_service[0]
+    assert stays.returns[truck, 0] < drives.returns[truck, 0]
