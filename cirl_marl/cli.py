@@ -80,9 +80,8 @@ def show(
     console.print(nodes_table(found, stock))
     console.print(arcs_table(found, flow))
     for service in found.services:
-        ends = [f"at least {service.low:g}"] * (service.low > 0) + [f"at most {service.high:g}"] * np.isfinite(
-            service.high
-        )
+        ends = [f"at least {service.low:g}"] if service.low > 0 else []
+        ends += [] if np.isinf(service.high) else [f"at most {service.high:g}"]
         console.print(
             f"service '{service.id}': {service.measure or service.quantity} of {service.provider} {' and '.join(ends)}"
         )

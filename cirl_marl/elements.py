@@ -150,8 +150,8 @@ class Arc(Compartment):
 class Service:
     """What the network is there for: a stock or flow to be kept within a band.
 
-    The level is 1 inside ``[low, high]``, ``q/low`` below it and ``high/q`` above it; the shortfall is 1 - level. A band
-    from 0 only bounds what piles up.
+    The level is 1 inside ``[low, high]``, ``q/low`` below it and ``high/q`` above it; the shortfall is 1 - level. A
+    band from 0 only bounds what piles up.
 
     Attributes:
         id: name of the service.

@@ -539,14 +539,14 @@ def test_networks_without_criticality_have_no_time_window() -> None:
 
 
 def test_robots_failures_decide_the_coupling() -> None:
-    """A robot that stands still loads the truck with everything, leaves no service, and lowers λ̄."""
+    """A robot that stands still loads the truck with everything, leaves nothing in second use, and lowers λ̄."""
     env = VectorEnv("solids_net", num_envs=1)
     controllers = (Scripted(), Scripted({"sorter": 0.0}), Constant())
     good, bad, stopped = (rollout(env, controller, seed=0) for controller in controllers)
     truck = [line.id for line in env.dynamics.batches.lines].index("truck")
     assert bad.load[:, truck].max() == BATCH_KG
-    assert (bad.episode_service == 0.0).all()
-    assert (good.episode_service > 0.5).all()
+    np.testing.assert_allclose(bad.episode_service, 0.5)  # no second use, and all that is unsorted is carried away
+    assert (good.episode_service > 0.8).all()
     assert (bad.episode_circularity < good.episode_circularity - 50.0).all()
     assert (stopped.episode_circularity > bad.episode_circularity).all()  # a truck that never arrives is best for λ
 
