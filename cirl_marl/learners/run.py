@@ -245,5 +245,5 @@ class MetricsFile:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, the platform and every package that bears on a result."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
+    found = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
     return found | {package: metadata.version(package) for package in PACKAGES}
