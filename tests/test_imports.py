@@ -24,7 +24,7 @@ LAYERS = (
     {"schema", "mistakes", "conversion", "definition", "writing", "catalogue"},
     {"batches", "flows", "inner", "simulate", "actuators", "starts", "state", "observe", "reward", "vector_env"},
     {"parallel_env", "single_env", "goal_env", "registration"},
-    {"controllers", "learners", "evaluate", "report", "nested", "testing"},
+    {"controllers", "optimum", "learners", "evaluate", "report", "nested", "testing"},
     {"paper"},
     {"cli"},
 )

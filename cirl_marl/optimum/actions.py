@@ -1,0 +1,76 @@
+"""The actions that come closest to planned flows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cirl_marl.actuators import Actuators
+from cirl_marl.elements import ControlKind, Law
+from cirl_marl.flows import FlowLaws
+from cirl_marl.network import Floats
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.layout import Layout
+
+
+def normalised_actions(admissible: Admissible, layout: Layout, planned: Floats) -> Floats:
+    """Return the actions whose constant factors give the planned mean flows at the planned mean stocks.
+
+    v = Z̄/X̄ where a node has several outflows, else what its outflow asks with its own control neutral; then
+    w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range.
+
+    Args:
+        admissible: ranges of the factors.
+        layout: of the variables.
+        planned: variables of each interval, shape (steps, size).
+
+    Returns:
+        Actions in [−1, 1], in the order of ``VectorEnv.stack``, shape (steps, entries).
+    """
+    network = admissible.network
+    nodes = len(network.nodes)
+    stock, flow, through = layout.means(planned)
+    neutral = np.array([1.0 if c.control is None else c.control.neutral for c in network.compartments.values()])
+    is_valve = [node.control is not None and node.control.kind is ControlKind.RATE for node in network.nodes]
+    valve = np.tile(np.where(is_valve, neutral[:nodes], 1.0), (len(planned), 1))
+    by_donor = admissible.driver == network.donors
+    for k in np.flatnonzero(by_donor):
+        donor = int(network.donors[k])
+        if donor not in layout.valves and admissible.valve[0, donor] < admissible.valve[1, donor]:
+            unit = admissible.base[:, k] * neutral[nodes + k] * stock[:, donor]
+            valve[:, donor] = _ratio(flow[:, k], unit, valve[:, donor])
+    for z, node in enumerate(layout.valves):
+        valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
+    valve = np.clip(valve, admissible.valve[0], admissible.valve[1])
+    driving = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
+    own = _ratio(
+        flow, admissible.base * driving * valve[:, network.donors], np.broadcast_to(neutral[nodes:], flow.shape)
+    )
+    own = np.clip(own, admissible.own[0], admissible.own[1])
+    return _entries(admissible, valve, own)
+
+
+def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
+    network = admissible.network
+    laws = FlowLaws(network)
+    actuators = Actuators(laws, admissible.agents or None, 1)
+    actions = np.zeros((len(valve), len(actuators.acting)))
+    low, high = laws.control_low[actuators.acting], laws.control_high[actuators.acting]
+    for agent, entries in actuators.entries.items():
+        control = network.compartments[agent].control
+        assert control is not None
+        if agent in network.arc_index:
+            values = own[:, network.arc_index[agent]]
+        elif control.kind is ControlKind.RATE:
+            values = valve[:, network.node_index[agent]]
+        else:
+            node = network.node_index[agent]
+            sets = next(k for k in np.flatnonzero(network.donors == node) if network.arcs[k].law is Law.CONTROLLED)
+            values = own[:, sets]
+        actions[:, entries] = values[:, None]
+    normalised: Floats = np.clip((actions - (high + low) / 2) / ((high - low) / 2), -1.0, 1.0)
+    return normalised
+
+
+def _ratio(amount: Floats, unit: Floats, otherwise: Floats) -> Floats:
+    ratio: Floats = np.divide(amount, unit, out=otherwise.copy(), where=unit > 1e-12 * np.abs(amount))
+    return ratio

@@ -1,0 +1,124 @@
+"""What the acting agents can do to each flow, and for which networks that is all there is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.actuators import Actuators
+from cirl_marl.elements import Arc, Compartment, ControlKind, Law, Node
+from cirl_marl.errors import CirlError
+from cirl_marl.flows import FlowLaws
+from cirl_marl.network import Floats, Integers, Network
+
+
+class NoCertificate(CirlError):
+    """A network for which no upper bound is proved; the message says why."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Admissible:
+    """The ranges of the factors of every flow, f_k = v·w_k·a_k·x_p for stock-driven flows, u_k·v for scheduled ones.
+
+    v is the valve of the donor and w_k or u_k the arc's own control; each is a single value if nobody acts on it.
+
+    Attributes:
+        network: whose flows they are.
+        agents: who acts.
+        driver: node p whose stock drives each arc; −1 for scheduled flows, shape (arcs,).
+        base: a_k, 1/time, or the mean of the schedule over each interval, mass/time (1 if a control sets the flow),
+            shape (steps, arcs).
+        own: lowest and highest w_k or u_k, shape (2, arcs).
+        valve: lowest and highest v of each node, shape (2, nodes).
+    """
+
+    network: Network
+    agents: tuple[str, ...]
+    driver: Integers
+    base: Floats
+    own: Floats
+    valve: Floats
+
+    @classmethod
+    def of(cls, network: Network, agents: Sequence[str] | None = None) -> Admissible:
+        """Read the ranges off ``network`` while ``agents`` act and the others are neutral.
+
+        Raises:
+            NoCertificate: for inner physics, batches, a solver that is not exact, or flows that may run backwards.
+            CirlError: for an unknown agent.
+        """
+        reasons = list(_uncertified(network))
+        if reasons:
+            named = f"network '{network.name}', scenario '{network.scenario_name}'"
+            raise NoCertificate(f"{named}: no bound is proved: {'; '.join(reasons)}")
+        laws = FlowLaws(network)
+        acting = Actuators(laws, agents, 1).agents
+        steps = network.episode.horizon
+        own, valve = np.ones((2, len(network.arcs))), np.ones((2, len(network.nodes)))
+        for i, node in enumerate(network.nodes):
+            if node.control is not None and node.control.kind is ControlKind.RATE:
+                valve[:, i] = _range(node, acting)
+        for k, arc in enumerate(network.arcs):
+            setter = _setter(network, arc)
+            if setter is not None:
+                own[:, k] = _range(setter, acting)
+        if (own < 0).any():
+            arc = network.arcs[int((own < 0).any(axis=0).argmax())]
+            raise NoCertificate(f"network '{network.name}': arc '{arc.id}' may run backwards, so no bound is proved")
+        return cls(
+            network=network,
+            agents=acting,
+            driver=np.where(laws.scheduled, -1, laws.driver),
+            base=laws.rate(np.ones((len(laws.neutral), steps)), np.arange(steps)).T,
+            own=own,
+            valve=valve,
+        )
+
+    @property
+    def scheduled(self) -> NDArray[np.bool_]:
+        """Arcs that flow by schedule, as far as their donor holds enough, shape (arcs,)."""
+        scheduled: NDArray[np.bool_] = self.driver < 0
+        return scheduled
+
+    @property
+    def factor(self) -> Floats:
+        """Lowest and highest v·w_k or v·u_k, shape (2, arcs)."""
+        factor: Floats = self.own * self.valve[:, self.network.donors]
+        return factor
+
+    def rate(self, step: int) -> Floats:
+        """Return the lowest and highest coefficient of each arc in one interval, shape (2, arcs).
+
+        1/time for stock-driven arcs, mass/time for scheduled ones.
+        """
+        rate: Floats = self.factor * self.base[step]
+        return rate
+
+
+def _range(compartment: Compartment, acting: Sequence[str]) -> tuple[float, float]:
+    control = compartment.control
+    assert control is not None
+    return (control.low, control.high) if compartment.id in acting else (control.neutral, control.neutral)
+
+
+def _setter(network: Network, arc: Arc) -> Arc | Node | None:
+    """Return the compartment whose control is the arc's own factor; the valve of its donor is none."""
+    donor = network.nodes[network.node_index[arc.donor]]
+    if arc.law is Law.CONTROLLED and donor.control is not None and donor.control.kind is ControlKind.FLOW:
+        return donor
+    return arc if arc.control is not None else None
+
+
+def _uncertified(network: Network) -> Iterator[str]:
+    """Yield every reason why the flows of ``network`` are not the linear laws that the theorem is about."""
+    if network.episode.solver != "exact":
+        yield f"solver '{network.episode.solver}' is not exact within a control interval"
+    modelled = [c.id for c in network.compartments.values() if c.model is not None]
+    if modelled:
+        yield f"{modelled} have inner physics"
+    batches = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
+    if batches:
+        yield f"{batches} move batches"

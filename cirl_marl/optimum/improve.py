@@ -1,0 +1,190 @@
+"""Better actions for a plan: sequential linear programs on the exact simulator.
+
+The relaxed flows of a bound are not quite what constant controls can do. Around an episode of the simulator every
+interval is linear to first order, δx' = J_x δx + J_a δa, and so are mean flows; the best step within a trust region is
+a linear program. Steps are accepted by simulation alone, so the result is an episode that exists.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy import optimize, sparse
+
+from cirl_marl.actuators import Actuators
+from cirl_marl.errors import CirlError
+from cirl_marl.evaluate import Rollout
+from cirl_marl.network import Floats
+from cirl_marl.optimum.bound import Bound
+from cirl_marl.optimum.plan import achieved
+from cirl_marl.simulate import Dynamics
+
+DIFFERENCE = 1e-6
+"""Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
+PENALTY = 3.0
+"""Price of missing service in the merit, times the price that the bound puts on it."""
+TRUST, SMALLEST = 0.25, 1e-3
+"""First and smallest half-width of the trust region, in normalised actions."""
+
+
+def improved(bound: Bound, *, rounds: int = 20) -> Bound:
+    """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
+
+    The merit is the objective of the bound; service below ``min_service`` is charged PENALTY times what the bound says
+    it costs to provide. Local optimality is all that is sought; ``bound.gap`` says how much better any plan could be.
+
+    Args:
+        bound: with the actions to start from.
+        rounds: most linear programs to solve.
+    """
+    price = _price(bound)
+    best, run = bound, achieved(bound)
+    merit, trust = _merit(bound, run, price), TRUST
+    for _ in range(rounds):
+        step = _step(best, run, price, trust)
+        candidate = replace(best, actions=np.clip(best.actions + step, -1.0, 1.0))
+        tried = achieved(candidate)
+        gained = _merit(bound, tried, price) - merit
+        if gained > 0:
+            best, run, merit, trust = candidate, tried, merit + gained, min(1.0, 2 * trust)
+        else:
+            trust /= 4
+        if trust < SMALLEST:
+            break
+    return best
+
+
+def _price(bound: Bound) -> float:
+    """Merit of one unit of service: the weight, or the price that covers what the certificate asks for it."""
+    if bound.service_weight is not None:
+        return bound.service_weight
+    if bound.min_service is None or not bound.network.services:
+        return 0.0
+    return PENALTY * max(float(-bound.certificate.under[-1]), bound.network.objective.circularity_scale)
+
+
+def _merit(bound: Bound, run: Rollout, price: float) -> float:
+    circularity, service = float(run.episode_circularity[0]), float(run.episode_service[0])
+    if bound.service_weight is not None:
+        return circularity / bound.network.objective.circularity_scale + price * service
+    return circularity - price * max(0.0, (bound.min_service or 0.0) - service)
+
+
+def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
+    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, shape (steps, nodes + arcs, nodes | entries)."""
+    network = bound.network
+    steps, entries = bound.actions.shape
+    nodes = len(network.nodes)
+    dynamics = Dynamics(network)
+    stock = np.concatenate([bound.initial[None], run.stock[:-1]])
+    inputs = np.concatenate([stock, bound.actions], axis=1)
+    width = np.concatenate([np.maximum(stock.max(axis=0), 1.0), np.ones(entries)]) * DIFFERENCE
+    # forward in stocks, which may be 0; inward in actions, which may be at a bound
+    shift = np.where(np.arange(nodes + entries) < nodes, 1.0, -np.where(inputs >= 0, 1.0, -1.0)) * width
+    columns = np.repeat(inputs[:, :, None], nodes + entries + 1, axis=2)
+    columns[:, np.arange(nodes + entries), np.arange(nodes + entries)] += shift
+    flat = np.ascontiguousarray(columns.transpose(1, 0, 2).reshape(nodes + entries, -1))
+    actuators = Actuators(dynamics, bound.agents or None, flat.shape[1])
+    when = np.repeat(np.arange(steps), nodes + entries + 1)
+    inner = np.empty((0, flat.shape[1]))
+    done = dynamics.advance(dynamics.extend(flat[:nodes]), inner, actuators.controls(flat[nodes:]), when)
+    outputs = np.concatenate([done.stock[:nodes], done.moved / network.episode.control_interval])
+    shaped = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
+    slopes = (shaped[:, :, :-1] - shaped[:, :, -1:]) / shift[:, None]
+    return slopes[:, :, :nodes], slopes[:, :, nodes:]
+
+
+def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats:
+    """Return the best change of the actions within the trust region to first order, shape (steps, entries).
+
+    Variables of an interval: δx', δf̄, δa, the levels, the imbalance; after the last, missing service.
+    """
+    network = bound.network
+    steps, entries = bound.actions.shape
+    nodes, arcs, services = len(network.nodes), len(network.arcs), len(network.services)
+    by_stock, by_action = _jacobians(bound, run)
+    outputs = nodes + arcs
+    size = outputs + entries + services + 1
+    level, imbalance = outputs + entries, size - 1
+    once = sparse.identity(steps)
+    carry = sparse.csr_array(_diagonal(-by_stock, (outputs, nodes)))
+    carried = carry @ sparse.kron(sparse.eye_array(steps, k=-1), sparse.eye_array(nodes, size))
+    select_out, select_in = sparse.eye_array(outputs, size), sparse.eye_array(entries, size, k=outputs)
+    linear = sparse.kron(once, select_out) - sparse.csr_array(_diagonal(by_action, (outputs, entries))) @ sparse.kron(
+        once, select_in
+    )
+    measure, imbalances = _measures(bound)
+    realised = np.concatenate([run.stock, run.flow], axis=1)
+    low = np.array([service.low for service in network.services])
+    rows = np.zeros((services + 2, size))
+    rows[:services, :outputs], rows[:services, level:imbalance] = -measure, np.diag(low)
+    rows[services:, :outputs], rows[services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0
+    limits = np.concatenate([realised @ measure.T, -(realised @ imbalances)[:, None] * [1.0, -1.0]], axis=1)
+    cost = _cost(bound, size, level, price)
+    missing = np.zeros((1, steps * size + 1))
+    if services:
+        share = np.zeros(size)
+        share[level:imbalance] = -1.0 / (steps * services)
+        missing[0, :-1], missing[0, -1] = np.tile(share, steps), -1.0
+    under = sparse.vstack(
+        [sparse.hstack([sparse.kron(once, rows), sparse.csr_array((steps * len(rows), 1))]), missing], format="csr"
+    )
+    demanded = (bound.min_service or 0.0) if services and bound.service_weight is None else 0.0
+    bounds = np.tile(np.array([-np.inf, np.inf]), (steps, size, 1))
+    bounds[:, :nodes, 0] = -run.stock
+    bounds[:, outputs:level] = np.stack(
+        [np.maximum(-trust, -1 - bound.actions), np.minimum(trust, 1 - bound.actions)], axis=2
+    )
+    bounds[:, level:imbalance] = [0.0, 1.0]
+    bounds[:, imbalance, 0] = 0.0
+    found = optimize.linprog(
+        np.append(np.tile(cost, steps), price if demanded else 0.0),
+        A_ub=under,
+        b_ub=np.append(limits.ravel(), -demanded),
+        A_eq=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, 1))], format="csr"),
+        b_eq=np.zeros(steps * outputs),
+        bounds=np.concatenate([bounds.reshape(-1, 2), [[0.0, np.inf]]]),
+        method="highs-ipm",
+    )
+    if found.status != 0:
+        raise CirlError(f"network '{network.name}': HiGHS found no better actions: {found.message}")
+    step: Floats = found.x[:-1].reshape(steps, size)[:, outputs:level]
+    return step
+
+
+def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:
+    return sparse.block_diag([block.reshape(shape) for block in blocks], format="csr")
+
+
+def _measures(bound: Bound) -> tuple[Floats, Floats]:
+    """Return what each service reads off (x', f̄), shape (services, nodes + arcs), and Δ·σ_env padded with zeros."""
+    network = bound.network
+    nodes = len(network.nodes)
+    measure = np.zeros((len(network.services), nodes + len(network.arcs)))
+    for s, service in enumerate(network.services):
+        if service.quantity == "stock":
+            measure[s, network.node_index[service.provider]] = 1.0
+        elif service.quantity == "outflow":
+            measure[s, nodes:] = network.donors == network.node_index[service.provider]
+        else:
+            measure[s, nodes + network.arc_index[service.provider]] = 1.0
+    weights = network.objective.reference_interval * network.sustainability * network.environmental
+    return measure, np.concatenate([np.zeros(nodes), weights])
+
+
+def _cost(bound: Bound, size: int, level: int, price: float) -> Floats:
+    """Return the cost of the variables of one interval: minus the share in λ̄, or in the weighted objective."""
+    network, steps = bound.network, len(bound.actions)
+    nodes, services = len(network.nodes), len(network.services)
+    cost = np.zeros(size)
+    counted = network.objective.reference_interval * network.sustainability
+    if network.objective.net_zero == "abs":
+        counted = counted * ~network.environmental
+        cost[-1] = 1.0 / steps
+    cost[nodes : nodes + len(counted)] = counted / steps
+    if bound.service_weight is not None:
+        cost /= network.objective.circularity_scale
+        cost[level : level + services] = -price / (steps * max(services, 1))
+    return cost

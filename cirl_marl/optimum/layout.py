@@ -1,0 +1,120 @@
+"""Where the variables of the linear program lie."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from cirl_marl.network import Floats, Integers, Network
+
+Row = list[tuple[int, float]]
+Link = tuple[Row, Row]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the variables of one interval lie.
+
+    For each piece X_i, F_i and Z_i for i = 0 … d, then the stocks at its end; after the last piece, the levels, the
+    imbalance and the valves.
+    Z_i = v·X_i is what the valve of a node lets through to several outflows. Moments are counted through all pieces.
+
+    Attributes:
+        network: whose variables they are.
+        pieces: substeps of the simulator in an interval; scheduled flows are constant within each.
+        degree: d.
+        valves: nodes that have a Z.
+        openings: nodes of these with scheduled outflows, on which the valve acts as well; v is then a variable.
+    """
+
+    network: Network
+    pieces: int
+    degree: int
+    valves: Integers
+    openings: Integers
+
+    @cached_property
+    def moments(self) -> range:
+        """All Bernstein indices of an interval, piece after piece."""
+        return range(self.pieces * (self.degree + 1))
+
+    @cached_property
+    def piece(self) -> int:
+        """Variables of a piece."""
+        nodes = len(self.network.nodes)
+        return (self.degree + 1) * (nodes + len(self.network.arcs) + len(self.valves)) + nodes
+
+    @property
+    def length(self) -> float:
+        """Length of a piece, δ."""
+        return self.network.episode.control_interval / self.pieces
+
+    @property
+    def portion(self) -> float:
+        """Length of a piece over d + 1, the integral of each test polynomial."""
+        return self.network.episode.control_interval / len(self.moments)
+
+    def stock(self, moment: int) -> int:
+        """Return the first of the weighted mean stocks X."""
+        piece, i = divmod(moment, self.degree + 1)
+        return piece * self.piece + i * ((self.piece - len(self.network.nodes)) // (self.degree + 1))
+
+    def flow(self, moment: int) -> int:
+        """Return the first of the weighted mean flows F."""
+        return self.stock(moment) + len(self.network.nodes)
+
+    def valve(self, moment: int) -> int:
+        """Return the first of Z."""
+        return self.flow(moment) + len(self.network.arcs)
+
+    def end(self, piece: int) -> int:
+        """Return the first of the stocks at the end of a piece; −1 is the last."""
+        return (piece % self.pieces + 1) * self.piece - len(self.network.nodes)
+
+    @property
+    def level(self) -> int:
+        """The first of the service levels."""
+        return self.pieces * self.piece
+
+    @property
+    def imbalance(self) -> int:
+        """The variable that is at least |Δ·σ_env·f̄|; counted only with ``net_zero = "abs"``."""
+        return self.level + len(self.network.services)
+
+    @property
+    def opening(self) -> int:
+        """The first of the valves v themselves."""
+        return self.imbalance + 1
+
+    @property
+    def size(self) -> int:
+        """Variables of an interval."""
+        return self.opening + len(self.openings)
+
+    def means(self, planned: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the plain means of X, F and Z over each interval, shape (steps, nodes | arcs | valves)."""
+        counts = (len(self.network.nodes), len(self.network.arcs), len(self.valves))
+        parts = []
+        for first, count in zip((self.stock, self.flow, self.valve), counts, strict=True):
+            parts.append(np.mean([planned[:, first(j) : first(j) + count] for j in self.moments], axis=0))
+        return parts[0], parts[1], parts[2]
+
+
+def start_of(layout: Layout, piece: int, node: int, factor: float) -> Link:
+    """Return the entry of a stock at the start of a piece, in this interval or in the one before."""
+    entry = [(layout.end(piece - 1) + node, factor)]
+    return (entry, []) if piece > 0 else ([], entry)
+
+
+def matrix_of(rows: Sequence[Row], layout: Layout) -> Any:
+    """Return the sparse matrix of rows over the variables of one interval."""
+    entries = [(i, column, value) for i, row in enumerate(rows) for column, value in row]
+    if not entries:
+        return sparse.csr_array((len(rows), layout.size))
+    i, columns, values = zip(*entries, strict=True)
+    return sparse.csr_array((values, (i, columns)), shape=(len(rows), layout.size))

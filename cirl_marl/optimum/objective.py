@@ -1,0 +1,57 @@
+"""What the program maximises, and how service is read off its variables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cirl_marl.network import Floats
+from cirl_marl.optimum.layout import Layout, Row
+
+
+def measures(layout: Layout) -> Iterator[Row]:
+    """Yield low·level − q ≤ 0 for each service, and ±Δ·σ_env·f̄ − imbalance ≤ 0.
+
+    The level is at most min(1, q/low): a finite upper end of the band could only lower it further.
+    """
+    network, count = layout.network, len(layout.moments)
+    for s, service in enumerate(network.services):
+        if service.quantity == "stock":
+            measured = [(layout.end(-1) + network.node_index[service.provider], -1.0)]
+        else:
+            outflow = service.quantity == "outflow"
+            arcs = [k for k, arc in enumerate(network.arcs) if (arc.donor if outflow else arc.id) == service.provider]
+            measured = [(layout.flow(i) + k, -1.0 / count) for i in layout.moments for k in arcs]
+        yield [(layout.level + s, service.low), *measured]
+    weights = network.objective.reference_interval * network.sustainability * network.environmental
+    counted = [(i, int(k)) for i in layout.moments for k in np.flatnonzero(weights)]
+    for sign in (1.0, -1.0):
+        flows = [(layout.flow(i) + k, sign * float(weights[k]) / count) for i, k in counted]
+        yield [*flows, (layout.imbalance, -1.0)]
+
+
+def circularity_weights(layout: Layout) -> Floats:
+    """Return the weights of λ̄ on the variables of one interval, shape (size,), mass."""
+    network, steps = layout.network, layout.network.episode.horizon
+    weights = np.zeros(layout.size)
+    counted = -network.objective.reference_interval * network.sustainability
+    if network.objective.net_zero == "abs":
+        counted = counted * ~network.environmental
+        weights[layout.imbalance] = -1.0 / steps
+    for i in layout.moments:
+        weights[layout.flow(i) : layout.valve(i)] = counted / (steps * len(layout.moments))
+    return weights
+
+
+def objective(layout: Layout, service_weight: float | None) -> tuple[Floats, float]:
+    """Return the cost of every variable of an episode, and what the objective has beside −cᵀv."""
+    network, steps = layout.network, layout.network.episode.horizon
+    weights, constant = circularity_weights(layout), 0.0
+    if service_weight is not None:
+        weights = weights / network.objective.circularity_scale
+        if network.services:
+            weights[layout.level : layout.imbalance] = service_weight / (len(network.services) * steps)
+        else:
+            constant = service_weight
+    return np.tile(-weights, steps), constant

@@ -1,0 +1,211 @@
+"""The linear program that relaxes an episode: its variables, matrices and bounds (docs/bound.md).
+
+Every piece is tested with the Bernstein polynomials B_0 … B_d of degree d: X_i and F_i are the means of stocks and
+flows weighted with B_i. Integration by parts and the flow laws hold for them exactly, whatever the controls do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from cirl_marl.network import Floats
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.layout import Layout, Link, Row, matrix_of, start_of
+from cirl_marl.optimum.monotone import falls
+from cirl_marl.optimum.objective import measures, objective
+from cirl_marl.optimum.reach import Reach
+from cirl_marl.optimum.scheduled import deliveries, openings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Program:
+    """Minimise cᵀv subject to A v = b, G v ≤ g, l ≤ v ≤ u; v has shape (steps · layout.size,).
+
+    Attributes:
+        layout: what v is.
+        cost: c; the objective to maximise is −cᵀv + ``constant``.
+        constant: what no plan changes.
+        equal: A, sparse.
+        equal_to: b.
+        under: G, sparse.
+        under_to: g.
+        low: l, finite.
+        high: u, finite.
+    """
+
+    layout: Layout
+    cost: Floats
+    constant: float
+    equal: Any
+    equal_to: Floats
+    under: Any
+    under_to: Floats
+    low: Floats
+    high: Floats
+
+
+def program(
+    admissible: Admissible,
+    reached: Reach,
+    initial: Floats,
+    degree: int,
+    *,
+    service_weight: float | None,
+    min_service: float | None,
+) -> Program:
+    """Write down the program for one episode from ``initial``, shape (nodes,)."""
+    network, steps = admissible.network, admissible.network.episode.horizon
+    layout = _layout(admissible, reached, degree)
+    equal, under = _laws(admissible, layout)
+    first = np.zeros(layout.size)
+    first[layout.end(-1) : layout.level] = initial
+    matrix, equal_to = _chained(_balances(layout), equal, layout, first)
+    inequalities, under_to = _chained(
+        [*deliveries(admissible, layout), *falls(admissible, layout)], [*under, *measures(layout)], layout, first
+    )
+    opened, opened_to = openings(admissible, reached, layout)
+    inequalities, under_to = sparse.vstack([inequalities, opened], format="csr"), np.append(under_to, opened_to)
+    cost, constant = objective(layout, service_weight)
+    if min_service is not None and network.services:
+        level = np.zeros(layout.size)
+        level[layout.level : layout.imbalance] = -1.0 / (len(network.services) * steps)
+        inequalities = sparse.vstack([inequalities, sparse.csr_array(np.tile(level, steps)[None])], format="csr")
+        under_to = np.append(under_to, -min_service)
+    low, high = _box(admissible, reached, layout)
+    return Program(
+        layout=layout,
+        cost=cost,
+        constant=constant,
+        equal=matrix,
+        equal_to=equal_to,
+        under=inequalities,
+        under_to=under_to,
+        low=low,
+        high=high,
+    )
+
+
+def _layout(admissible: Admissible, reached: Reach, degree: int) -> Layout:
+    network = admissible.network
+    nodes = len(network.nodes)
+    exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
+    orders = np.bincount(network.donors[admissible.scheduled], minlength=nodes)
+    movable = admissible.valve[0] < admissible.valve[1]
+    openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
+    valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
+    return Layout(network, reached.pieces, degree, valves, openings)
+
+
+def _chained(linked: Sequence[Link], alone: Sequence[Row], layout: Layout, first: Floats) -> tuple[Any, Floats]:
+    """Repeat rows in every interval and link each interval to the one before; return the matrix and right-hand side.
+
+    Args:
+        linked: pairs of rows on this interval's variables and on those of the one before.
+        alone: rows on this interval's variables.
+        layout: of an interval.
+        first: variables of the interval before the first, of which only the stocks at the end are used.
+    """
+    once, steps = sparse.identity(layout.network.episode.horizon), layout.network.episode.horizon
+    now, before = (matrix_of([link[side] for link in linked], layout) for side in (0, 1))
+    matrix = sparse.vstack(
+        [
+            sparse.kron(once, now) + sparse.kron(sparse.eye_array(steps, k=-1), before),
+            sparse.kron(once, matrix_of(alone, layout)),
+        ],
+        format="csr",
+    )
+    to = np.zeros(matrix.shape[0])
+    to[: len(linked)] = -(before @ first)
+    return matrix, to
+
+
+def _balances(layout: Layout) -> list[Link]:
+    """Return Y_i − Y_{i−1} − δ/(d + 1)·S F_i, which is 0, for i = 0 … d.
+
+    Y_i = ((d − i) X_i + (i + 1) X_{i+1})/(d + 1) are the means weighted with the polynomials of degree d − 1;
+    Y_{−1} and Y_d are the stocks at the two ends of the piece, δ its length.
+    """
+    network, d = layout.network, layout.degree
+    links: list[Link] = []
+    for j in layout.moments:
+        piece, i = divmod(j, d + 1)
+        for node in range(len(network.nodes)):
+            row = _lower_degree(layout, j, node, 1.0)
+            before: Row = []
+            if i > 0:
+                row += _lower_degree(layout, j - 1, node, -1.0)
+            else:
+                start, before = start_of(layout, piece, node, -1.0)
+                row += start
+            row += [(layout.flow(j) + int(k), layout.portion) for k in np.flatnonzero(network.donors == node)]
+            row += [(layout.flow(j) + int(k), -layout.portion) for k in np.flatnonzero(network.recipients == node)]
+            links.append((row, before))
+    return links
+
+
+def _lower_degree(layout: Layout, moment: int, node: int, sign: float) -> list[tuple[int, float]]:
+    d = layout.degree
+    piece, i = divmod(moment, d + 1)
+    if i == d:
+        return [(layout.end(piece) + node, sign)]
+    return [
+        (layout.stock(moment) + node, sign * (d - i) / (d + 1)),
+        (layout.stock(moment + 1) + node, sign * (i + 1) / (d + 1)),
+    ]
+
+
+def _laws(admissible: Admissible, layout: Layout) -> tuple[list[Row], list[Row]]:
+    """Return the rows of the flow laws: those equal to 0 and those at most 0."""
+    network = admissible.network
+    position = {int(node): z for z, node in enumerate(layout.valves)}
+    equal: list[Row] = []
+    under: list[Row] = []
+
+    def hold(column: int, driver: int, low: float, high: float) -> None:
+        """Hold low·driver ≤ column ≤ high·driver."""
+        if low == high:
+            equal.append([(column, 1.0), (driver, -low)])
+        else:
+            under.extend(([(column, 1.0), (driver, -high)], [(column, -1.0), (driver, low)]))
+
+    for i in layout.moments:
+        first = i - i % (layout.degree + 1)
+        if i > first:
+            for k in np.flatnonzero(admissible.scheduled):
+                equal.append([(layout.flow(i) + int(k), 1.0), (layout.flow(first) + int(k), -1.0)])
+        for node, z in position.items():
+            hold(layout.valve(i) + z, layout.stock(i) + node, *admissible.valve[:, node])
+        for k in np.flatnonzero(~admissible.scheduled):
+            donor, driver = int(network.donors[k]), int(admissible.driver[k])
+            through_valve = donor == driver and donor in position
+            factor = admissible.own[:, k] if through_valve else admissible.factor[:, k]
+            column = layout.valve(i) + position[donor] if through_valve else layout.stock(i) + driver
+            hold(layout.flow(i) + int(k), column, *(factor * admissible.base[0, k]))
+    return equal, under
+
+
+def _box(admissible: Admissible, reached: Reach, layout: Layout) -> tuple[Floats, Floats]:
+    """Return the lowest and highest value of every variable; all are finite, which makes every multiplier a bound."""
+    network = admissible.network
+    low, high = np.zeros((2, network.episode.horizon, layout.size))
+    scheduled = admissible.scheduled
+    rates = admissible.factor[:, None] * admissible.base
+    most = rates[1] * np.where(scheduled, 1.0, reached.upper[:, admissible.driver])
+    least = np.where(scheduled & reached.uncut, rates[0], 0.0)
+    for i in layout.moments:
+        high[:, layout.stock(i) : layout.flow(i)] = reached.upper
+        high[:, layout.flow(i) : layout.valve(i)] = most
+        low[:, layout.flow(i) : layout.valve(i)] = least
+        high[:, layout.valve(i) :][:, : len(layout.valves)] = (reached.upper * admissible.valve[1])[:, layout.valves]
+    for piece in range(layout.pieces):
+        high[:, layout.end(piece) : layout.end(piece) + len(network.nodes)] = reached.upper
+    high[:, layout.level : layout.imbalance] = 1.0
+    weights = network.objective.reference_interval * np.abs(network.sustainability * network.environmental)
+    high[:, layout.imbalance] = most @ weights
+    low[:, layout.opening :], high[:, layout.opening :] = admissible.valve[:, None, layout.openings]
+    return low.ravel(), high.ravel()

@@ -1,0 +1,410 @@
+"""The bound against simulated episodes and closed forms, its certificate against arbitrary multipliers, its limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Control,
+    ControlError,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    Node,
+    Role,
+    Service,
+    VectorEnv,
+    load_network,
+)
+from cirl_marl.controllers import Neutral
+from cirl_marl.evaluate import rollout
+from cirl_marl.flows import FlowLaws
+from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, improved
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.bound import starting_stocks
+from cirl_marl.optimum.certificate import verified
+from cirl_marl.optimum.reach import reach
+
+Floats = NDArray[np.float64]
+COPIES = 48
+
+
+def certifiable(network: Network, interval: float, pulls: bool) -> Network:
+    """Return the network without batches, and without pulls of recipients if so asked, with a moderate interval."""
+    replaced = {Law.BATCH} if pulls else {Law.BATCH, Law.RECIPIENT}
+    arcs = [
+        replace(arc, law=Law.DONOR, rate=0.3 if arc.law is Law.BATCH else arc.rate, batches=(), delay=0.0)
+        if arc.law in replaced
+        else arc
+        for arc in network.arcs
+    ]
+    return replace(network, arcs=tuple(arcs), episode=replace(network.episode, control_interval=interval))
+
+
+def bounded(network: Network, interval: float, service_weight: float | None = None) -> Bound:
+    """Bound the network; without the pulls of recipients if they rule a certificate out."""
+    start = [node.initial[1] for node in network.nodes]
+    try:
+        return bound(certifiable(network, interval, pulls=True), start, service_weight=service_weight)
+    except NoCertificate:
+        return bound(certifiable(network, interval, pulls=False), start, service_weight=service_weight)
+
+
+def pinned(found: Bound) -> Network:
+    """Return the network with the start of a bound as the only one."""
+    nodes = zip(found.network.nodes, found.initial.tolist(), strict=True)
+    return replace(found.network, nodes=tuple(replace(node, initial=(x, x)) for node, x in nodes))
+
+
+def episodes(network: Network, seed: int) -> tuple[Floats, Floats, Floats]:
+    """Return λ̄, service and the highest stocks of episodes under extreme, uniform, constant and neutral actions.
+
+    The first copies hold extremes that change from step to step, the next uniform actions, the next constant extremes;
+    the last is neutral.
+    """
+    env = VectorEnv(network, num_envs=COPIES)
+    env.reset(seed=0)
+    rng = np.random.default_rng(seed)
+    entries = len(env.stack({a: np.tile(n, (COPIES, 1)) for a, n in env.neutral_action.items()}))
+    constant = rng.choice([-1.0, 1.0], (entries, COPIES))
+    circularity, service = np.zeros((2, COPIES))
+    highest = env.physical.stock[: len(network.nodes)].copy()
+    for _ in range(network.episode.horizon):
+        actions = rng.choice([-1.0, 1.0], (entries, COPIES))
+        actions[:, 12:24] = rng.uniform(-1, 1, (entries, 12))
+        actions[:, 24:] = constant[:, 24:]
+        actions[:, -1] = np.concatenate([np.zeros(0), *env.neutral_action.values()])
+        outcome = env.advance(actions)
+        circularity += outcome.circularity_mean / network.episode.horizon
+        service += outcome.service_level / network.episode.horizon
+        highest = np.maximum(highest, env.physical.stock[: len(network.nodes)])
+    return circularity, service, highest.max(axis=1)
+
+
+@given(
+    network=st.from_type(Network),
+    interval=st.floats(0.02, 0.4),
+    seed=st.integers(0, 1000),
+    weight=st.sampled_from([None, 0.3, 3.0]),
+)
+def test_no_episode_exceeds_the_bound(network: Network, interval: float, seed: int, weight: float | None) -> None:
+    """λ̄, or λ̄/scale + w·service, of every simulated episode is at most the bound."""
+    found = bounded(network, interval, weight)
+    circularity, service, _ = episodes(pinned(found), seed)
+    objective = circularity
+    if weight is not None:
+        objective = circularity / network.objective.circularity_scale + weight * service
+    mass = found.initial.sum() * network.objective.reference_interval  # the simulator rounds relative to all the mass
+    slack = 1e-9 * (abs(found.objective) + np.abs(objective).max()) + 1e-12 * mass
+    assert objective.max() <= found.objective + slack
+    run = achieved(found)
+    assert found.gap(run.episode_circularity, run.episode_service).min() * abs(found.objective) >= -slack or (
+        found.objective == 0 and run.episode_circularity.max() <= slack
+    )
+
+
+@given(network=st.from_type(Network), interval=st.floats(0.02, 0.4), seed=st.integers(0, 1000))
+def test_no_episode_with_the_service_exceeds_its_bound(network: Network, interval: float, seed: int) -> None:
+    """Episodes that keep a mean service level s have at most the λ̄ that the bound allows for s."""
+    network = certifiable(network, interval, pulls=False)
+    start = [node.initial[1] for node in network.nodes]
+    single = replace(network, nodes=tuple(replace(n, initial=(n.initial[1],) * 2) for n in network.nodes))
+    circularity, service, _ = episodes(single, seed)
+    mass = sum(start) * network.objective.reference_interval
+    for demanded in np.quantile(service, [0.5, 1.0]):
+        found = bound(network, start, min_service=float(demanded) * (1 - 1e-9))
+        best = circularity[service >= demanded].max()
+        assert best <= found.objective + 1e-9 * (abs(found.objective) + np.abs(circularity).max()) + 1e-12 * mass
+
+
+@given(network=st.from_type(Network), interval=st.floats(0.02, 0.4), seed=st.integers(0, 1000))
+def test_reach(network: Network, interval: float, seed: int) -> None:
+    """No simulated stock leaves its bounds, and scheduled flows said to be uncut are what was asked for."""
+    network = certifiable(network, interval, pulls=False)
+    single = replace(network, nodes=tuple(replace(n, initial=(n.initial[1],) * 2) for n in network.nodes))
+    admissible = Admissible.of(single)
+    reached = reach(admissible, starting_stocks(single, None))
+    _, _, highest = episodes(single, seed)
+    assert (highest <= reached.upper.max(axis=0) * (1 + 1e-9) + 1e-12).all()
+    run = rollout(VectorEnv(single, num_envs=1), Neutral())
+    dynamics = FlowLaws(single)
+    steps = np.arange(single.episode.horizon)
+    asked = dynamics.rate(np.repeat(dynamics.neutral[:, None], len(steps), axis=1), steps).T
+    sure = reached.uncut & dynamics.scheduled
+    np.testing.assert_allclose(run.flow[sure], asked[sure], rtol=1e-9)
+
+
+@given(network=st.from_type(Network))
+def test_ranges_are_those_of_the_flow_laws(network: Network) -> None:
+    """With every compartment acting, the highest coefficients are the laws' own."""
+    network = certifiable(network, 0.3, pulls=True)
+    admissible = Admissible.of(network, None)
+    highest = np.max([admissible.rate(step)[1] for step in range(network.episode.horizon)], axis=0)
+    np.testing.assert_allclose(highest, FlowLaws(network).max_rate, rtol=1e-12)
+
+
+def small(nodes: list[Node], arcs: list[Arc], services: list[Service] | None = None, horizon: int = 8) -> Network:
+    """Return a network with intervals of 0.5 and Δ = 1."""
+    return Network(
+        name="small",
+        nodes=tuple(nodes),
+        arcs=tuple(arcs),
+        services=tuple(services or ()),
+        episode=Episode(control_interval=0.5, horizon=horizon),
+    )
+
+
+def stocked(name: str, stock: float, role: Role = Role.TECHNOSPHERE, control: Control | None = None) -> Node:
+    """Return a node with one initial stock."""
+    return Node(id=name, role=role, initial=(stock, stock), control=control)
+
+
+def order(name: str, donor: str, recipient: str, most: float) -> Arc:
+    """Return an arc whose flow is set between 0 and ``most``."""
+    control = Control(kind=ControlKind.FLOW, low=0.0, neutral=most, high=most)
+    return Arc(id=name, donor=donor, recipient=recipient, law=Law.CONTROLLED, control=control)
+
+
+def valve(low: float, high: float) -> Control:
+    """Return a valve that is neutral at ``high``."""
+    return Control(kind=ControlKind.RATE, low=low, neutral=high, high=high)
+
+
+RESERVE = stocked("reserve", 100.0, Role.NONRENEWABLE_RESERVOIR)
+USE = stocked("use", 10.0)
+TIP = stocked("tip", 0.0, Role.LANDFILL)
+
+
+def test_single_valve() -> None:
+    """Extraction a·w·x from a reserve is least at the lowest w: λ̄ = −x_0 (1 − e^{−a w̲ T})/T."""
+    arc = Arc(id="extraction", donor="reserve", recipient="use", rate=0.4, control=valve(0.5, 2.0))
+    found = bound(small([RESERVE, USE], [arc]), degree=4)
+    expected = -100 * (1 - math.exp(-0.4 * 0.5 * 4)) / 4
+    assert found.objective == pytest.approx(expected, rel=1e-7)
+    assert achieved(found).episode_circularity[0] == pytest.approx(expected, rel=1e-7)
+    np.testing.assert_allclose(found.actions, -1.0, atol=1e-6)
+
+
+def test_two_valves_in_series_multiply() -> None:
+    """A valve on the node and one on its outflow let through at least the product of their lowest values."""
+    arc = Arc(id="extraction", donor="reserve", recipient="use", rate=0.4, control=valve(0.5, 2.0))
+    reserve = replace(RESERVE, control=valve(0.6, 1.0))
+    found = bound(small([reserve, USE], [arc]), degree=4)
+    assert found.objective == pytest.approx(-100 * (1 - math.exp(-0.4 * 0.3 * 4)) / 4, rel=1e-7)
+
+
+def test_capture_is_limited_by_its_capacity() -> None:
+    """Removal from an ample environment counts in favour: λ̄ = Δ u."""
+    air = stocked("air", 1000.0, Role.ENVIRONMENT)
+    found = bound(small([air, USE], [order("capture", "air", "use", 7.0)]))
+    assert found.objective == pytest.approx(7.0, rel=1e-9)
+    assert achieved(found).episode_circularity[0] == pytest.approx(7.0, rel=1e-9)
+
+
+def test_capture_is_limited_by_what_there_is() -> None:
+    """No more than the stock can be removed: λ̄ = Δ x_0/T, whatever the capacity."""
+    air = stocked("air", 6.0, Role.ENVIRONMENT)
+    found = bound(small([air, USE], [order("capture", "air", "use", 7.0)]))
+    assert found.objective == pytest.approx(6.0 / 4, rel=1e-9)
+
+
+def test_service_costs_its_throughput() -> None:
+    """A stock x in use that decays at the rate a needs U = a·x mined and loses as much: λ̄ = −2·a·x."""
+    arcs = [order("extraction", "reserve", "use", 9.0), Arc(id="loss", donor="use", recipient="tip", rate=0.3)]
+    service = Service(id="served", provider="use", quantity="stock", low=10.0)
+    network = small([RESERVE, USE, TIP], arcs, [service])
+    found = bound(network, min_service=1.0, degree=4)
+    assert found.objective == pytest.approx(-6.0, rel=1e-5)
+    run = achieved(found)
+    assert run.episode_circularity[0] == pytest.approx(-6.0, rel=1e-5)
+    assert run.episode_service[0] == pytest.approx(1.0, abs=1e-6)
+    # one unit of weight on service is worth less than what service costs, a hundred is worth more
+    assert bound(network, service_weight=0.0).objective == pytest.approx(bound(network).objective)
+    assert bound(network, service_weight=100.0).service == pytest.approx(1.0, abs=1e-6)
+
+
+def test_net_zero_by_absolute_value() -> None:
+    """With ``abs`` removing more than is emitted does not pay: λ̄ = 0 where ``signed`` would give u − e."""
+    air = stocked("air", 1000.0, Role.ENVIRONMENT)
+    emission = Arc(id="emission", donor="use", recipient="air", law=Law.EXOGENOUS, flow=(3.0,))
+    network = small([air, stocked("use", 100.0)], [emission, order("capture", "air", "use", 7.0)])
+    assert bound(network).objective == pytest.approx(4.0, rel=1e-9)
+    absolute = bound(network.with_options(objective={"net_zero": "abs"}))
+    assert absolute.objective == pytest.approx(0.0, abs=1e-8)
+    assert achieved(absolute).episode_circularity[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_exogenous_series_is_exact() -> None:
+    """A demand that the reserve can meet is met: λ̄ = −Δ·mean of the series."""
+    arc = Arc(
+        id="demand", donor="reserve", recipient="use", law=Law.EXOGENOUS, flow=(1.0, 4.0, 2.0), times=(0.0, 1.2, 3.0)
+    )
+    found = bound(small([RESERVE, USE], [arc]), agents=None)
+    assert found.objective == pytest.approx(-(1.2 * 1 + 1.8 * 4 + 1 * 2) / 4, rel=1e-9)
+
+
+def test_exogenous_series_that_is_cut_still_bounds() -> None:
+    """A demand above what the reserve holds moves all there is at most, and the bound claims no more than none."""
+    arc = Arc(id="demand", donor="reserve", recipient="use", law=Law.EXOGENOUS, flow=(80.0,))
+    found = bound(small([RESERVE, USE], [arc]))
+    run = rollout(VectorEnv(small([RESERVE, USE], [arc]), num_envs=1), Neutral())
+    assert run.episode_circularity[0] == pytest.approx(-100 / 4, rel=1e-9)
+    assert run.episode_circularity[0] <= found.objective <= 0
+
+
+def test_gap_falls_with_the_degree() -> None:
+    """Where nothing can be chosen the bound tends to what happens, by a factor of three per degree and more."""
+    arcs = [
+        Arc(id="extraction", donor="reserve", recipient="use", rate=0.4),
+        Arc(id="loss", donor="use", recipient="tip", rate=1.3),
+    ]
+    network = small([RESERVE, USE, TIP], arcs)
+    happens = rollout(VectorEnv(network, num_envs=1), Neutral()).episode_circularity[0]
+    gaps = [bound(network, degree=d).objective - happens for d in (1, 2, 3, 4)]
+    assert min(gaps) > -1e-9
+    assert all(later < earlier / 3 for earlier, later in pairwise(gaps)), gaps
+    assert gaps[-1] < 1e-5 * abs(happens)
+
+
+@given(network=st.from_type(Network), seed=st.integers(0, 1000), size=st.sampled_from([0.0, 0.1, 10.0]))
+def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float) -> None:
+    """Multipliers that are perturbed, or none at all, prove a weaker bound than the solver's, never a smaller one."""
+    found = bounded(network, 0.2)
+    proof = found.verify()
+    assert proof.bound == found.objective
+    scale = 1 + abs(proof.bound)
+    assert proof.bound - proof.objective == pytest.approx(0.0, abs=1e-5 * scale)
+    rng = np.random.default_rng(seed)
+    equal, under = found.certificate.equal, found.certificate.under
+    other = Certificate(
+        equal=size * equal + rng.normal(size=len(equal)) * size, under=size * under + rng.normal(size=len(under)) * size
+    )
+    weaker = verified(found.problem, other, found.solution)
+    assert weaker.bound >= proof.objective - 1e-6 * scale
+    assert weaker.infeasibility == pytest.approx(max(0.0, other.under.max(initial=0.0)))
+
+
+@pytest.mark.parametrize("name", ["copper_net", "carbo_net"])
+def test_plan_comes_close_to_the_bound(name: str) -> None:
+    """Ten days of each network: the improved plan keeps the service and 99 % of the bound; neutral control does not."""
+    found = bound(name, min_service=0.99, horizon=40)
+    better = improved(found, rounds=8)
+    run = achieved(better)
+    assert run.episode_service[0] > 0.99 - 1e-4
+    assert 0 <= better.gap(run.episode_circularity)[0] < 0.01
+    env = VectorEnv(pinned(found), num_envs=1)
+    assert found.gap(rollout(env, Neutral()).episode_circularity)[0] > 0.3
+
+
+def test_improvement_never_loses() -> None:
+    """The weighted objective in the simulator does not fall, and stays below the bound."""
+    found = bound("copper_net", service_weight=2.0, horizon=12)
+    before, after = (achieved(plan) for plan in (found, improved(found, rounds=4)))
+    first, second = (found.gap(run.episode_circularity, run.episode_service)[0] for run in (before, after))
+    assert 0 <= second <= first
+
+
+def test_each_copy_follows_its_own_plan() -> None:
+    """Plans for the starts of three copies, side by side, achieve what each achieves alone."""
+    env = VectorEnv("carbo_net", num_envs=3, horizon=6)
+    env.reset(seed=5)
+    starts = env.physical.stock[: len(env.network.nodes)].T
+    bounds = [bound("carbo_net", start, horizon=6) for start in starts]
+    together = rollout(env, Plan(bounds), seed=5).episode_circularity
+    alone = [achieved(each).episode_circularity[0] for each in bounds]
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
+    assert all(each.gap(value)[()] > -1e-9 for each, value in zip(bounds, together, strict=True))
+
+
+def test_plan_refuses_what_it_was_not_made_for() -> None:
+    """Another network, horizon, choice of agents, start or number of copies is an error, and so is a step too many."""
+    found = bound("carbo_net", horizon=3)
+    for env, said in (
+        (VectorEnv("copper_net", num_envs=1, horizon=3), "not for 'copper_net'"),
+        (VectorEnv("carbo_net", num_envs=1, horizon=4), "3 steps"),
+        (VectorEnv("carbo_net", num_envs=1, horizon=3, agents=["vehicles"]), "agents"),
+        (VectorEnv("carbo_net", num_envs=1, horizon=3), "it starts from"),
+    ):
+        with pytest.raises(ControlError, match=said):
+            rollout(env, Plan(found))
+    env = VectorEnv(pinned(found), num_envs=3)
+    with pytest.raises(ControlError, match="2 plans for 3 copies"):
+        rollout(env, Plan([found, found]))
+    plan = Plan(replace(found, network=pinned(found)))
+    rollout(env, plan)
+    with pytest.raises(ControlError, match="all are done"):
+        plan.act({})
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario", "said"),
+    [
+        ("copper_net", "paper", "solver 'euler'"),
+        ("carbo_net", "temperature", "inner physics"),
+        ("net_zero", None, "inner physics"),
+        ("solids_net", None, "move batches"),
+    ],
+)
+def test_networks_without_certificate(name: str, scenario: str | None, said: str) -> None:
+    """Inner physics, batches and inexact solvers have no certificate, and the error says which it is."""
+    with pytest.raises(NoCertificate, match=said):
+        bound(name, scenario=scenario)
+
+
+def test_pull_beyond_the_stock_has_no_certificate() -> None:
+    """A recipient that may empty its donor makes the solver cut flows, which is no linear law."""
+    pull = Arc(id="pull", donor="reserve", recipient="use", law=Law.RECIPIENT, rate=0.5)
+    assert bound(small([RESERVE, USE], [pull], horizon=2)).objective == pytest.approx(
+        -10 * (math.exp(0.5) - 1), rel=1e-3
+    )
+    with pytest.raises(NoCertificate, match="more from node 'reserve' than it holds"):
+        bound(small([RESERVE, USE], [pull], horizon=12))
+
+
+def test_flow_that_may_run_backwards_has_no_certificate() -> None:
+    """A node whose control may reverse its outflow could be overdrawn at the other end."""
+    reversing = Control(kind=ControlKind.FLOW, low=-1.0, neutral=0.0, high=1.0)
+    arc = Arc(id="either", donor="reserve", recipient="use", law=Law.CONTROLLED)
+    with pytest.raises(NoCertificate, match="arc 'either' may run backwards"):
+        bound(small([replace(RESERVE, control=reversing), USE], [arc]))
+
+
+def test_service_out_of_reach() -> None:
+    """The error names the highest mean level that any actions reach: here 10·e^{−0.15 t} of 10 at the four ends."""
+    loss = Arc(id="loss", donor="use", recipient="tip", rate=0.3)
+    network = small([USE, TIP], [loss], [Service(id="served", provider="use", quantity="stock", low=10.0)], horizon=4)
+    with pytest.raises(CirlError, match=r"no actions reach a mean service level of 0\.95; at most 0\.69"):
+        bound(network, min_service=0.95, degree=4)
+    highest = np.mean(np.exp(-0.15 * np.arange(1, 5)))
+    assert bound(network, min_service=highest - 1e-6, degree=4).service == pytest.approx(highest, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"service_weight": 1.0, "min_service": 0.5}, "two ways"),
+        ({"service_weight": -1.0}, "service_weight"),
+        ({"min_service": 1.5}, "min_service"),
+        ({"degree": 0}, "degree"),
+        ({"initial": {"minne": 3.0}}, "Did you mean 'mine'"),
+        ({"initial": {"mine": -3.0}}, "not negative"),
+        ({"initial": [1.0, 2.0]}, "shape"),
+        ({"agents": ["miner"]}, "unknown agent 'miner'"),
+        ({"scenario": "papers"}, "unknown scenario"),
+    ],
+)
+def test_bad_input(options: dict[str, object], said: str) -> None:
+    """Options that cannot be used are named."""
+    with pytest.raises(CirlError, match=said):
+        bound(load_network("copper_net"), **options)  # type: ignore[arg-type]
