@@ -21,6 +21,7 @@ from cirl_marl.learners.lockstep import Lockstep
 from cirl_marl.learners.recipe import Recipe
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.trainee import Trainee
+from cirl_marl.learners.views import OneAgent
 from cirl_marl.network import Network
 from cirl_marl.vector_env import Infos, VectorEnv
 
@@ -147,7 +148,7 @@ def lone_seat(env: FreeEnv, agent: str) -> Seat:
         seat.latest = seen
         return seen, env.reward(agent, step).astype(np.float32), ended, infos
 
-    seat = Seat(env, agent, exchange)
+    seat = Seat(env, agent, OneAgent(env, agent), exchange)
     seat.latest = env.observation(agent, 0)
     return seat
 
@@ -179,7 +180,7 @@ def learn_alone(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weight
 
 
 def _trainee(seat: Seat, recipe: Recipe, env: FreeEnv) -> Trainee:
-    return Trainee(seat, recipe.learner_of(seat.agent, env.network), 0).build()
+    return Trainee(seat, recipe.learner_of(seat.name, env.network), 0).build()
 
 
 def _learning(trainee: Trainee, steps: int) -> Callable[[], None]:

@@ -33,13 +33,13 @@ class VectorEnv:
     """``num_envs`` independent copies of a material network, stepped together.
 
     Observations, rewards and so on are dicts agent → array with leading axis ``num_envs``. A copy whose episode ended
-    starts the next one within the same step; its last observation is then in
-    ``infos[agent]["final_observation"]``, valid where ``infos[agent]["_final_observation"]`` is true.
+    starts the next one within the same step; its last observation and state are then in
+    ``infos[agent]["final_observation"]`` and ``["final_state"]``, valid where ``["_final_observation"]`` is true.
 
     Attributes:
         network: the network under the chosen scenario.
         agents: compartments that act, in the order of every stacked array.
-        reward_mode: one of ``local``, ``circularity``, ``mixed``, ``difference``, ``local_sum``.
+        reward_mode: one of ``local``, ``circularity``, ``mixed``, ``difference``, ``mixed_difference``, ``local_sum``.
         observation_spaces: by agent.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
@@ -279,13 +279,15 @@ class VectorEnv:
         objective = self.network.objective
         if self.reward_mode == "local":
             return local.copy()
-        if self.reward_mode == "mixed":
+        if self.reward_mode in ("difference", "mixed_difference"):
+            team = team - self._counterfactuals(state, controls)
+        if self.reward_mode in ("mixed", "mixed_difference"):
             shared = team * (objective.circularity_weight / objective.circularity_scale)
             mixed: Floats = local * (1.0 - objective.circularity_weight)
             mixed += shared
             return mixed
         if self.reward_mode == "difference":
-            return team - self._counterfactuals(state, controls)
+            return team
         common = team if self.reward_mode == "circularity" else self.scoring.local_sum(terms)
         return np.repeat(common[None], len(self.agents), axis=0)
 
@@ -317,9 +319,10 @@ class VectorEnv:
         """Add the final observations and the episode's λ̄ and service level of the copies that ended."""
         state, ended = self.physical, outcome.truncated
         steps = np.maximum(state.step, 1)
-        final = self.by_agent(outcome.observation)
+        final, whole = self.by_agent(outcome.observation), self.state()
         for agent, info in infos.items():
             info["final_observation"] = final[agent]
+            info["final_state"] = whole
             info["_final_observation"] = ended
             info["episode_circularity"] = state.circularity / steps
             info["episode_service_level"] = state.service / steps

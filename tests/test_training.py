@@ -26,6 +26,7 @@ from cirl_marl.learners import Recipe, RunDirectory, Training, resume, train
 from cirl_marl.learners.recipe import Learner, Match, Run
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.trainee import derived_seed
+from cirl_marl.learners.views import OneAgent
 
 PPO_PARAMETERS: dict[str, Any] = {"n_steps": 10, "batch_size": 20, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
 OFF_POLICY = {
@@ -180,19 +181,19 @@ class Alone(Seat):
     def __init__(self, env: VectorEnv, seeds: list[int]) -> None:
         """Seat the only agent of ``env``."""
         self.joint = env
-        super().__init__(env, env.agents[0], self._step_alone)
-        self.latest = np.ascontiguousarray(env.reset(seed=seeds)[self.agent])
+        super().__init__(env, env.agents[0], OneAgent(env, env.agents[0]), self._step_alone)
+        self.latest = np.ascontiguousarray(env.reset(seed=seeds)[self.name])
 
     def _step_alone(self, _: Seat) -> VecEnvStepReturn:
         assert self.action is not None
-        observations, rewards, _terminations, truncations, infos = self.joint.step({self.agent: self.action})
-        self.latest = np.ascontiguousarray(observations[self.agent])
-        done = truncations[self.agent]
+        observations, rewards, _terminations, truncations, infos = self.joint.step({self.name: self.action})
+        self.latest = np.ascontiguousarray(observations[self.name])
+        done = truncations[self.name]
         details: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for copy in np.flatnonzero(done):
-            final = infos[self.agent]["final_observation"][copy].copy()
+            final = infos[self.name]["final_observation"][copy].copy()
             details[copy] = {"TimeLimit.truncated": True, "terminal_observation": final}
-        return self.latest, rewards[self.agent].astype(np.float32), done, details
+        return self.latest, rewards[self.name].astype(np.float32), done, details
 
 
 def test_lockstep_equals_plain_learning_where_agents_do_not_meet() -> None:

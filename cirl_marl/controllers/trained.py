@@ -12,6 +12,7 @@ from cirl_marl.controllers.basic import Arrays
 from cirl_marl.errors import RunError
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.learners.trainee import load_model, load_normaliser
+from cirl_marl.learners.views import unseen_state
 from cirl_marl.vector_env import VectorEnv
 
 
@@ -25,11 +26,12 @@ class Trained:
             RunError: if the run is incomplete or a file of it cannot be read.
         """
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
-        config, folder = self.run.config, self.run.checkpoint
-        network = self.run.make_env(1).network
-        specs = {agent: config.recipe.learner_of(agent, network) for agent in config.agents}
-        self._models = {agent: load_model(folder, agent, spec.algorithm) for agent, spec in specs.items()}
-        self._normalisers = {agent: load_normaliser(folder, agent, spec) for agent, spec in specs.items()}
+        folder, groups = self.run.checkpoint, self.run.groups()
+        env = self.run.make_env(1)
+        self._agents = env.agents
+        self._views = {group.name: group.view(env) for group in groups}
+        self._models = {group.name: load_model(folder, group.name, group.spec.algorithm) for group in groups}
+        self._normalisers = {group.name: load_normaliser(folder, group.name, group.spec) for group in groups}
         self._memory: dict[str, Any] = {}
         self._starts = np.ones(1, dtype=bool)
 
@@ -39,21 +41,22 @@ class Trained:
         Raises:
             RunError: if ``env`` has other agents than the run.
         """
-        if set(env.agents) != set(self._models):
-            raise RunError(f"{self.run.path}: trained {sorted(self._models)}, not {sorted(env.agents)}")
+        if set(env.agents) != set(self._agents):
+            raise RunError(f"{self.run.path}: trained {sorted(self._agents)}, not {sorted(env.agents)}")
         self._memory = dict.fromkeys(self._models)
         self._starts = np.ones(env.num_envs, dtype=bool)
+        self._state = unseen_state(env)
 
     def act(self, observations: Arrays) -> Arrays:
-        """Return each policy's deterministic action."""
+        """Return each policy's deterministic action, which depends on the observations of its agents alone."""
         actions: dict[str, NDArray[np.floating]] = {}
-        for agent, model in self._models.items():
-            seen = np.ascontiguousarray(observations[agent])
-            normaliser = self._normalisers[agent]
+        for name, model in self._models.items():
+            view, normaliser = self._views[name], self._normalisers[name]
+            seen = view.observe(observations, self._state)
             if normaliser is not None:
-                seen = normaliser.normalize_obs(seen)  # type: ignore[assignment]
-            actions[agent], self._memory[agent] = model.predict(
-                seen, self._memory[agent], self._starts, deterministic=True
-            )
+                seen = normaliser.normalize_obs(seen)
+            starts = np.tile(self._starts, max(1, len(view.row_agents)))
+            chosen, self._memory[name] = model.predict(seen, self._memory[name], starts, deterministic=True)
+            actions.update(view.act(chosen))
         self._starts = np.zeros_like(self._starts)
         return actions

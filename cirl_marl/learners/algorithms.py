@@ -12,12 +12,18 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.utils import get_linear_fn
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from cirl_marl.errors import RecipeError, unknown
+from cirl_marl.learners.central_critic import CentralCriticPolicy
 
 MODULES = ("stable_baselines3", "sb3_contrib")
+CENTRAL_CRITIC = "CentralCriticPolicy"
+POLICIES = {CENTRAL_CRITIC: CentralCriticPolicy}
+"""Policies that Stable-Baselines3 has no name for."""
+
 RESERVED = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "device", "_init_setup_model")
 NOISES: Mapping[str, type[ActionNoise]] = {
     "normal": NormalActionNoise,
@@ -85,7 +91,10 @@ def checked_policy(name: str, policy: str) -> None:
     Raises:
         RecipeError: naming the nearest that it has.
     """
-    known = [alias for alias in algorithm_class(name).policy_aliases if alias.startswith("Mlp")]
+    aliases = algorithm_class(name).policy_aliases
+    known = [alias for alias in aliases if alias.startswith("Mlp")]
+    if aliases.get("MultiInputPolicy") is MultiInputActorCriticPolicy:
+        known.append(CENTRAL_CRITIC)
     if policy not in known:
         raise RecipeError(f"policy: {unknown(f'policy of {name} for vectors', policy, known)}")
 
@@ -118,6 +127,6 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         mean = np.zeros(env.action_space.shape or (1,))
         arguments["action_noise"] = NOISES[noise["kind"]](mean, noise["sigma"] * np.ones_like(mean))  # type: ignore[call-arg]
     try:
-        return algorithm_class(name)(policy, env, **arguments, **fixed)
+        return algorithm_class(name)(POLICIES.get(policy, policy), env, **arguments, **fixed)
     except (TypeError, ValueError, AssertionError, KeyError) as error:
         raise RecipeError(f"{name} refuses its parameters {dict(parameters)}: {error}") from error

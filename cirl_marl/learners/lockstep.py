@@ -1,14 +1,13 @@
 """Many unmodified learners in one joint environment, in lockstep.
 
 Each learner's own ``learn()`` runs in a greenlet against its ``Seat``. A seat's ``step_wait`` switches back here; when
-every agent has handed in its actions, the joint environment moves once and the learners go on, in a fixed order.
+every learner has handed in its actions, the joint environment moves once and the learners go on, in a fixed order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import copy_context
-from typing import Any
 
 import numpy as np
 from greenlet import GreenletExit, greenlet
@@ -18,6 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from cirl_marl.errors import LearnerError
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.views import Arrays, OneAgent, View
 from cirl_marl.vector_env import Infos, VectorEnv
 
 StepHook = Callable[[Infos, NDArray[np.bool_]], None]
@@ -28,16 +28,23 @@ class Interrupted(Exception):
 
 
 class Lockstep:
-    """Seats the agents of one batched environment and lets their learners run together.
+    """Seats the learners of one batched environment and lets them run together.
 
     Attributes:
         env: the joint environment.
-        seats: by agent, in the order in which learners are resumed.
+        seats: by name of the learner, in the order in which learners are resumed.
         joint_steps: control intervals done, each in every copy.
     """
 
-    def __init__(self, env: VectorEnv, seeds: Sequence[int]) -> None:
-        """Reset ``env`` with one seed per copy and seat its agents."""
+    def __init__(self, env: VectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None) -> None:
+        """Reset ``env`` with one seed per copy and seat its learners.
+
+        Args:
+            env: the joint environment.
+            seeds: of its copies.
+            views: what each learner sees, by its name; together they act for every agent once. None: every agent has
+                a learner of its own.
+        """
         self.env = env
         self.joint_steps = 0
         self._hub = greenlet.getcurrent()
@@ -46,9 +53,9 @@ class Lockstep:
         self._coroutines: dict[str, greenlet] = {}
         self._outcomes: dict[str, VecEnvStepReturn] = {}
         self._learning: set[str] = set()
-        self.seats = {agent: Seat(env, agent, self._exchange) for agent in env.agents}
-        for agent, observation in env.reset(seed=list(seeds)).items():
-            self.seats[agent].latest = np.ascontiguousarray(observation)
+        views = views if views is not None else {agent: OneAgent(env, agent) for agent in env.agents}
+        self.seats = {name: Seat(env, name, view, self._exchange) for name, view in views.items()}
+        self._show(env.reset(seed=list(seeds)))
         self._returns = np.zeros((len(env.agents), env.num_envs))
         self._lengths = np.zeros(env.num_envs, dtype=int)
 
@@ -63,68 +70,75 @@ class Lockstep:
         """Run every learner to its end.
 
         Args:
-            learners: by agent, what learns; returns when it has learnt enough.
-            actors: by agent, what acts for ever once its learner is done, so that the others' world goes on.
-            streams: by agent, its random streams.
-            budgets: by agent, joint steps after which a learner that has not returned is stopped.
+            learners: by name, what learns; returns when it has learnt enough.
+            actors: by name, what acts for ever once its learner is done, so that the others' world goes on.
+            streams: by name, its random streams.
+            budgets: by name, joint steps after which a learner that has not returned is stopped.
             hook: called after each joint step, in the caller's random streams; may raise ``Interrupted``.
 
         Raises:
-            LearnerError: if a learner raises; names its agent and the joint step.
+            LearnerError: if a learner raises; names it and the joint step.
             Interrupted: if the hook raised it.
         """
         self._hub = greenlet.getcurrent()
         self._streams = dict(streams)
-        self._learning = set(self.env.agents)
+        self._learning = set(self.seats)
         try:
-            for agent in self.env.agents:
-                self._coroutines[agent] = greenlet(self._task(agent, learners[agent], actors[agent]))
-                self._coroutines[agent].gr_context = copy_context()
-                self._resume(agent)
+            for name in self.seats:
+                self._coroutines[name] = greenlet(self._task(name, learners[name], actors[name]))
+                self._coroutines[name].gr_context = copy_context()
+                self._resume(name)
             while self._learning:
                 self._step_jointly(hook)
-                for agent in self.env.agents:
-                    if agent in self._learning and self.joint_steps > budgets[agent]:
-                        self._stop_learning(agent)
+                for name in self.seats:
+                    if name in self._learning and self.joint_steps > budgets[name]:
+                        self._stop_learning(name)
                     else:
-                        self._resume(agent)
+                        self._resume(name)
         finally:
             self._end()
 
-    def _task(self, agent: str, learn: Callable[[], None], act: Callable[[], None]) -> Callable[[], None]:
+    def _task(self, name: str, learn: Callable[[], None], act: Callable[[], None]) -> Callable[[], None]:
         def run() -> None:
             try:
                 learn()
             except GreenletExit:
-                if agent in self._learning:
+                if name in self._learning:
                     return  # training is over for everyone
-            self._learning.discard(agent)
+            self._learning.discard(name)
             act()
 
         return run
 
+    def _show(self, observations: Arrays) -> None:
+        """Show every learner the current observations."""
+        for seat in self.seats.values():
+            seat.latest = seat.view.observe(observations, self.env.state)
+
     def _step_jointly(self, hook: StepHook | None) -> None:
-        actions = {agent: seat.action for agent, seat in self.seats.items()}
-        observations, rewards, _, truncations, infos = self.env.step(actions)  # type: ignore[arg-type]
+        actions: dict[str, NDArray[np.floating]] = {}
+        for seat in self.seats.values():
+            assert seat.action is not None
+            actions.update(seat.view.act(seat.action))
+        observations, rewards, _, truncations, infos = self.env.step(actions)
         self.joint_steps += 1
         done = next(iter(truncations.values()))
         self._returns += list(rewards.values())
         self._lengths += 1
-        for row, (agent, seat) in enumerate(self.seats.items()):
-            seat.latest = np.ascontiguousarray(observations[agent])
-            seat_infos: list[dict[str, Any]] = [{} for _ in range(self.env.num_envs)]
-            for copy in np.flatnonzero(done):
-                seat_infos[copy] = {
-                    "TimeLimit.truncated": True,
-                    "terminal_observation": infos[agent]["final_observation"][copy].copy(),
-                    "episode": {"r": float(self._returns[row, copy]), "l": int(self._lengths[copy]), "t": 0.0},
-                }
-            # own copies: PPO adds the bootstrap value to the rewards in place
-            self._outcomes[agent] = (seat.latest, rewards[agent].astype(np.float32), done.copy(), seat_infos)
+        self._show(observations)
+        returns = dict(zip(self.env.agents, self._returns, strict=True))
+        for name, seat in self.seats.items():
+            final = None
+            if done.any():
+                final = seat.view.observe(
+                    {agent: infos[agent]["final_observation"] for agent in seat.view.agents},
+                    lambda: infos[self.env.agents[0]]["final_state"],
+                )
+            self._outcomes[name] = seat.outcome(rewards, done, returns, self._lengths, final)
         if hook is not None:
             if done.any():
-                for row, agent in enumerate(self.seats):
-                    infos[agent]["episode_return"] = self._returns[row].copy()
+                for agent, total in returns.items():
+                    infos[agent]["episode_return"] = total.copy()
             hook(infos, done)
         self._returns[:, done] = 0.0
         self._lengths[done] = 0
@@ -132,31 +146,32 @@ class Lockstep:
     def _exchange(self, seat: Seat) -> VecEnvStepReturn:
         """Leave the learner's coroutine until the joint step is done."""
         self._hub.switch()
-        return self._outcomes.pop(seat.agent)
+        return self._outcomes.pop(seat.name)
 
-    def _resume(self, agent: str) -> None:
+    def _resume(self, name: str) -> None:
         try:
-            self._enter(agent, self._coroutines[agent].switch)
+            self._enter(name, self._coroutines[name].switch)
         except Exception as error:
-            raise LearnerError(f"agent '{agent}' failed at joint step {self.joint_steps}: {error!r}") from error
-        if self._coroutines[agent].dead:
-            raise LearnerError(f"agent '{agent}' stopped acting at joint step {self.joint_steps}")
+            who = self.seats[name].title
+            raise LearnerError(f"{who} failed at joint step {self.joint_steps}: {error!r}") from error
+        if self._coroutines[name].dead:
+            raise LearnerError(f"{self.seats[name].title} stopped acting at joint step {self.joint_steps}")
 
-    def _stop_learning(self, agent: str) -> None:
-        """End ``learn()`` of an agent that has used up its steps; it goes on acting from its next turn."""
-        self._learning.discard(agent)
-        self._enter(agent, lambda: self._coroutines[agent].throw(GreenletExit))
+    def _stop_learning(self, name: str) -> None:
+        """End ``learn()`` of a learner that has used up its steps; it goes on acting from its next turn."""
+        self._learning.discard(name)
+        self._enter(name, lambda: self._coroutines[name].throw(GreenletExit))
 
     def _end(self) -> None:
-        self._learning = set(self.env.agents)
-        for agent, coroutine in self._coroutines.items():
+        self._learning = set(self.seats)
+        for name, coroutine in self._coroutines.items():
             if not coroutine.dead:
-                self._enter(agent, lambda: coroutine.throw(GreenletExit))  # noqa: B023 (called at once)
+                self._enter(name, lambda: coroutine.throw(GreenletExit))  # noqa: B023 (called at once)
         self._coroutines.clear()
 
-    def _enter(self, agent: str, action: Callable[[], object]) -> None:
-        """Do something in the random streams of an agent."""
-        streams = self._streams[agent]
+    def _enter(self, name: str, action: Callable[[], object]) -> None:
+        """Do something in the random streams of a learner."""
+        streams = self._streams[name]
         self._own.switch_to(streams)
         try:
             action()

@@ -1,8 +1,9 @@
-"""Learner recipes: which algorithm each agent learns with, read from ``agents/*.toml``."""
+"""Learner recipes: which algorithm each agent learns with, alone or together, read from ``agents/*.toml``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,9 +13,17 @@ from cirl_marl.catalogue import recipe_path
 from cirl_marl.definition import read_toml
 from cirl_marl.elements import Node, Role
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
-from cirl_marl.learners.algorithms import algorithm_class, algorithms, checked_parameters, checked_policy
+from cirl_marl.learners.algorithms import (
+    CENTRAL_CRITIC,
+    algorithm_class,
+    algorithms,
+    checked_parameters,
+    checked_policy,
+)
+from cirl_marl.learners.views import Scheme, View, view_of
 from cirl_marl.mistakes import mistakes_of
 from cirl_marl.network import Network
+from cirl_marl.vector_env import VectorEnv
 
 
 class _Table(BaseModel):
@@ -39,7 +48,12 @@ class Learner(_Table):
     """One algorithm with its parameters."""
 
     algorithm: str
-    policy: str = "MlpPolicy"
+    policy: str = Field("MlpPolicy", description="CentralCriticPolicy lets the critic see the whole state")
+    scheme: Scheme = Field(
+        "independent",
+        description="independent: a learner for each agent; shared: one policy for all, each acting by itself; "
+        "joint: one policy that sees and acts for all at once",
+    )
     parameters: dict[str, Any] = {}
     normalise: Normalisation = Normalisation()
     share_of_steps: Annotated[float, Field(gt=0, le=1)] = Field(
@@ -72,6 +86,26 @@ class Run(_Table):
     envs: Annotated[int, Field(gt=0)] = Field(16, description="copies of the environment")
 
 
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Agents that one learner learns for.
+
+    Attributes:
+        name: the agent's of an independent learner, else ``shared-learner`` or ``joint-learner``; of several with the
+            number of the match, 0 for the common one.
+        agents: in the order of the environment.
+        spec: how it learns.
+    """
+
+    name: str
+    agents: tuple[str, ...]
+    spec: Learner
+
+    def view(self, env: VectorEnv) -> View:
+        """Return how the learner sees ``env``."""
+        return view_of(env, self.agents, self.spec.scheme, with_state=self.spec.policy == CENTRAL_CRITIC)
+
+
 class Recipe(_Table):
     """A learner for each agent of a network.
 
@@ -94,6 +128,21 @@ class Recipe(_Table):
     def learner_of(self, agent: str, network: Network) -> Learner:
         """Return the learner of ``agent``: that of the first match that fits, else the common one."""
         return next((match for match in self.match if match.fits(agent, network)), self.learner)
+
+    def groups(self, network: Network, agents: Sequence[str]) -> tuple[Group, ...]:
+        """Return the learners of ``agents``, in the order of their first agents."""
+        specs = [self.learner, *self.match]
+        found: dict[str, Group] = {}
+        for agent in agents:
+            spec = self.learner_of(agent, network)
+            name = agent
+            if spec.scheme != "independent":
+                alike = sum(other.scheme == spec.scheme for other in specs)
+                number = next(i for i, other in enumerate(specs) if other is spec)
+                name = f"{spec.scheme}-learner" + (f"-{number}" if alike > 1 else "")
+            members = found[name].agents if name in found else ()
+            found[name] = Group(name, (*members, agent), spec)
+        return tuple(found.values())
 
     def check(self, network: Network, agents: Sequence[str]) -> None:
         """Refuse matches that name agents which do not act.
@@ -140,6 +189,8 @@ def load_recipe(name: str | Path) -> Recipe:
             algorithm_class(learner.algorithm)
             checked_parameters(learner.algorithm, learner.parameters)
             checked_policy(learner.algorithm, learner.policy)
+            if learner.policy == CENTRAL_CRITIC and not learner.normalise.observation:
+                raise RecipeError(f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true")
         except RecipeError as error:
             mistakes.append(f"{where}.{error}")
     if mistakes:

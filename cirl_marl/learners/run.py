@@ -7,9 +7,10 @@
       network.toml         the definition that was trained on
       versions.json        of Python and of every package that matters
       status.json          state, joint steps, the checkpoint that counts; rewritten last, atomically
-      checkpoints/NNN/     AGENT.zip (policy and optimiser), AGENT.normaliser.pkl, AGENT.replay.pkl
+      checkpoints/NNN/     LEARNER.zip (policy and optimiser), LEARNER.normaliser.pkl, LEARNER.replay.pkl; an
+                           independent learner has the name of its agent
       metrics.csv          one row an episode: λ̄, service level, return of each agent
-      tensorboard/AGENT/   learning curves of each agent
+      tensorboard/LEARNER/ learning curves of each learner
       evaluation.json      written by an evaluation
       pictures/
 """
@@ -29,7 +30,8 @@ from typing import Any
 
 from cirl_marl.catalogue import load_network
 from cirl_marl.errors import RunError
-from cirl_marl.learners.recipe import Recipe
+from cirl_marl.learners.recipe import Group, Recipe
+from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
 
 PACKAGES = (
@@ -156,21 +158,33 @@ class RunDirectory:
         if name is None:
             raise RunError(f"{self.path}: nothing was saved in this run yet (state: {self.status['state']})")
         folder: Path = self.path / "checkpoints" / name
-        missing = [agent for agent in self.config.agents if not (folder / f"{agent}.zip").is_file()]
+        missing = [group.name for group in self.groups() if not (folder / f"{group.name}.zip").is_file()]
         if missing:
             raise RunError(f"{folder}: the checkpoint lacks the policies of {', '.join(missing)}")
         return folder
 
-    def make_env(self, num_envs: int) -> VectorEnv:
-        """Return the environment that the run trained in, with ``num_envs`` copies."""
+    def groups(self) -> tuple[Group, ...]:
+        """Return the learners of the run."""
         config = self.config
+        return config.recipe.groups(self.network(), config.agents)
+
+    def network(self) -> Network:
+        """Return the network that the run trained on, under its scenario.
+
+        Raises:
+            RunError: if the definition is missing.
+        """
         definition = self.path / "network.toml"
         if not definition.is_file():
             raise RunError(f"{definition}: missing; the run directory is incomplete")
+        return load_network(definition, scenario=self.config.scenario)
+
+    def make_env(self, num_envs: int) -> VectorEnv:
+        """Return the environment that the run trained in, with ``num_envs`` copies."""
+        config = self.config
         return VectorEnv(
-            load_network(definition),
+            self.network(),
             num_envs=num_envs,
-            scenario=config.scenario,
             agents=config.agents,
             **config.options,
         )

@@ -1,8 +1,8 @@
-"""What one learner sees: its agent's view of the joint environment, as a Stable-Baselines3 ``VecEnv``."""
+"""Where one learner sits: its view of the joint environment, as a Stable-Baselines3 ``VecEnv``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,22 +11,36 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, Vec
 
 from cirl_marl.elements import Compartment
 from cirl_marl.errors import CirlError
+from cirl_marl.learners.views import Observation, View
+from cirl_marl.network import Floats
 from cirl_marl.vector_env import VectorEnv
 
 
-class AgentView:
-    """One agent in one copy of the environment; what ``env_method`` and ``get_attr`` of a seat reach.
+class CopyView:
+    """One copy of the environment; what ``env_method`` and ``get_attr`` of a joint learner's seat reach.
 
     Attributes that it lacks are those of the joint environment.
     """
 
     render_mode: str | None = None
 
-    def __init__(self, env: VectorEnv, agent: str, index: int) -> None:
-        """View copy ``index`` of ``env`` as ``agent``."""
+    def __init__(self, env: VectorEnv, index: int) -> None:
+        """View copy ``index`` of ``env``."""
         self.env = env
-        self.agent = agent
         self.index = index
+
+    def __getattr__(self, name: str) -> Any:
+        """Fall back on the joint environment."""
+        return getattr(self.env, name)
+
+
+class AgentView(CopyView):
+    """One agent in one copy of the environment."""
+
+    def __init__(self, env: VectorEnv, index: int, agent: str) -> None:
+        """View copy ``index`` of ``env`` as ``agent``."""
+        super().__init__(env, index)
+        self.agent = agent
 
     @property
     def compartment(self) -> Compartment:
@@ -37,44 +51,82 @@ class AgentView:
         """Return the local reward that the current state gives the agent."""
         return float(self.env.local_rewards()[self.agent][self.index])
 
-    def __getattr__(self, name: str) -> Any:
-        """Fall back on the joint environment."""
-        return getattr(self.env, name)
-
 
 class Seat(VecEnv):
-    """The B copies of the joint environment as one agent sees them.
+    """The B copies of the joint environment as one learner sees them.
 
     Time limits reach the learner as Stable-Baselines3 expects them: ``done`` with ``TimeLimit.truncated`` and the true
     last observation in ``terminal_observation``. A ``reset`` while the joint episode runs (ARS asks for one) cannot
     stop the others: it returns the current observation.
 
     Attributes:
-        agent: whose seat it is.
-        latest: the observation that the agent acts on next, shape (B, k).
+        name: of the learner; an independent learner has its agent's.
+        view: what it sees of the environment.
+        latest: the observation that it acts on next, one row for each row of its view.
+        action: what it last did.
     """
 
-    def __init__(self, env: VectorEnv, agent: str, exchange: Callable[[Seat], VecEnvStepReturn]) -> None:
-        """Seat ``agent``; ``exchange`` hands in its action and waits for the outcome of the joint step."""
-        self.agent = agent
-        self.latest: NDArray[np.float32] | None = None
+    def __init__(self, env: VectorEnv, name: str, view: View, exchange: Callable[[Seat], VecEnvStepReturn]) -> None:
+        """Seat the learner ``name``; ``exchange`` hands in its action and waits for the outcome of the joint step."""
+        self.name = name
+        self.view = view
+        self.latest: Observation | None = None
         self.action: NDArray[np.float32] | None = None
-        self.views = [AgentView(env, agent, i) for i in range(env.num_envs)]
+        self.copies = env.num_envs
+        copies = range(self.copies)
+        self.views: list[CopyView] = [AgentView(env, i, agent) for agent in view.row_agents for i in copies]
+        self.views = self.views or [CopyView(env, i) for i in copies]
         self._exchange = exchange
-        super().__init__(env.num_envs, env.observation_spaces[agent], env.action_spaces[agent])
+        super().__init__(len(self.views), view.observation_space, view.action_space)
+
+    @property
+    def title(self) -> str:
+        """What messages call the learner."""
+        return f"agent '{self.name}'" if self.view.agents == (self.name,) else f"learner '{self.name}'"
+
+    def outcome(
+        self,
+        rewards: Mapping[str, Floats],
+        done: NDArray[np.bool_],
+        returns: Mapping[str, Floats],
+        lengths: NDArray[np.integer],
+        final: Observation | None,
+    ) -> VecEnvStepReturn:
+        """Put together what a joint step brought the learner.
+
+        Args:
+            rewards: of this step by agent, shape (B,).
+            done: copies whose episode ended, shape (B,).
+            returns: of the episode so far by agent, shape (B,).
+            lengths: of the episode so far, shape (B,).
+            final: last observation of the episodes that ended; None if none did.
+        """
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ended = np.tile(done, self.num_envs // self.copies)
+        if final is not None:
+            scores = self.view.score(returns)
+            for row in np.flatnonzero(ended):
+                infos[row] = {
+                    "TimeLimit.truncated": True,
+                    "terminal_observation": _row(final, int(row)),
+                    "episode": {"r": float(scores[row]), "l": int(lengths[row % self.copies]), "t": 0.0},
+                }
+        assert self.latest is not None
+        # arrays of its own: PPO adds the bootstrap value to the rewards in place
+        return self.latest, self.view.score(rewards).astype(np.float32), ended, infos
 
     def reset(self) -> VecEnvObs:
         """Return the current observation of every copy."""
         if self.latest is None:
-            raise CirlError(f"the seat of agent '{self.agent}' has no observation: the joint environment is not reset")
+            raise CirlError(f"the seat of {self.title} has no observation: the joint environment is not reset")
         return self.latest
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Keep the actions, shape (B, 1), for the next joint step."""
+        """Keep the actions, one row for each row of the view, for the next joint step."""
         self.action = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Wait until every agent has handed in its actions and the joint environment has moved."""
+        """Wait until every learner has handed in its actions and the joint environment has moved."""
         return self._exchange(self)
 
     def close(self) -> None:
@@ -85,23 +137,30 @@ class Seat(VecEnv):
         return [seed] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Return an attribute of the agent's view in the given copies."""
+        """Return an attribute of the given rows' views."""
         return [getattr(view, attr_name) for view in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Set an attribute of the agent's view in the given copies."""
+        """Set an attribute of the given rows' views."""
         for view in self._chosen(indices):
             setattr(view, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the agent's view in the given copies."""
+        """Call a method of the given rows' views."""
         return [getattr(view, method_name)(*method_args, **method_kwargs) for view in self._chosen(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:
-        """Return False for each copy: no Gymnasium wrapper is involved."""
+        """Return False for each row: no Gymnasium wrapper is involved."""
         return [False for _ in self._chosen(indices)]
 
-    def _chosen(self, indices: int | Iterable[int] | None) -> list[AgentView]:
+    def _chosen(self, indices: int | Iterable[int] | None) -> list[CopyView]:
         return [self.views[i] for i in self._get_indices(indices)]
+
+
+def _row(observation: Observation, row: int) -> Observation:
+    if isinstance(observation, dict):
+        return {key: value[row].copy() for key, value in observation.items()}
+    own: NDArray[np.floating] = observation[row].copy()
+    return own

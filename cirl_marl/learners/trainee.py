@@ -1,4 +1,4 @@
-"""One agent's learner: algorithm, normaliser, random streams; how it learns, goes on acting, is saved and loaded."""
+"""One learner: algorithm, normaliser, random streams; how it learns, goes on acting, is saved and loaded."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def derived_seed(seed: int, *names: str | int) -> int:
 
 
 class Trainee:
-    """The learner of one agent, seated in the joint environment.
+    """A learner seated in the joint environment.
 
     Attributes:
-        agent: whose learner it is.
+        name: the agent's whose learner it is, or that of a learner of several agents.
         spec: its part of the recipe.
         seat: its view of the environment.
         env: the seat, behind ``VecNormalize`` if the recipe normalises.
@@ -51,11 +51,11 @@ class Trainee:
     env: VecEnv
 
     def __init__(self, seat: Seat, spec: Learner, seed: int) -> None:
-        """Give the agent its streams; ``build`` or ``load`` makes the algorithm."""
-        self.agent = seat.agent
+        """Give the learner its streams; ``build`` or ``load`` makes the algorithm."""
+        self.name = seat.name
         self.spec = spec
         self.seat = seat
-        self._seed = derived_seed(seed, seat.agent)
+        self._seed = derived_seed(seed, seat.name)
         noisy = spec.parameters.get("action_noise") is not None
         self.streams = Streams(self._seed, keep_gaussian=noisy)
 
@@ -63,7 +63,7 @@ class Trainee:
         """Make a fresh algorithm.
 
         Raises:
-            RecipeError: naming the agent, if the algorithm refuses its parameters.
+            RecipeError: naming the learner, if the algorithm refuses its parameters.
         """
         spec = self.spec
         self.env = self._normalised(spec)
@@ -74,15 +74,15 @@ class Trainee:
             try:
                 self.model = build(spec.algorithm, spec.policy, self.env, parameters, seed=self._seed, device="cpu")
             except RecipeError as error:
-                raise RecipeError(f"agent '{self.agent}': {error}") from error
+                raise RecipeError(f"{self.seat.title}: {error}") from error
         return self
 
     def load(self, folder: Path) -> Trainee:
         """Go on with the algorithm saved in ``folder``."""
         with self.streams.active():
-            self.env = load_normaliser(folder, self.agent, self.spec, self.seat) or self.seat
-            self.model = load_model(folder, self.agent, self.spec.algorithm, env=self.env)
-            replay = folder / f"{self.agent}.replay.pkl"
+            self.env = load_normaliser(folder, self.name, self.spec, self.seat) or self.seat
+            self.model = load_model(folder, self.name, self.spec.algorithm, env=self.env)
+            replay = folder / f"{self.name}.replay.pkl"
             if isinstance(self.model, OffPolicyAlgorithm) and replay.is_file():
                 self.model.load_replay_buffer(replay)
         return self
@@ -90,13 +90,17 @@ class Trainee:
     def budget(self, steps: int) -> int:
         """Joint steps after which it is stopped; only ARS, which counts otherwise, does not stop by itself."""
         if isinstance(self.model, ARS):
-            return math.ceil(steps * self.spec.share_of_steps / self.seat.num_envs)
+            return math.ceil(steps * self.spec.share_of_steps / self.seat.copies)
         return 2**62
 
     def learn(self, steps: int, callback: BaseCallback | None) -> None:
-        """Run the algorithm's own ``learn()`` up to its share of ``steps``, counting what it had learnt before."""
+        """Run the algorithm's own ``learn()`` up to its share of ``steps``, counting what it had learnt before.
+
+        A shared policy makes one step of its own for each of its agents.
+        """
         done = self.model.num_timesteps
-        total = 10**15 if isinstance(self.model, ARS) else math.ceil(steps * self.spec.share_of_steps) - done
+        rows = self.seat.num_envs // self.seat.copies
+        total = 10**15 if isinstance(self.model, ARS) else math.ceil(steps * self.spec.share_of_steps) * rows - done
         if total > 0:
             self.model.learn(total, callback=callback, reset_num_timesteps=done == 0)
 
@@ -113,11 +117,11 @@ class Trainee:
 
     def save(self, folder: Path, *, replay: bool) -> None:
         """Save policy, optimiser and normaliser, and the replay buffer if learning may go on."""
-        self.model.save(folder / f"{self.agent}.zip")
+        self.model.save(folder / f"{self.name}.zip")
         if isinstance(self.env, VecNormalize):
-            self.env.save(str(folder / f"{self.agent}.normaliser.pkl"))
+            self.env.save(str(folder / f"{self.name}.normaliser.pkl"))
         if replay and isinstance(self.model, OffPolicyAlgorithm) and self.model.replay_buffer is not None:
-            write_atomically(folder / f"{self.agent}.replay.pkl", self.model.save_replay_buffer)
+            write_atomically(folder / f"{self.name}.replay.pkl", self.model.save_replay_buffer)
 
     def close(self) -> None:
         """Close the log files."""
@@ -139,18 +143,18 @@ class Trainee:
     def log_to(self, log: Path | None) -> None:
         """Write TensorBoard events below the folder ``log``, or nowhere."""
         if log is not None:
-            self.model.set_logger(configure(str(log / self.agent), ["tensorboard"]))
+            self.model.set_logger(configure(str(log / self.name), ["tensorboard"]))
         else:
             self.model.set_logger(configure(None, []))
 
 
-def load_model(folder: Path, agent: str, algorithm: str, env: VecEnv | None = None) -> BaseAlgorithm:
-    """Load the policy that ``agent`` learnt; the global random streams are left as they were.
+def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = None) -> BaseAlgorithm:
+    """Load the policy that the learner ``name`` learnt; the global random streams are left as they were.
 
     Raises:
         RunError: if the file cannot be read.
     """
-    path = folder / f"{agent}.zip"
+    path = folder / f"{name}.zip"
     with global_streams_kept():
         try:
             return algorithm_class(algorithm).load(path, env=env, device="cpu")
@@ -158,7 +162,7 @@ def load_model(folder: Path, agent: str, algorithm: str, env: VecEnv | None = No
             raise RunError(f"{path}: cannot be read: {error}") from error
 
 
-def load_normaliser(folder: Path, agent: str, spec: Learner, seat: Seat | None = None) -> VecNormalize | None:
+def load_normaliser(folder: Path, name: str, spec: Learner, seat: Seat | None = None) -> VecNormalize | None:
     """Load the normaliser saved with a policy; None if its recipe does not normalise.
 
     Raises:
@@ -166,12 +170,12 @@ def load_normaliser(folder: Path, agent: str, spec: Learner, seat: Seat | None =
     """
     if not spec.normalise.any:
         return None
-    path = folder / f"{agent}.normaliser.pkl"
+    path = folder / f"{name}.normaliser.pkl"
     try:
         if seat is not None:
             return VecNormalize.load(str(path), seat)
         with path.open("rb") as file:
             normaliser: VecNormalize = pickle.load(file)
     except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError, IndexError, ValueError) as error:
-        raise RunError(f"{path}: cannot be read: {error}; without it the policy of '{agent}' is useless") from error
+        raise RunError(f"{path}: cannot be read: {error}; without it the policy of '{name}' is useless") from error
     return normaliser

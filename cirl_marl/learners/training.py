@@ -1,4 +1,4 @@
-"""Training: seat the agents, let their learners run in lockstep, keep what they learn."""
+"""Training: seat the learners, let them run in lockstep, keep what they learn."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ class Training:
     Attributes:
         config: what it was asked to do.
         env: the joint environment.
-        trainees: the learner of each agent.
+        trainees: the learners by name; an independent learner has its agent's.
         run: where it is kept; None if it is not.
     """
 
     def __init__(self, config: RunConfig, env: VectorEnv, resumed: RunDirectory | None = None) -> None:
-        """Seat the agents and make their algorithms, or load those of a run that is resumed."""
+        """Seat the learners and make their algorithms, or load those of a run that is resumed."""
         self.config = config
         self.env = env
         self.run: RunDirectory | None = None
@@ -76,11 +76,12 @@ class Training:
             checkpoint, self.done = resumed.checkpoint, int(resumed.status["joint_steps"])
         keys: tuple[str | int, ...] = ("copies", self.done) if self.done else ("copies",)
         seeds = [derived_seed(config.seed, *keys, i) for i in range(config.envs)]
-        self.lockstep = Lockstep(env, seeds)
+        groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
+        self.lockstep = Lockstep(env, seeds, {name: group.view(env) for name, group in groups.items()})
         self.trainees: dict[str, Trainee] = {}
-        for agent, seat in self.lockstep.seats.items():
-            trainee = Trainee(seat, config.recipe.learner_of(agent, env.network), config.seed + self.done)
-            self.trainees[agent] = trainee.load(checkpoint) if checkpoint else trainee.build()
+        for name, seat in self.lockstep.seats.items():
+            trainee = Trainee(seat, groups[name].spec, config.seed + self.done)
+            self.trainees[name] = trainee.load(checkpoint) if checkpoint else trainee.build()
         self._log()
 
     def keep_in(self, run: RunDirectory) -> None:
@@ -105,7 +106,7 @@ class Training:
         Ctrl-C, and an error in a learner, save what was learnt before they are raised.
 
         Args:
-            callbacks: Stable-Baselines3 callbacks by agent.
+            callbacks: Stable-Baselines3 callbacks by name of the learner.
             report: called after every joint step.
 
         Raises:
@@ -113,9 +114,9 @@ class Training:
             KeyboardInterrupt: after Ctrl-C.
         """
         callbacks = callbacks or {}
-        for agent in callbacks:
-            if agent not in self.trainees:
-                raise CirlError(f"callbacks: {unknown('agent', agent, self.trainees)}")
+        for name in callbacks:
+            if name not in self.trainees:
+                raise CirlError(f"callbacks: {unknown('learner', name, self.trainees)}")
         steps = self.config.steps
         try:
             with _one_torch_thread(), self._interruptible():
@@ -238,7 +239,7 @@ def train(
     report: Callable[[Progress], None] | None = None,
     **options: Any,
 ) -> Training:
-    """Train one learner per agent, all at once, in the same coupled environment.
+    """Train the learners of all agents, all at once, in the same coupled environment.
 
     The same arguments give bit-identical policies.
 
@@ -250,12 +251,12 @@ def train(
         envs: copies of the environment; None takes the recipe's.
         seed: from which every random stream derives.
         agents: who acts and learns; None takes the network's choice.
-        callbacks: Stable-Baselines3 callbacks by agent.
+        callbacks: Stable-Baselines3 callbacks by name of the learner.
         report: called after every joint step.
         **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``horizon``; they override the recipe's.
 
     Returns:
-        The finished training; ``trainees[agent].model`` is the Stable-Baselines3 model.
+        The finished training; ``trainees[name].model`` is the Stable-Baselines3 model.
 
     Raises:
         CirlError: for input that cannot be used, before anything is written.

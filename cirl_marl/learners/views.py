@@ -1,0 +1,187 @@
+"""How one learner sees the joint environment: as one agent, as many agents that share a policy, or as all at once.
+
+A view maps what the environment gives to agents (agent → array with leading axis B) to the rows of one
+Stable-Baselines3 ``VecEnv``, and the learner's actions back. Views hold no state, so that the same view serves training
+and evaluation, with any number of copies.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from cirl_marl.network import Floats
+from cirl_marl.vector_env import VectorEnv
+
+Arrays = Mapping[str, NDArray[np.floating]]
+Observation = NDArray[np.floating] | dict[str, NDArray[np.floating]]
+Scheme = Literal["independent", "shared", "joint"]
+
+
+class View(ABC):
+    """What one learner sees and does.
+
+    Attributes:
+        agents: who acts by its actions.
+        row_agents: the agent of each row that a copy of the environment fills; empty if its row is that of all agents.
+        observation_space: of one row.
+        action_space: of one row.
+    """
+
+    agents: tuple[str, ...]
+    row_agents: tuple[str, ...]
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+
+    @abstractmethod
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+        """Return the rows of all copies, agent by agent; ``state`` is called by those who see the whole state."""
+
+    @abstractmethod
+    def act(self, actions: NDArray[np.floating]) -> Arrays:
+        """Split the actions of all rows into agent → (B, entries)."""
+
+    @abstractmethod
+    def score(self, rewards: Arrays) -> Floats:
+        """Return the reward of each row."""
+
+
+class OneAgent(View):
+    """The view of a single agent: its own observation, action and reward, as they are."""
+
+    def __init__(self, env: VectorEnv, agent: str) -> None:
+        """View ``env`` as ``agent``."""
+        self.agents, self.row_agents = (agent,), (agent,)
+        self.observation_space = env.observation_spaces[agent]
+        self.action_space = env.action_spaces[agent]
+
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+        """Return the agent's observation, shape (B, k)."""
+        return np.ascontiguousarray(observations[self.agents[0]])
+
+    def act(self, actions: NDArray[np.floating]) -> Arrays:
+        """Return the actions, shape (B, m), as the agent's."""
+        return {self.agents[0]: actions}
+
+    def score(self, rewards: Arrays) -> Floats:
+        """Return the agent's reward, shape (B,)."""
+        return np.asarray(rewards[self.agents[0]], dtype=np.float64)
+
+
+class SharedPolicy(View):
+    """N agents as rows of one learner: observations padded with zeros, then a one-hot indicator of the agent.
+
+    Row a·B + b is agent a in copy b. Values are those of SuperSuit's ``pad_observations_v0``, ``pad_action_space_v0``
+    and ``agent_indicator_v0``, but for the indicator, which is 1 where SuperSuit writes the largest bound of the space.
+    """
+
+    def __init__(self, env: VectorEnv, agents: Sequence[str]) -> None:
+        """View ``env`` as each of ``agents`` in turn."""
+        self.agents = self.row_agents = tuple(agents)
+        boxes = [env.observation_spaces[agent] for agent in self.agents]
+        self._actions = {agent: env.action_spaces[agent].shape[0] for agent in self.agents}
+        self._length = max(box.shape[0] for box in boxes)
+        low, high = np.zeros((2, self._length + len(self.agents)), dtype=np.float32)
+        for box in boxes:
+            low[: len(box.low)] = np.minimum(low[: len(box.low)], box.low)
+            high[: len(box.high)] = np.maximum(high[: len(box.high)], box.high)
+        high[self._length :] = 1.0
+        self.observation_space = spaces.Box(low, high, dtype=np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (max(self._actions.values()),), dtype=np.float32)
+
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+        """Return the padded and marked observations, shape (N·B, longest + N)."""
+        copies = len(observations[self.agents[0]])
+        rows = np.zeros((len(self.agents), copies, self._length + len(self.agents)), dtype=np.float32)
+        for a, agent in enumerate(self.agents):
+            seen = observations[agent]
+            rows[a, :, : seen.shape[1]] = seen
+            rows[a, :, self._length + a] = 1.0
+        return rows.reshape(-1, rows.shape[2])
+
+    def act(self, actions: NDArray[np.floating]) -> Arrays:
+        """Return each agent's part of the rows, without the padding."""
+        by_agent = actions.reshape(len(self.agents), -1, max(self._actions.values()))
+        return {agent: by_agent[a, :, :n] for a, (agent, n) in enumerate(self._actions.items())}
+
+    def score(self, rewards: Arrays) -> Floats:
+        """Return each agent's reward, shape (N·B,)."""
+        return np.concatenate([rewards[agent] for agent in self.agents])
+
+
+class AllAtOnce(View):
+    """N agents as one: observations and actions one after the other, the reward their mean."""
+
+    def __init__(self, env: VectorEnv, agents: Sequence[str]) -> None:
+        """View ``env`` as all of ``agents``."""
+        self.agents, self.row_agents = tuple(agents), ()
+        boxes = [env.observation_spaces[agent] for agent in self.agents]
+        lengths = [env.action_spaces[agent].shape[0] for agent in self.agents]
+        self._ends = np.cumsum(lengths)
+        self.observation_space = spaces.Box(
+            np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes]), dtype=np.float32
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (int(self._ends[-1]),), dtype=np.float32)
+
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+        """Return the observations side by side, shape (B, Σ k)."""
+        return np.concatenate([observations[agent] for agent in self.agents], axis=1)
+
+    def act(self, actions: NDArray[np.floating]) -> Arrays:
+        """Return each agent's columns."""
+        return dict(zip(self.agents, np.split(actions, self._ends[:-1], axis=1), strict=True))
+
+    def score(self, rewards: Arrays) -> Floats:
+        """Return the mean of the agents' rewards, shape (B,): λ itself if every agent is paid λ."""
+        mean: Floats = np.mean([rewards[agent] for agent in self.agents], axis=0)
+        return mean
+
+
+class WithState(View):
+    """Another view, and the whole state beside it: ``{"observation": …, "state": …}``.
+
+    The state is that of ``VectorEnv.state()``, in physical units and double precision.
+    """
+
+    def __init__(self, env: VectorEnv, view: View) -> None:
+        """Add the state of ``env`` to what ``view`` shows."""
+        self._view = view
+        self.agents, self.row_agents = view.agents, view.row_agents
+        self.action_space = view.action_space
+        state = spaces.Box(-np.inf, np.inf, (len(env.state_names) + 1,), dtype=np.float64)
+        self.observation_space = spaces.Dict({"observation": view.observation_space, "state": state})
+
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+        """Return the view's rows, and for each the state of its copy."""
+        rows = self._view.observe(observations, state)
+        assert isinstance(rows, np.ndarray)
+        return {"observation": rows, "state": np.tile(state(), (max(1, len(self.row_agents)), 1))}
+
+    def act(self, actions: NDArray[np.floating]) -> Arrays:
+        """Act as the view does."""
+        return self._view.act(actions)
+
+    def score(self, rewards: Arrays) -> Floats:
+        """Score as the view does."""
+        return self._view.score(rewards)
+
+
+def view_of(env: VectorEnv, agents: Sequence[str], scheme: Scheme, *, with_state: bool = False) -> View:
+    """Return how a learner of ``agents`` sees ``env``; one that is independent has a single agent."""
+    view: View
+    if scheme == "independent":
+        (agent,) = agents
+        view = OneAgent(env, agent)
+    else:
+        view = SharedPolicy(env, agents) if scheme == "shared" else AllAtOnce(env, agents)
+    return WithState(env, view) if with_state else view
+
+
+def unseen_state(env: VectorEnv) -> Callable[[], Floats]:
+    """Return zeros in the place of the state, for acting: an actor does not look at it."""
+    return lambda: np.zeros((env.num_envs, len(env.state_names) + 1))

@@ -1,0 +1,300 @@
+"""Shared policies, joint learners and central critics: what they see, what they learn, how they act alone."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+
+import cirl_marl
+from cirl_marl import DefinitionError, Network, VectorEnv, vector_env
+from cirl_marl.controllers.trained import Trained
+from cirl_marl.evaluate import rollout
+from cirl_marl.learners import load_recipe, train
+from cirl_marl.learners.central_critic import CentralCriticPolicy
+from cirl_marl.learners.lockstep import Lockstep
+from cirl_marl.learners.recipe import Learner, Match, Recipe, Run
+from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, WithState, unseen_state
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    from supersuit import agent_indicator_v0, pad_action_space_v0, pad_observations_v0
+
+SMALL: dict[str, Any] = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
+JOINT_RECIPES = ["shared_ppo", "joint_ppo", "joint_sac", "mappo", "difference_ppo"]
+
+
+@pytest.mark.parametrize("name", cirl_marl.networks())
+@pytest.mark.filterwarnings("ignore")
+def test_shared_policy_sees_and_does_what_supersuit_pads(name: str) -> None:
+    """Observations, actions and rewards of the batched view are those of SuperSuit's wrappers around PettingZoo."""
+    plain = cirl_marl.parallel_env(name, horizon=4)
+    theirs: Any = agent_indicator_v0(pad_action_space_v0(pad_observations_v0(plain)))
+    ours = vector_env(name, num_envs=1, horizon=4)
+    view = SharedPolicy(ours, ours.agents)
+    agents, rng = list(ours.agents), np.random.default_rng(0)
+    longest = max(space.shape[0] for space in ours.observation_spaces.values())
+    assert view.observation_space.shape == theirs.observation_space(agents[0]).shape
+    assert view.action_space.shape == theirs.action_space(agents[0]).shape
+    seen, _ = theirs.reset(seed=5)
+    rows = view.observe(ours.reset(seed=5), ours.state)
+    for _ in range(3):
+        assert isinstance(rows, np.ndarray)
+        for row, agent in zip(rows, agents, strict=True):
+            np.testing.assert_array_equal(row[:longest], seen[agent][:longest])
+            np.testing.assert_array_equal(row[longest:], seen[agent][longest:] != 0)
+        actions = rng.uniform(-1, 1, (len(agents), view.action_space.sample().size)).astype(np.float32)
+        seen, paid, *_ = theirs.step(dict(zip(agents, actions, strict=True)))
+        observations, rewards, *_ = ours.step(view.act(actions))
+        rows = view.observe(observations, ours.state)
+        assert view.score(rewards).tolist() == [paid[agent] for agent in agents]
+
+
+@given(network=st.from_type(Network), copies=st.integers(1, 3), seed=st.integers(0, 1000))
+def test_views_lose_nothing(network: Network, copies: int, seed: int) -> None:
+    """Whatever the view, each agent's observation, action and reward is in its place, in every copy."""
+    env = VectorEnv(network, num_envs=copies)
+    if not env.agents:
+        return
+    observations, rng = env.reset(seed=seed), np.random.default_rng(seed)
+    rewards = {agent: rng.normal(size=copies) for agent in env.agents}
+    views: list[View] = [SharedPolicy(env, env.agents), AllAtOnce(env, env.agents)]
+    views += [OneAgent(env, agent) for agent in env.agents]
+    for view in [*views, *(WithState(env, view) for view in views)]:
+        rows = view.observe(observations, env.state)
+        if isinstance(rows, dict):
+            assert (rows["state"][:copies] == env.state()).all() and (rows["state"][-copies:] == env.state()).all()
+            rows = rows["observation"]
+        per_copy = max(1, len(view.row_agents))
+        assert len(rows) == len(view.score(rewards)) == per_copy * copies
+        actions = rng.uniform(-1, 1, (len(rows), *(view.action_space.shape or ())))
+        done = view.act(actions)
+        assert set(done) == set(view.agents)
+        column = 0
+        for a, agent in enumerate(view.agents):
+            entries = env.action_spaces[agent].shape[0]
+            mine, reward = rows[a * copies : (a + 1) * copies], view.score(rewards)[a * copies : (a + 1) * copies]
+            if view.row_agents:
+                np.testing.assert_array_equal(mine[:, : observations[agent].shape[1]], observations[agent])
+                np.testing.assert_array_equal(done[agent], actions[a * copies : (a + 1) * copies, :entries])
+                np.testing.assert_array_equal(reward, rewards[agent])
+            else:
+                np.testing.assert_array_equal(done[agent], actions[:, column : column + entries])
+                column += entries
+        if not view.row_agents:
+            together = np.concatenate([observations[agent] for agent in view.agents], axis=1)
+            np.testing.assert_array_equal(rows, together)
+            np.testing.assert_allclose(view.score(rewards), sum(rewards.values()) / len(rewards), rtol=1e-12)
+
+
+def test_joint_learner_is_paid_circularity() -> None:
+    """With the team reward a joint learner's reward is λ itself."""
+    env = vector_env("copper_net", num_envs=3, reward="circularity")
+    env.reset(seed=0)
+    _, rewards, _, _, infos = env.step({agent: np.tile(n, (3, 1)) for agent, n in env.neutral_action.items()})
+    paid = AllAtOnce(env, env.agents).score(rewards)
+    np.testing.assert_allclose(paid, infos["mine"]["circularity"], rtol=1e-14)
+
+
+def test_mixed_difference_reward() -> None:
+    """w·(λ − λ had the agent been neutral)/scale + (1 − w)·local, of the same steps."""
+    envs = {mode: vector_env("copper_net", num_envs=2, reward=mode) for mode in ("mixed_difference", "difference")}
+    rng = np.random.default_rng(1)
+    actions = rng.uniform(-1, 1, (5, len(envs["difference"].agents), 2))
+    got = {}
+    for mode, env in envs.items():
+        env.reset(seed=4)
+        got[mode] = [env.advance(action) for action in actions]
+    objective = envs["difference"].network.objective
+    weight = objective.circularity_weight
+    for mixed, alone in zip(got["mixed_difference"], got["difference"], strict=True):
+        expected = weight / objective.circularity_scale * alone.reward + (1 - weight) * alone.local
+        np.testing.assert_allclose(mixed.reward, expected, rtol=1e-12)
+
+
+def small(learner: Learner, **options: Any) -> Recipe:
+    """Return a recipe for two copies."""
+    return Recipe(name="small", title="small", learner=learner, run=Run(steps=64, envs=2), **options)
+
+
+def test_rows_of_a_seat_are_agents_in_copies() -> None:
+    """Time limits, returns and attributes of a row are those of its agent and copy; the last state as well."""
+    env = vector_env("copper_net", num_envs=2, horizon=3)
+    by_hand = vector_env("copper_net", num_envs=2, horizon=3)
+    lockstep = Lockstep(env, [1, 2], {"all": WithState(env, SharedPolicy(env, env.agents))})
+    seat, count = lockstep.seats["all"], len(env.agents)
+    by_hand.reset(seed=[1, 2])
+    assert seat.get_attr("agent") == [agent for agent in env.agents for _ in range(2)]
+    assert seat.get_attr("index") == [0, 1] * count
+    seen: list[Any] = []
+
+    def learn() -> None:
+        for _ in range(3):
+            seen.append(seat.step(np.zeros((2 * count, 1), dtype=np.float32)))
+
+    def rest() -> None:
+        while True:
+            seat.step(np.zeros((2 * count, 1), dtype=np.float32))
+
+    lockstep.run({"all": learn}, {"all": rest}, {"all": Streams(0)}, {"all": 99})
+    returns = np.zeros(2 * count)
+    for observation, reward, done, infos in seen:
+        still = {agent: np.zeros((2, 1)) for agent in env.agents}
+        _, rewards, _, truncations, theirs = by_hand.step(still)
+        expected = np.concatenate(list(rewards.values()))
+        np.testing.assert_array_equal(reward, expected.astype(np.float32))
+        np.testing.assert_array_equal(done, np.tile(truncations["mine"], count))
+        np.testing.assert_array_equal(observation["state"], np.tile(by_hand.state(), (count, 1)))
+        returns += expected
+        for row, info in enumerate(infos):
+            assert ("terminal_observation" in info) == done[row]
+            if done[row]:
+                last = info["terminal_observation"]
+                agent = env.agents[row // 2]
+                k = env.observation_spaces[agent].shape[0]
+                np.testing.assert_array_equal(last["observation"][:k], theirs[agent]["final_observation"][row % 2])
+                np.testing.assert_array_equal(last["state"], theirs[agent]["final_state"][row % 2])
+                assert last["state"][-1] == 1.0  # the whole time has elapsed; the next episode's share is 0
+                assert info["TimeLimit.truncated"]
+                assert info["episode"]["r"] == pytest.approx(returns[row], rel=1e-12)
+
+
+def central_critic() -> PPO:
+    """Return PPO with a central critic on a toy view."""
+    env = vector_env("carbo_net", num_envs=2)
+    lockstep = Lockstep(env, [0, 1], {"all": WithState(env, SharedPolicy(env, env.agents))})
+    return PPO(CentralCriticPolicy, lockstep.seats["all"], seed=0, device="cpu", **SMALL)
+
+
+def perturbed(model: PPO) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Return an observation, and the same observation in another state."""
+    space: Any = model.observation_space
+    rng = torch.Generator().manual_seed(0)
+    rows = {key: torch.randn(5, *box.shape, generator=rng) for key, box in space.spaces.items()}
+    return rows, {**rows, "state": rows["state"] + 1.0}
+
+
+def test_actor_is_local_and_critic_central() -> None:
+    """The state changes values but no action; neither loss has a gradient in the other's network."""
+    policy = central_critic().policy
+    here, elsewhere = perturbed(central_critic())
+    assert torch.equal(policy.get_distribution(here).mode(), policy.get_distribution(elsewhere).mode())
+    assert not torch.allclose(policy.predict_values(here), policy.predict_values(elsewhere))
+    actions, values, _ = policy(here, deterministic=True)
+    assert torch.equal(actions, policy.get_distribution(here).mode())
+    assert torch.equal(values, policy.predict_values(here))
+
+    critic = {"mlp_extractor.value_net", "value_net"}
+    for loss in ("actor", "critic"):
+        policy.zero_grad()
+        values, log_likelihood, _ = policy.evaluate_actions(here, actions)
+        (log_likelihood if loss == "actor" else values).sum().backward()  # type: ignore[no-untyped-call]
+        moved = {name for name, p in policy.named_parameters() if p.grad is not None and bool(p.grad.any())}
+        in_critic = {name for name in moved if any(name.startswith(part) for part in critic)}
+        assert moved and in_critic == (set() if loss == "actor" else moved), (loss, moved)
+
+
+def test_trained_actors_need_no_state(tmp_path: Path) -> None:
+    """A saved run acts by observations alone, as its policy does with the state before it."""
+    learner = Learner(scheme="shared", algorithm="PPO", policy="CentralCriticPolicy", parameters=SMALL)
+    training = train("carbo_net", small(learner), directory=tmp_path / "run", horizon=8)
+    env = vector_env("carbo_net", num_envs=3, horizon=8)
+    observations = env.reset(seed=9)
+    controller = Trained(tmp_path / "run")
+    controller.start(env, 9)
+    got = controller.act(observations)
+    trainee = training.trainees["shared-learner"]
+    view = WithState(env, SharedPolicy(env, env.agents))
+    rows = view.observe(observations, env.state)
+    normalised: Any = trainee.env.normalize_obs(rows)  # type: ignore[attr-defined]
+    expected = view.act(trainee.model.predict(normalised, deterministic=True)[0])
+    for agent in env.agents:
+        np.testing.assert_array_equal(got[agent], expected[agent])
+    unseen: Any = view.observe(observations, unseen_state(env))
+    assert (unseen["state"] == 0).all()
+    assert np.isfinite(rollout(env, controller).episode_circularity).all()
+
+
+def test_learners_share_by_match(tmp_path: Path) -> None:
+    """Nodes may share one policy and arcs another, beside an agent that learns alone; every policy moves."""
+    matches = [
+        Match(agents=["mine"], algorithm="A2C", parameters={"n_steps": 8}),
+        Match(kind="node", scheme="shared", algorithm="PPO", parameters=SMALL),
+        Match(agents=["use_to_collection", "collection_to_sorting"], scheme="joint", algorithm="PPO", parameters=SMALL),
+    ]
+    recipe = small(Learner(scheme="shared", algorithm="PPO", parameters=SMALL), match=matches)
+    training = train("copper_net", recipe, directory=tmp_path / "run", horizon=8)
+    members = {name: trainee.seat.view.agents for name, trainee in training.trainees.items()}
+    assert set(members) == {"shared-learner-0", "shared-learner-2", "joint-learner", "mine"}
+    assert sorted(a for agents in members.values() for a in agents) == sorted(training.env.agents)
+    assert members["joint-learner"] == ("use_to_collection", "collection_to_sorting")
+    network = training.env.network
+    assert all(agent in network.node_index for agent in members["shared-learner-2"])
+    assert all(agent in network.arc_index for agent in members["shared-learner-0"])
+    for name, trainee in training.trainees.items():
+        assert trainee.model.num_timesteps == 64 * max(1, len(trainee.seat.view.row_agents)), name
+    controller, env = Trained(tmp_path / "run"), vector_env("copper_net", num_envs=2, horizon=8)
+    assert np.isfinite(rollout(env, controller).episode_circularity).all()
+
+
+def shortened(name: str) -> Recipe:
+    """Return a recipe of the catalogue for two copies and a few gradient steps."""
+    recipe = load_recipe(name)
+    parameters = dict(recipe.learner.parameters)
+    if recipe.learner.algorithm == "PPO":
+        parameters |= {"n_steps": 4, "batch_size": 8, "n_epochs": 1}
+    else:
+        parameters |= {"learning_starts": 2, "buffer_size": 50, "gradient_steps": 1, "batch_size": 4}
+    learner = recipe.learner.model_copy(update={"parameters": parameters})
+    return recipe.model_copy(update={"learner": learner, "run": Run(steps=8, envs=2)})
+
+
+@pytest.mark.parametrize("network", cirl_marl.networks())
+@pytest.mark.parametrize("name", JOINT_RECIPES)
+def test_every_recipe_learns_on_every_network(name: str, network: str) -> None:
+    """The recipes of the catalogue train on each network, and their policies move."""
+    training = train(network, shortened(name), horizon=4, seed=1)
+    for trainee in training.trainees.values():
+        parameters = [p.detach().numpy() for p in trainee.model.policy.parameters()]
+        assert all(np.isfinite(p).all() for p in parameters)
+        assert trainee.model._n_updates > 0
+
+
+def seen_values(training: Any) -> NDArray[np.floating]:
+    """Return all weights of a training in one array."""
+    weights = [p.detach().numpy().ravel() for t in training.trainees.values() for p in t.model.policy.parameters()]
+    return np.concatenate(weights)
+
+
+@pytest.mark.parametrize("scheme", ["shared", "joint"])
+def test_same_seed_gives_the_same_bits(scheme: Any) -> None:
+    """Learners of several agents are reproducible, and another seed gives other weights."""
+    recipe = small(Learner(scheme=scheme, algorithm="PPO", parameters=SMALL))
+    first, again, other = (seen_values(train("carbo_net", recipe, seed=seed, horizon=8)) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_central_critic_needs_what_it_needs(tmp_path: Path) -> None:
+    """Physical units must be normalised, and only on-policy actor-critics have such a policy."""
+    text = 'name = "mine"\ntitle = "mine"\n[learner]\nalgorithm = "PPO"\npolicy = "CentralCriticPolicy"\n'
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    assert load_recipe(path).learner.policy == "CentralCriticPolicy"
+    for changed, said in (
+        (text + "normalise = { observation = false }\n", "learner.normalise.observation"),
+        (text.replace("PPO", "SAC"), "unknown policy of SAC for vectors 'CentralCriticPolicy'"),
+        (text + 'scheme = "sharde"\n', "learner.scheme"),
+    ):
+        path.write_text(changed)
+        with pytest.raises(DefinitionError, match=said):
+            load_recipe(path)
