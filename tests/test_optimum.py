@@ -30,11 +30,11 @@ from cirl_marl import (
 from cirl_marl.controllers import Neutral
 from cirl_marl.evaluate import rollout
 from cirl_marl.flows import FlowLaws
-from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, improved
+from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, improved
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bound import starting_stocks
 from cirl_marl.optimum.certificate import verified
-from cirl_marl.optimum.reach import reach
+from cirl_marl.optimum.maximise import starting_stocks
+from cirl_marl.optimum.reach import Comparison
 
 Floats = NDArray[np.float64]
 COPIES = 48
@@ -134,7 +134,7 @@ def test_reach(network: Network, interval: float, seed: int) -> None:
     network = certifiable(network, interval, pulls=False)
     single = replace(network, nodes=tuple(replace(n, initial=(n.initial[1],) * 2) for n in network.nodes))
     admissible = Admissible.of(single)
-    reached = reach(admissible, starting_stocks(single, None))
+    reached = Comparison(admissible).reach(starting_stocks(single, None), range(single.episode.horizon))
     _, _, highest = episodes(single, seed)
     assert (highest <= reached.upper.max(axis=0) * (1 + 1e-9) + 1e-12).all()
     run = rollout(VectorEnv(single, num_envs=1), Neutral())
@@ -293,6 +293,81 @@ def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float)
     weaker = verified(found.problem, other, found.solution)
     assert weaker.bound >= proof.objective - 1e-6 * scale
     assert weaker.infeasibility == pytest.approx(max(0.0, other.under.max(initial=0.0)))
+
+
+@given(network=st.from_type(Network), seed=st.integers(0, 1000), weight=st.sampled_from([None, 0.3]))
+def test_multipliers_of_one_start_bound_another(network: Network, seed: int, weight: float | None) -> None:
+    """``at`` is the bound itself at its own start, and nowhere less than what is solved there."""
+    network = certifiable(network, 0.2, pulls=False)
+    found = bound(network, service_weight=weight)
+    own = found.at()
+    assert own.shape == () and own == found.objective
+    rng = np.random.default_rng(seed)
+    starts = np.array([rng.uniform(*zip(*(n.initial for n in network.nodes), strict=True)) for _ in range(2)])
+    starts[1] *= rng.integers(2)
+    proved = found.at(starts)
+    solved = np.array([bound(network, start, service_weight=weight).objective for start in starts])
+    mass = starts.sum(axis=1).max() * network.objective.reference_interval
+    slack = 1e-6 * np.abs(solved).max() + 1e-9 * mass  # of the solver
+    assert (proved >= solved - slack).all()
+    together = envelope(network, starts, service_weight=weight)
+    assert (together.at(starts) >= solved - slack).all()
+    assert (together.at(starts) <= solved + slack).all()  # each start was solved
+
+
+def test_multipliers_of_one_level_bound_another() -> None:
+    """A bound for one demanded service proves one for each other: an affine function of the level, never too small."""
+    found = bound("carbo_net", min_service=0.9, horizon=12, degree=1)
+    levels = np.array([0.7, 0.8, 0.9, 0.95])
+    proved = found.at(None, levels)
+    assert proved[2] == found.objective
+    np.testing.assert_allclose(np.diff(proved[:3]), np.diff(proved[:3])[0], rtol=1e-6)
+    solved = [bound("carbo_net", min_service=level, horizon=12, degree=1).objective for level in levels.tolist()]
+    assert (proved >= np.array(solved) - 1e-6).all()
+    starts = np.tile(found.initial, (4, 1))
+    np.testing.assert_array_equal(found.at(starts, levels), proved)
+    assert found.at(starts[:, None], levels).shape == (4, 4)
+
+
+def test_few_solutions_bound_many_starts() -> None:
+    """Ten days of copper from 12 drawn starts: three solutions prove within 1 % of what twelve do."""
+    env = VectorEnv("copper_net", num_envs=12, horizon=40)
+    env.reset(seed=0)
+    starts = env.physical.stock[: len(env.network.nodes)].T
+    found = envelope("copper_net", starts, min_service=0.9, horizon=40, degree=1)
+    assert len(found.members) == 3
+    solved = [bound("copper_net", start, min_service=0.9, horizon=40, degree=1).objective for start in starts]
+    proved = found.at(starts)
+    assert (proved >= np.array(solved) - 1e-6).all()
+    np.testing.assert_allclose(proved, solved, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("initial", "level", "said"),
+    [
+        ([1.0, 2.0], None, "expected"),
+        ([[-1.0] * 6], None, "not negative"),
+        (None, 1.2, "must lie in"),
+    ],
+)
+def test_bad_starts(initial: list[float] | None, level: float | None, said: str) -> None:
+    """Starts and levels that cannot be used are named."""
+    found = bound("carbo_net", min_service=0.5, horizon=2, degree=1)
+    with pytest.raises(CirlError, match=said):
+        found.at(initial, level)
+
+
+def test_a_level_needs_a_bound_that_demands_one() -> None:
+    """A bound without demanded service has no multiplier for it."""
+    with pytest.raises(CirlError, match="demands no service"):
+        bound("carbo_net", horizon=2, degree=1).at(None, 0.9)
+
+
+@pytest.mark.parametrize(("starts", "solves", "said"), [([1.0], 3, "expected"), ([[1.0] * 6], 0, "solves")])
+def test_bad_envelopes(starts: list[float], solves: int, said: str) -> None:
+    """An envelope needs a row of stocks for each episode and at least one solution."""
+    with pytest.raises(CirlError, match=said):
+        envelope("carbo_net", starts, solves=solves)
 
 
 @pytest.mark.parametrize("name", ["copper_net", "carbo_net"])

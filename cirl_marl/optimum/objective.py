@@ -32,26 +32,26 @@ def measures(layout: Layout) -> Iterator[Row]:
 
 
 def circularity_weights(layout: Layout) -> Floats:
-    """Return the weights of λ̄ on the variables of one interval, shape (size,), mass."""
-    network, steps = layout.network, layout.network.episode.horizon
+    """Return the weights of the mean of λ over an interval on its variables, shape (size,), mass."""
+    network = layout.network
     weights = np.zeros(layout.size)
     counted = -network.objective.reference_interval * network.sustainability
     if network.objective.net_zero == "abs":
         counted = counted * ~network.environmental
-        weights[layout.imbalance] = -1.0 / steps
+        weights[layout.imbalance] = -1.0
     for i in layout.moments:
-        weights[layout.flow(i) : layout.valve(i)] = counted / (steps * len(layout.moments))
+        weights[layout.flow(i) : layout.valve(i)] = counted / len(layout.moments)
     return weights
 
 
 def objective(layout: Layout, service_weight: float | None) -> tuple[Floats, float]:
-    """Return the cost of every variable of an episode, and what the objective has beside −cᵀv."""
-    network, steps = layout.network, layout.network.episode.horizon
+    """Return the weights of the objective on the variables of an interval, and what it has beside them."""
+    network = layout.network
     weights, constant = circularity_weights(layout), 0.0
     if service_weight is not None:
         weights = weights / network.objective.circularity_scale
         if network.services:
-            weights[layout.level : layout.imbalance] = service_weight / (len(network.services) * steps)
+            weights[layout.level : layout.imbalance] = service_weight / len(network.services)
         else:
             constant = service_weight
-    return np.tile(-weights, steps), constant
+    return weights, constant

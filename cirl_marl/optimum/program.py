@@ -18,7 +18,7 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout, Link, Row, matrix_of, start_of
 from cirl_marl.optimum.monotone import falls
 from cirl_marl.optimum.objective import measures, objective
-from cirl_marl.optimum.reach import Reach
+from cirl_marl.optimum.reach import Comparison, Reach
 from cirl_marl.optimum.scheduled import deliveries, openings
 
 
@@ -49,48 +49,70 @@ class Program:
     high: Floats
 
 
-def program(
-    admissible: Admissible,
-    reached: Reach,
-    initial: Floats,
-    degree: int,
-    *,
-    service_weight: float | None,
-    min_service: float | None,
-) -> Program:
-    """Write down the program for one episode from ``initial``, shape (nodes,)."""
-    network, steps = admissible.network, admissible.network.episode.horizon
-    layout = _layout(admissible, reached, degree)
-    equal, under = _laws(admissible, layout)
-    first = np.zeros(layout.size)
-    first[layout.end(-1) : layout.level] = initial
-    matrix, equal_to = _chained(_balances(layout), equal, layout, first)
-    inequalities, under_to = _chained(
-        [*deliveries(admissible, layout), *falls(admissible, layout)], [*under, *measures(layout)], layout, first
-    )
-    opened, opened_to = openings(admissible, reached, layout)
-    inequalities, under_to = sparse.vstack([inequalities, opened], format="csr"), np.append(under_to, opened_to)
-    cost, constant = objective(layout, service_weight)
-    if min_service is not None and network.services:
-        level = np.zeros(layout.size)
-        level[layout.level : layout.imbalance] = -1.0 / (len(network.services) * steps)
-        inequalities = sparse.vstack([inequalities, sparse.csr_array(np.tile(level, steps)[None])], format="csr")
-        under_to = np.append(under_to, -min_service)
-    low, high = _box(admissible, reached, layout)
-    return Program(
-        layout=layout,
-        cost=cost,
-        constant=constant,
-        equal=matrix,
-        equal_to=equal_to,
-        under=inequalities,
-        under_to=under_to,
-        low=low,
-        high=high,
-    )
+class Programs:
+    """The programs of a network for every start, demanded service and part of an episode.
+
+    Attributes:
+        admissible: ranges of the flows.
+        layout: of the variables of an interval.
+    """
+
+    def __init__(self, admissible: Admissible, degree: int, service_weight: float | None) -> None:
+        """Write down what does not depend on the start.
+
+        Args:
+            admissible: ranges of the flows.
+            degree: d of the test polynomials.
+            service_weight: w of λ̄/circularity_scale + w·service; None if λ̄ is maximised.
+        """
+        self.admissible = admissible
+        self._comparison = Comparison(admissible)
+        self.layout = layout = _layout(admissible, self._comparison.substeps, degree)
+        equal, under = _laws(admissible, layout)
+        self._equal = _Chained(_balances(layout), equal, layout)
+        falling = [*deliveries(admissible, layout), *falls(admissible, layout)]
+        self._under = _Chained(falling, [*under, *measures(layout)], layout)
+        self._weights, self._constant = objective(layout, service_weight)
+
+    def program(self, initial: Floats, min_service: float | None = None, intervals: range | None = None) -> Program:
+        """Return the program from ``initial``, shape (nodes,), with at least the mean service level ``min_service``.
+
+        Args:
+            initial: stocks at the start, mass.
+            min_service: None if nothing is demanded.
+            intervals: of the episode, one after the other; None is all of them.
+
+        Raises:
+            NoCertificate: if recipients may pull more from a node than it holds.
+        """
+        layout, network = self.layout, self.admissible.network
+        when = range(network.episode.horizon) if intervals is None else intervals
+        steps = len(when)
+        reached = self._comparison.reach(initial, when)
+        equal, equal_to = self._equal.over(steps, initial)
+        under, under_to = self._under.over(steps, initial)
+        opened, opened_to = openings(self.admissible, reached, layout, when)
+        blocks, limits = [under, opened], [under_to, opened_to]
+        if min_service is not None and network.services:
+            level = np.zeros(layout.size)
+            level[layout.level : layout.imbalance] = -1.0 / (len(network.services) * steps)
+            blocks.append(sparse.csr_array(np.tile(level, steps)[None]))
+            limits.append(np.array([-min_service]))
+        low, high = _box(self.admissible, reached, layout, when)
+        return Program(
+            layout=layout,
+            cost=np.tile(-self._weights / steps, steps),
+            constant=self._constant,
+            equal=equal,
+            equal_to=equal_to,
+            under=sparse.vstack(blocks, format="csr"),
+            under_to=np.concatenate(limits),
+            low=low,
+            high=high,
+        )
 
 
-def _layout(admissible: Admissible, reached: Reach, degree: int) -> Layout:
+def _layout(admissible: Admissible, pieces: int, degree: int) -> Layout:
     network = admissible.network
     nodes = len(network.nodes)
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
@@ -98,30 +120,38 @@ def _layout(admissible: Admissible, reached: Reach, degree: int) -> Layout:
     movable = admissible.valve[0] < admissible.valve[1]
     openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
-    return Layout(network, reached.pieces, degree, valves, openings)
+    return Layout(network, pieces, degree, valves, openings)
 
 
-def _chained(linked: Sequence[Link], alone: Sequence[Row], layout: Layout, first: Floats) -> tuple[Any, Floats]:
-    """Repeat rows in every interval and link each interval to the one before; return the matrix and right-hand side.
+class _Chained:
+    """Rows that are repeated in every interval, some of which link it to the interval before."""
 
-    Args:
-        linked: pairs of rows on this interval's variables and on those of the one before.
-        alone: rows on this interval's variables.
-        layout: of an interval.
-        first: variables of the interval before the first, of which only the stocks at the end are used.
-    """
-    once, steps = sparse.identity(layout.network.episode.horizon), layout.network.episode.horizon
-    now, before = (matrix_of([link[side] for link in linked], layout) for side in (0, 1))
-    matrix = sparse.vstack(
-        [
-            sparse.kron(once, now) + sparse.kron(sparse.eye_array(steps, k=-1), before),
-            sparse.kron(once, matrix_of(alone, layout)),
-        ],
-        format="csr",
-    )
-    to = np.zeros(matrix.shape[0])
-    to[: len(linked)] = -(before @ first)
-    return matrix, to
+    def __init__(self, linked: Sequence[Link], alone: Sequence[Row], layout: Layout) -> None:
+        """Take the rows of an interval.
+
+        Args:
+            linked: pairs of rows on this interval's variables and on those of the one before, of which only the stocks
+                at the end are used.
+            alone: rows on this interval's variables.
+            layout: of an interval.
+        """
+        self._layout = layout
+        self._now, self._before = (matrix_of([link[side] for link in linked], layout) for side in (0, 1))
+        self._alone = matrix_of(alone, layout)
+        self._known: dict[int, Any] = {}
+
+    def over(self, steps: int, initial: Floats) -> tuple[Any, Floats]:
+        """Return the matrix over ``steps`` intervals, interval after interval, and the right-hand side."""
+        if steps not in self._known:
+            once, shifted = sparse.eye_array(steps), sparse.eye_array(steps, k=-1)
+            linked = sparse.kron(once, self._now) + sparse.kron(shifted, self._before)
+            self._known[steps] = sparse.vstack([linked, sparse.kron(once, self._alone)], format="csr")
+        layout, matrix = self._layout, self._known[steps]
+        first = np.zeros(layout.size)
+        first[layout.end(-1) : layout.level] = initial
+        to = np.zeros(matrix.shape[0])
+        to[: self._before.shape[0]] = -(self._before @ first)
+        return matrix, to
 
 
 def _balances(layout: Layout) -> list[Link]:
@@ -189,12 +219,12 @@ def _laws(admissible: Admissible, layout: Layout) -> tuple[list[Row], list[Row]]
     return equal, under
 
 
-def _box(admissible: Admissible, reached: Reach, layout: Layout) -> tuple[Floats, Floats]:
+def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: range) -> tuple[Floats, Floats]:
     """Return the lowest and highest value of every variable; all are finite, which makes every multiplier a bound."""
     network = admissible.network
-    low, high = np.zeros((2, network.episode.horizon, layout.size))
+    low, high = np.zeros((2, len(intervals), layout.size))
     scheduled = admissible.scheduled
-    rates = admissible.factor[:, None] * admissible.base
+    rates = admissible.factor[:, None] * admissible.base[intervals.start : intervals.stop]
     most = rates[1] * np.where(scheduled, 1.0, reached.upper[:, admissible.driver])
     least = np.where(scheduled & reached.uncut, rates[0], 0.0)
     for i in layout.moments:

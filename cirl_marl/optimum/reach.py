@@ -30,28 +30,22 @@ class Reach:
 
     Attributes:
         upper: bound of each stock within each interval, shape (steps, nodes), mass.
-        pieces: substeps of the simulator in an interval.
         uncut: whether the donor of each arc delivers all that is asked, whatever the actions, shape (steps, arcs).
     """
 
     upper: Floats
-    pieces: int
     uncut: NDArray[np.bool_]
 
 
-def reach(admissible: Admissible, initial: Floats) -> Reach:
-    """Bound the stocks from ``initial``, shape (nodes,), on.
+class Comparison:
+    """The comparison system, advanced by the substeps of the simulator, in which scheduled flows are constant.
 
-    Raises:
-        NoCertificate: if recipients may pull more from a node than it holds: the solver then departs from the laws.
+    Attributes:
+        substeps: of the simulator in an interval.
     """
-    return _Comparison(admissible).run(initial)
-
-
-class _Comparison:
-    """The comparison system, advanced by the substeps of the simulator, in which scheduled flows are constant."""
 
     def __init__(self, admissible: Admissible) -> None:
+        """Compile the system for the ranges of ``admissible``."""
         network = admissible.network
         self.admissible, self.network = admissible, network
         dynamics = Dynamics(network)
@@ -80,16 +74,21 @@ class _Comparison:
         turned_over = self.outgoing @ (high * (driven & ~self.pulled)) * self.substep
         self.share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(nodes), where=turned_over > ROUNDING)
 
-    def run(self, initial: Floats) -> Reach:
+    def reach(self, initial: Floats, intervals: range) -> Reach:
+        """Bound the stocks from ``initial``, shape (nodes,), on, over the given intervals of the episode.
+
+        Raises:
+            NoCertificate: if recipients may pull more from a node than it holds: the solver then departs from the laws.
+        """
         network, scheduled = self.network, self.admissible.scheduled
-        nodes, steps = len(network.nodes), network.episode.horizon
+        nodes, steps = len(network.nodes), len(intervals)
         mass = float(initial.sum()) * (1 + ROUNDING)
         lower, upper = initial.copy(), initial.copy()
         highest = np.zeros((steps, nodes))
         uncut = np.ones((steps, len(network.arcs)), dtype=bool)
         pulled_from = self.outgoing @ self.pulled > 0
-        for step in range(steps):
-            least, most = np.where(scheduled, self.admissible.rate(step), 0.0)
+        for step, interval in enumerate(intervals):
+            least, most = np.where(scheduled, self.admissible.rate(interval), 0.0)
             for _ in range(self.substeps):
                 # without any outflow no stock ends a substep lower than it began, so this bounds it throughout
                 peak = np.minimum(self.growth @ upper + self.surge @ (self.incoming @ most), mass) * (1 + ROUNDING)
@@ -100,7 +99,7 @@ class _Comparison:
                     node = network.nodes[int((pulled_from & ~enough).argmax())].id
                     raise NoCertificate(
                         f"network '{network.name}': recipients may pull more from node '{node}' than it holds in "
-                        f"interval {step}; no bound is proved for what the solver then does"
+                        f"interval {interval}; no bound is proved for what the solver then does"
                     )
                 delivered = enough[network.donors]
                 uncut[step] &= delivered
@@ -114,7 +113,7 @@ class _Comparison:
                 bounds = self.solution @ np.concatenate([lower, upper]) + self.response @ constant
                 lower = np.maximum(bounds[:nodes] - mass * ROUND_OFF, 0.0)
                 upper = np.minimum(bounds[nodes:] + mass * ROUND_OFF, mass)
-        return Reach(highest, self.substeps, uncut)
+        return Reach(highest, uncut)
 
 
 def _held(matrix: Floats, interval: float) -> tuple[Floats, Floats]:

@@ -34,20 +34,23 @@ def deliveries(admissible: Admissible, layout: Layout) -> list[Link]:
     return links
 
 
-def openings(admissible: Admissible, reached: Reach, layout: Layout) -> tuple[Any, Floats]:
+def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: range) -> tuple[Any, Floats]:
     """Return the rows, and their right-hand sides, of valves that act on stock-driven and on scheduled outflows.
 
     A scheduled flow is at most ū·v. With v ≤ v̄ and X ≤ x̄, (v̄ − v)(x̄ − X) ≥ 0 gives v̄ X + x̄ v − Z ≤ v̄ x̄, and
     (v − v̲)(x̄ − X) ≥ 0 gives Z − v̲ X − x̄ v ≤ −v̲ x̄ (McCormick 1976).
     """
-    network, steps = admissible.network, admissible.network.episode.horizon
-    blocks, limits = [sparse.csr_array((0, steps * layout.size))], [np.zeros(0)]
+    network, steps = admissible.network, len(intervals)
+    fixed: list[Row] = []
+    columns: list[int] = []
+    weights, limits = [np.zeros((steps, 0))], [np.zeros((steps, 0))]
 
     def hold(row: Row, opening: int, weight: Floats, to: Floats) -> None:
         """Hold row + weight_t·v ≤ to_t in each interval t."""
-        fixed, moving = matrix_of([row], layout), matrix_of([[(opening, 1.0)]], layout)
-        blocks.append(sparse.kron(sparse.identity(steps), fixed) + sparse.kron(sparse.diags_array(weight), moving))
-        limits.append(to)
+        fixed.append(row)
+        columns.append(opening)
+        weights.append(weight[:, None])
+        limits.append(to[:, None])
 
     for place, node in enumerate(layout.openings):
         opening, z = layout.opening + place, int(np.flatnonzero(layout.valves == node)[0])
@@ -58,7 +61,14 @@ def openings(admissible: Admissible, reached: Reach, layout: Layout) -> tuple[An
             hold([(stock, high), (through, -1.0)], opening, most, high * most)
             hold([(through, 1.0), (stock, -low)], opening, -most, -low * most)
         for k in np.flatnonzero(admissible.scheduled & (network.donors == node)):
+            capacity = admissible.own[1, k] * admissible.base[intervals.start : intervals.stop, k]
             for piece in range(layout.pieces):
                 flow = layout.flow(piece * (layout.degree + 1)) + int(k)
-                hold([(flow, 1.0)], opening, -admissible.own[1, k] * admissible.base[:, k], np.zeros(steps))
-    return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
+                hold([(flow, 1.0)], opening, -capacity, np.zeros(steps))
+    varying = np.concatenate(weights, axis=1)
+    entries = layout.size * np.arange(steps)[:, None] + np.array(columns, dtype=np.intp)
+    shape = (varying.size, steps * layout.size)
+    moving = sparse.csr_array((varying.ravel(), (np.arange(varying.size), entries.ravel())), shape=shape)
+    return sparse.kron(sparse.eye_array(steps), matrix_of(fixed, layout), format="csr") + moving, np.concatenate(
+        limits, axis=1
+    ).ravel()

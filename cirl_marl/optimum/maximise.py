@@ -1,0 +1,222 @@
+"""The best circularity that any admissible actions can reach over an episode: the programs and their solution."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cirl_marl.catalogue import load_network
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network import Floats, Network
+from cirl_marl.optimum.actions import normalised_actions
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.bound import Bound, Envelope, check_service, check_stocks
+from cirl_marl.optimum.certificate import verified
+from cirl_marl.optimum.objective import circularity_weights
+from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.solver import Basis, Infeasible, solve
+
+DEGREE = 2
+"""Degree of the test polynomials; docs/bound.md has the gap against it."""
+
+
+def bound(
+    network: str | Path | Network,
+    initial: Mapping[str, float] | ArrayLike | None = None,
+    *,
+    service_weight: float | None = None,
+    min_service: float | None = None,
+    agents: Sequence[str] | None = None,
+    scenario: str | None = None,
+    horizon: int | None = None,
+    degree: int = DEGREE,
+) -> Bound:
+    """Bound what any admissible actions can reach over one episode in the simulator.
+
+    Without options the bound is on λ̄; with ``min_service`` on λ̄ of episodes with at least that mean service level; with
+    ``service_weight`` w on λ̄/circularity_scale + w·(mean service level). It holds for open and closed loops, whatever
+    they know, and for the simulator as it is: exact zero-order hold, flows cut to what their donors hold
+    (docs/bound.md). Of a service with a finite upper end of its band the lower end alone counts, so the bound holds but
+    may be loose.
+
+    Args:
+        network: catalogue name, path of a definition file, or a network.
+        initial: stocks at the start: node → stock, the rest in the middle of their ranges; or shape (nodes,). None: all
+            in the middle.
+        service_weight: w ≥ 0; excludes ``min_service``.
+        min_service: in [0, 1].
+        agents: who acts; None is the network's own choice.
+        scenario: scenario of the definition; None is the default.
+        horizon: decisions per episode; None takes the definition's.
+        degree: degree of the test polynomials, 1 or more; higher is tighter and slower.
+
+    Raises:
+        NoCertificate: for a network whose flows are not linear laws: inner physics, batches, inexact solvers.
+        CirlError: for input that cannot be used, a service that no plan reaches, or a solver that fails.
+    """
+    check_options(service_weight, min_service, degree)
+    admissible = Admissible.of(_found(network, scenario, horizon), agents)
+    start = starting_stocks(admissible.network, initial)
+    return _bounded(Programs(admissible, degree, service_weight), start, service_weight, min_service)
+
+
+def envelope(
+    network: str | Path | Network,
+    initial: ArrayLike,
+    *,
+    solves: int = 3,
+    service_weight: float | None = None,
+    min_service: ArrayLike | None = None,
+    agents: Sequence[str] | None = None,
+    scenario: str | None = None,
+    horizon: int | None = None,
+    degree: int = DEGREE,
+) -> Envelope:
+    """Bound the objective from many starts with a few solutions.
+
+    The first is for the mean of the starts, each further one for the start where those before prove least: the best
+    objective is a nearly concave function of the start, so what is proved from elsewhere is weakest where it is worst.
+
+    Args:
+        network: see ``bound``.
+        initial: stocks at the starts, shape (episodes, nodes), mass.
+        solves: how many programs to solve, at most 1 + episodes.
+        service_weight: see ``bound``.
+        min_service: in [0, 1], one for all episodes or one for each, shape (episodes,).
+        agents: see ``bound``.
+        scenario: see ``bound``.
+        horizon: see ``bound``.
+        degree: see ``bound``.
+
+    Raises:
+        NoCertificate: see ``bound``.
+        CirlError: see ``bound``.
+    """
+    if not isinstance(solves, int | np.integer) or isinstance(solves, bool) or solves < 1:
+        raise CirlError(f"solves must be a whole number of at least 1, got {solves!r}")
+    admissible = Admissible.of(_found(network, scenario, horizon), agents)
+    nodes = len(admissible.network.nodes)
+    starts = np.asarray(initial, dtype=float)
+    if starts.ndim != 2 or starts.shape[1] != nodes or not len(starts):
+        raise CirlError(f"initial has shape {starts.shape}, expected (episodes, {nodes})")
+    levels = None if min_service is None else np.broadcast_to(np.asarray(min_service, dtype=float), len(starts))
+
+    check_options(service_weight, None if levels is None else float(levels[0]), degree)
+    programs = Programs(admissible, degree, service_weight)
+
+    def solved(start: Floats, level: float | None, basis: Basis | None) -> Bound:
+        check_options(service_weight, level, degree)
+        check_stocks(admissible.network, start)
+        return _bounded(programs, start, service_weight, level, basis)
+
+    first = solved(starts.mean(axis=0), None if levels is None else float(levels.mean()), None)
+    found, open_ = Envelope((first,)), np.ones(len(starts), dtype=bool)
+    for _ in range(min(solves - 1, len(starts))):
+        worst = int(np.where(open_, found.at(starts, levels), np.inf).argmin())
+        open_[worst] = False
+        level = None if levels is None else float(levels[worst])
+        found = Envelope((*found.members, solved(starts[worst], level, first.basis)))
+    return found
+
+
+def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike | None) -> Floats:
+    """Return the stocks that ``initial`` describes (see ``bound``), shape (nodes,), mass.
+
+    Raises:
+        CirlError: for an unknown node, a wrong shape, or a stock that is negative or not finite.
+    """
+    start = np.array([sum(node.initial) / 2 for node in network.nodes])
+    if isinstance(initial, Mapping):
+        for node, stock in initial.items():
+            if node not in network.node_index:
+                raise CirlError(f"initial: {unknown('node', node, network.node_index)}")
+            start[network.node_index[node]] = stock
+    elif initial is not None:
+        given = np.asarray(initial, dtype=float)
+        if given.shape != start.shape:
+            raise CirlError(f"initial has shape {given.shape}, expected {start.shape}")
+        start = given.copy()
+    check_stocks(network, start)
+    return start
+
+
+def check_options(service_weight: float | None, min_service: float | None, degree: int) -> None:
+    """Refuse options of ``bound`` that cannot be used.
+
+    Raises:
+        CirlError: naming the option and its value.
+    """
+    if service_weight is not None and min_service is not None:
+        raise CirlError("service_weight and min_service are two ways to ask for service: give one of them")
+    if service_weight is not None and not 0 <= service_weight < math.inf:
+        raise CirlError(f"service_weight {service_weight!r} must be finite and not negative")
+    if min_service is not None:
+        check_service(min_service)
+    if not isinstance(degree, int | np.integer) or isinstance(degree, bool) or degree < 1:
+        raise CirlError(f"degree must be a whole number of at least 1, got {degree!r}")
+
+
+def _found(network: str | Path | Network, scenario: str | None, horizon: int | None) -> Network:
+    found = load_network(network) if isinstance(network, str | Path) else network
+    found = found.scenario(scenario)
+    return found if horizon is None else found.with_options(episode={"horizon": horizon})
+
+
+def _bounded(
+    programs: Programs,
+    start: Floats,
+    service_weight: float | None,
+    min_service: float | None,
+    basis: Basis | None = None,
+) -> Bound:
+    admissible, layout = programs.admissible, programs.layout
+    problem = programs.program(start, min_service)
+    try:
+        solution = solve(problem, basis)
+    except Infeasible:
+        raise CirlError(_unreachable(problem, min_service)) from None
+    proof = verified(problem, solution.certificate, solution.plan)
+    planned = solution.plan.reshape(-1, layout.size)
+    circularity = planned @ circularity_weights(layout)
+    levels = planned[:, layout.level : layout.imbalance]
+    return Bound(
+        network=admissible.network,
+        agents=admissible.agents,
+        initial=start,
+        objective=proof.bound,
+        value=proof.bound if service_weight is None else float(circularity.mean()),
+        service=float(levels.mean()) if levels.size else 1.0,
+        service_weight=service_weight,
+        min_service=min_service,
+        degree=layout.degree,
+        circularity=circularity,
+        stock=np.concatenate([start[None], planned[:, layout.end(-1) : layout.level]]),
+        flow=layout.means(planned)[1],
+        actions=normalised_actions(admissible, layout, planned),
+        problem=problem,
+        solution=solution.plan,
+        certificate=solution.certificate,
+        basis=solution.basis,
+    )
+
+
+def _unreachable(problem: Program, min_service: float | None) -> str:
+    """Say what is wrong with a program without solution: the service demanded, with the highest that can be had."""
+    layout = problem.layout
+    network = layout.network
+    if min_service is None:
+        return f"network '{network.name}': HiGHS calls the program infeasible, though neutral control solves it"
+    rows = len(problem.under_to) - 1
+    cost = np.zeros((network.episode.horizon, layout.size))
+    cost[:, layout.level : layout.imbalance] = -1.0 / cost[:, layout.level : layout.imbalance].size
+    most = replace(
+        problem, cost=cost.ravel(), constant=0.0, under=problem.under[:rows], under_to=problem.under_to[:rows]
+    )
+    solution = solve(most)
+    highest = verified(most, solution.certificate, solution.plan).bound
+    return f"network '{network.name}': no actions reach a mean service level of {min_service}; at most {highest:.6g}"
