@@ -239,7 +239,7 @@ class Observation:
 
 SOLVERS = ("exact", "rk4", "euler")
 NET_ZERO = ("signed", "abs")
-REWARDS = ("local", "circularity", "mixed", "difference", "mixed_difference", "local_sum")
+REWARDS = ("local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team")
 OBSERVE = ("local", "neighbours", "full", "stocks", "model")
 QUANTITIES = ("stock", "outflow", "flow", "measure")
 SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})

@@ -54,6 +54,9 @@ class Scoring:
         sums = self._everyone.column_sums()
         counted = np.flatnonzero(sums)
         self._all = RowSum(np.zeros(len(counted), dtype=np.intp), counted, sums[counted], (1, terms))
+        self._weighted_shortfall = RowSum(
+            [0] * len(services), range(len(services)), [s.weight for s in services], (1, len(services))
+        )
         self._sum_of_levels = RowSum(
             [0] * len(services), range(len(services)), [1.0] * len(services), (1, len(services))
         )
@@ -91,6 +94,11 @@ class Scoring:
     def local_sum(self, terms: Floats) -> Floats:
         """Return the sum of the local rewards of all compartments, shape (B,)."""
         total: Floats = self._all(terms)[0]
+        return total
+
+    def shortfall(self, levels: Floats) -> Floats:
+        """Return Σ_s weight_s · (1 − level_s), shape (B,)."""
+        total: Floats = self._weighted_shortfall(1.0 - levels)[0]
         return total
 
     def service_level(self, levels: Floats) -> Floats:

@@ -170,7 +170,7 @@ class ObjectiveTable(Table):
 
     reference_interval: Quantity = Field(description="the interval Δ of λ = -(m_fb + Δ·ṁ_fc)")
     net_zero: Literal["signed", "abs"]
-    reward: Literal["local", "circularity", "mixed", "difference", "mixed_difference", "local_sum"]
+    reward: Literal["local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team"]
     circularity_scale: Quantity
     circularity_weight: Quantity
     tracked: list[str] = Field(

@@ -6,7 +6,6 @@ Every other view (PettingZoo, Gymnasium, the seats of the learners) stands on th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.actuators import Actuators
 from cirl_marl.catalogue import load_network
+from cirl_marl.credit import Credit
 from cirl_marl.elements import REWARDS
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
@@ -25,8 +25,6 @@ from cirl_marl.starts import Starts
 from cirl_marl.state import Outcome, Snapshot, State
 
 Infos = dict[str, dict[str, Any]]
-COUNTERFACTUAL_CELLS = 4_000_000
-"""Largest number of stocks that difference rewards re-simulate at once."""
 
 
 class VectorEnv:
@@ -39,7 +37,7 @@ class VectorEnv:
     Attributes:
         network: the network under the chosen scenario.
         agents: compartments that act, in the order of every stacked array.
-        reward_mode: one of ``local``, ``circularity``, ``mixed``, ``difference``, ``mixed_difference``, ``local_sum``.
+        reward_mode: one of those of ``credit.Credit``.
         observation_spaces: by agent.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
@@ -83,13 +81,14 @@ class VectorEnv:
         self.network = found
         self.num_envs = num_envs
         self.reward_mode = _choice("reward", found.objective.reward if reward is None else reward, REWARDS)
-        self._team = _choice("circularity", circularity, ("end", "mean"))
+        measure = _choice("circularity", circularity, ("end", "mean"))
         self.dynamics = Dynamics(found)
         self._actuators = Actuators(self.dynamics, agents, num_envs)
         self.agents = self._actuators.agents
         self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
         self.scoring = Scoring(found, self.layout, self.agents, num_envs)
+        self._credit = Credit(self.dynamics, self.scoring, self.agents, self.reward_mode, measure)
         self.observation_spaces = self.layout.spaces
         self._starts = Starts(found, self.dynamics, num_envs, self.layout.array_order)
         self.state_names = (*self._starts.names, *self.dynamics.batches.names)
@@ -188,9 +187,8 @@ class VectorEnv:
         service = self.scoring.service_level(levels)
         terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
         local = self.scoring.local(terms)
-        circularity, mean, batched = self._circularity(state, transition, flow)
-        team = circularity if self._team == "end" else mean
-        reward = self._reward(team, local, terms, state, controls)
+        circularity, mean, batched = self._credit.circularity(state, transition, flow)
+        reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
         self._state = State(
             transition.stock, transition.inner, flow, step, batched, state.circularity + mean, state.service + service
@@ -198,18 +196,6 @@ class VectorEnv:
         observation = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
-
-    def _circularity(self, state: State, transition: Transition, flow: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return λ at the end of the interval, its mean over the interval, and m_fb, shape (B,) each, mass.
-
-        Batches that leave at the start of the interval count in its mean, those of its end do not.
-        """
-        network = self.network
-        if transition.batched is None:
-            return network.circularity(transition.flow), network.circularity(flow), state.batched
-        during = state.batched + transition.batched[0]
-        after = during + transition.batched[1]
-        return network.circularity(transition.flow, after), network.circularity(flow, during), after
 
     def local_rewards(self) -> dict[str, Floats]:
         """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
@@ -274,46 +260,6 @@ class VectorEnv:
             if agent in infos:
                 infos[agent]["success"] = success
         return infos
-
-    def _reward(self, team: Floats, local: Floats, terms: Floats, state: State, controls: Floats) -> Floats:
-        objective = self.network.objective
-        if self.reward_mode == "local":
-            return local.copy()
-        if self.reward_mode in ("difference", "mixed_difference"):
-            team = team - self._counterfactuals(state, controls)
-        if self.reward_mode in ("mixed", "mixed_difference"):
-            shared = team * (objective.circularity_weight / objective.circularity_scale)
-            mixed: Floats = local * (1.0 - objective.circularity_weight)
-            mixed += shared
-            return mixed
-        if self.reward_mode == "difference":
-            return team
-        common = team if self.reward_mode == "circularity" else self.scoring.local_sum(terms)
-        return np.repeat(common[None], len(self.agents), axis=0)
-
-    def _counterfactuals(self, state: State, controls: Floats) -> Floats:
-        """λ had each agent in turn been neutral, re-simulated from the same state, shape (agents, B)."""
-        dynamics, batch = self.dynamics, self.num_envs
-        chunk = max(1, COUNTERFACTUAL_CELLS // (state.stock.size + state.inner.size))
-        results = []
-        for start in range(0, len(self.agents), chunk):
-            agents = self.agents[start : start + chunk]
-            count = len(agents)
-            imagined = np.tile(controls, (1, count))
-            for i, agent in enumerate(agents):
-                rows = self.network.control_rows[agent]
-                imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows, None]
-            transition = dynamics.advance(
-                np.tile(state.stock, (1, count)),
-                np.tile(state.inner, (1, count)),
-                imagined,
-                np.tile(state.step, count),
-            )
-            imagined_state = replace(state, batched=np.tile(state.batched, count))
-            flow = transition.moved / self.network.episode.control_interval
-            end, mean, _ = self._circularity(imagined_state, transition, flow)
-            results.append((end if self._team == "end" else mean).reshape(count, batch))
-        return np.concatenate(results)
 
     def _report_ends(self, infos: Infos, outcome: Outcome) -> None:
         """Add the final observations and the episode's λ̄ and service level of the copies that ended."""

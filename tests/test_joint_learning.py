@@ -21,7 +21,7 @@ from cirl_marl.evaluate import rollout
 from cirl_marl.learners import load_recipe, train
 from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.lockstep import Lockstep
-from cirl_marl.learners.recipe import Learner, Match, Recipe, Run
+from cirl_marl.learners.recipe import Learner, Match, Normalisation, Recipe, Run
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, WithState, unseen_state
 
@@ -30,6 +30,7 @@ with warnings.catch_warnings():
     from supersuit import agent_indicator_v0, pad_action_space_v0, pad_observations_v0
 
 SMALL: dict[str, Any] = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
+NOTHING = Normalisation(observation=False, reward=False)
 JOINT_RECIPES = ["shared_ppo", "joint_ppo", "joint_sac", "mappo", "difference_ppo"]
 
 
@@ -119,6 +120,20 @@ def test_mixed_difference_reward() -> None:
     for mixed, alone in zip(got["mixed_difference"], got["difference"], strict=True):
         expected = weight / objective.circularity_scale * alone.reward + (1 - weight) * alone.local
         np.testing.assert_allclose(mixed.reward, expected, rtol=1e-12)
+
+
+def test_team_reward() -> None:
+    """w·λ/scale − (1 − w)·Σ weight·shortfall, the same for everyone; both services of carbo_net weigh 10."""
+    env = vector_env("carbo_net", num_envs=2, reward="team", circularity="mean")
+    env.reset(seed=3)
+    rng, objective = np.random.default_rng(0), env.network.objective
+    assert {service.weight for service in env.network.services} == {10.0}
+    for _ in range(5):
+        outcome = env.advance(rng.uniform(-1, 1, (len(env.agents), 2)))
+        shortfall = 10.0 * 2 * (1 - outcome.service_level)
+        weight = objective.circularity_weight
+        expected = weight * outcome.circularity_mean / objective.circularity_scale - (1 - weight) * shortfall
+        np.testing.assert_allclose(outcome.reward, np.tile(expected, (len(env.agents), 1)), rtol=1e-12)
 
 
 def small(learner: Learner, **options: Any) -> Recipe:
@@ -298,3 +313,15 @@ def test_central_critic_needs_what_it_needs(tmp_path: Path) -> None:
         path.write_text(changed)
         with pytest.raises(DefinitionError, match=said):
             load_recipe(path)
+
+
+def test_time_limit_may_be_the_end() -> None:
+    """Without bootstrap the last step's reward stands alone; with it the value of what comes next is added."""
+    paid = {}
+    for bootstrap in (True, False):
+        spec = Learner(scheme="joint", algorithm="PPO", parameters=SMALL, bootstrap=bootstrap)
+        training = train("carbo_net", small(spec.model_copy(update={"normalise": NOTHING})), horizon=8, steps=16)
+        model: Any = training.trainees["joint-learner"].model
+        paid[bootstrap] = model.rollout_buffer.rewards.copy()
+    np.testing.assert_array_equal(paid[True][:-1], paid[False][:-1])
+    assert (paid[True][-1] != paid[False][-1]).all()

@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
-from stable_baselines3.common.utils import get_linear_fn
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from cirl_marl.errors import RecipeError, unknown
@@ -121,7 +121,7 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
     arguments = copy.deepcopy(dict(parameters))  # the library writes into policy_kwargs
     rate = arguments.get("learning_rate")
     if isinstance(rate, Mapping):
-        arguments["learning_rate"] = get_linear_fn(rate["linear_from"], rate["linear_to"], 1.0)
+        arguments["learning_rate"] = LinearSchedule(rate["linear_from"], rate["linear_to"], 1.0)
     noise = arguments.get("action_noise")
     if noise is not None:
         mean = np.zeros(env.action_space.shape or (1,))

@@ -56,6 +56,9 @@ class Learner(_Table):
     )
     parameters: dict[str, Any] = {}
     normalise: Normalisation = Normalisation()
+    bootstrap: bool = Field(
+        True, description="whether the learner expects more to come after a time limit; if not, the episode is all"
+    )
     share_of_steps: Annotated[float, Field(gt=0, le=1)] = Field(
         1.0, description="share of the run during which the agent learns; after it, it only acts"
     )

@@ -55,15 +55,16 @@ class AgentView(CopyView):
 class Seat(VecEnv):
     """The B copies of the joint environment as one learner sees them.
 
-    Time limits reach the learner as Stable-Baselines3 expects them: ``done`` with ``TimeLimit.truncated`` and the true
-    last observation in ``terminal_observation``. A ``reset`` while the joint episode runs (ARS asks for one) cannot
-    stop the others: it returns the current observation.
+    Time limits reach the learner as Stable-Baselines3 expects them: ``done`` with ``TimeLimit.truncated`` (unless
+    nothing counts for it beyond the episode) and the true last observation in ``terminal_observation``. A ``reset``
+    while the joint episode runs (ARS asks for one) cannot stop the others: it returns the current observation.
 
     Attributes:
         name: of the learner; an independent learner has its agent's.
         view: what it sees of the environment.
         latest: the observation that it acts on next, one row for each row of its view.
         action: what it last did.
+        bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
     """
 
     def __init__(self, env: VectorEnv, name: str, view: View, exchange: Callable[[Seat], VecEnvStepReturn]) -> None:
@@ -72,6 +73,7 @@ class Seat(VecEnv):
         self.view = view
         self.latest: Observation | None = None
         self.action: NDArray[np.float32] | None = None
+        self.bootstrap = True
         self.copies = env.num_envs
         copies = range(self.copies)
         self.views: list[CopyView] = [AgentView(env, i, agent) for agent in view.row_agents for i in copies]
@@ -107,7 +109,7 @@ class Seat(VecEnv):
             scores = self.view.score(returns)
             for row in np.flatnonzero(ended):
                 infos[row] = {
-                    "TimeLimit.truncated": True,
+                    "TimeLimit.truncated": self.bootstrap,
                     "terminal_observation": _row(final, int(row)),
                     "episode": {"r": float(scores[row]), "l": int(lengths[row % self.copies]), "t": 0.0},
                 }

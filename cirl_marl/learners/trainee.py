@@ -55,6 +55,7 @@ class Trainee:
         self.name = seat.name
         self.spec = spec
         self.seat = seat
+        seat.bootstrap = spec.bootstrap
         self._seed = derived_seed(seed, seat.name)
         noisy = spec.parameters.get("action_noise") is not None
         self.streams = Streams(self._seed, keep_gaussian=noisy)
