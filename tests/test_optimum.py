@@ -34,7 +34,9 @@ from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved,
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verified
 from cirl_marl.optimum.maximise import starting_stocks
+from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.reach import Comparison
+from cirl_marl.optimum.solver import solve
 
 Floats = NDArray[np.float64]
 COPIES = 48
@@ -261,6 +263,16 @@ def test_exogenous_series_that_is_cut_still_bounds() -> None:
     run = rollout(VectorEnv(small([RESERVE, USE], [arc]), num_envs=1), Neutral())
     assert run.episode_circularity[0] == pytest.approx(-100 / 4, rel=1e-9)
     assert run.episode_circularity[0] <= found.objective <= 0
+
+
+def test_controls_held_to_first_order_lie_below_the_bound() -> None:
+    """Rows that hold the controls within an interval can only lower the optimum, and neutral control satisfies them."""
+    admissible = Admissible.of(load_network("copper_net").with_options(episode={"horizon": 8}))
+    start = starting_stocks(admissible.network, None)
+    free, held = (Programs(admissible, 2, None, held=each).program(start) for each in (False, True))
+    best, planned = (-float(problem.cost @ solve(problem).plan) for problem in (free, held))
+    neutral = rollout(VectorEnv("copper_net", num_envs=1, horizon=8), Neutral()).episode_circularity[0]
+    assert neutral < planned <= best + 1e-9
 
 
 def test_gap_falls_with_the_degree() -> None:

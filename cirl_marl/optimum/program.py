@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from cirl_marl.network import Floats
+from cirl_marl.flows import FlowLaws
+from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout, Link, Row, matrix_of, start_of
 from cirl_marl.optimum.monotone import falls
@@ -48,6 +49,11 @@ class Program:
     low: Floats
     high: Floats
 
+    def interval_of_rows(self, matrix: Any) -> Integers:
+        """Return the last interval whose variables each row of A or G is about, shape (rows,)."""
+        intervals: Integers = np.maximum.reduceat(matrix.indices, matrix.indptr[:-1]) // self.layout.size
+        return intervals
+
 
 class Programs:
     """The programs of a network for every start, demanded service and part of an episode.
@@ -57,18 +63,24 @@ class Programs:
         layout: of the variables of an interval.
     """
 
-    def __init__(self, admissible: Admissible, degree: int, service_weight: float | None) -> None:
+    def __init__(
+        self, admissible: Admissible, degree: int, service_weight: float | None, *, held: bool = False
+    ) -> None:
         """Write down what does not depend on the start.
 
         Args:
             admissible: ranges of the flows.
             degree: d of the test polynomials.
             service_weight: w of λ̄/circularity_scale + w·service; None if λ̄ is maximised.
+            held: whether controls are constant within an interval to first order; the program then makes better plans
+                and bounds nothing.
         """
         self.admissible = admissible
         self._comparison = Comparison(admissible)
         self.layout = layout = _layout(admissible, self._comparison.substeps, degree)
         equal, under = _laws(admissible, layout)
+        if held:
+            equal += _held(admissible, layout)
         self._equal = _Chained(_balances(layout), equal, layout)
         falling = [*deliveries(admissible, layout), *falls(admissible, layout)]
         self._under = _Chained(falling, [*under, *measures(layout)], layout)
@@ -217,6 +229,27 @@ def _laws(admissible: Admissible, layout: Layout) -> tuple[list[Row], list[Row]]
             column = layout.valve(i) + position[donor] if through_valve else layout.stock(i) + driver
             hold(layout.flow(i) + int(k), column, *(factor * admissible.base[0, k]))
     return equal, under
+
+
+def _held(admissible: Admissible, layout: Layout) -> list[Row]:
+    """Return F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z.
+
+    For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.
+    """
+    network = admissible.network
+    neutral = FlowLaws(network)
+    rate = neutral.rate(neutral.neutral[:, None])[:, 0]
+    free = ~admissible.scheduled & (admissible.factor[0] < admissible.factor[1])
+    pairs = [(layout.flow, int(k), int(admissible.driver[k]), float(rate[k])) for k in np.flatnonzero(free)]
+    for z, node in enumerate(layout.valves):
+        control = network.nodes[node].control
+        assert control is not None
+        pairs.append((layout.valve, z, int(node), control.neutral))
+    return [
+        [(first(i) + place, 1.0), (first(i - 1) + place, -1.0), (layout.stock(i) + p, -r), (layout.stock(i - 1) + p, r)]
+        for i in layout.moments[1:]
+        for first, place, p, r in pairs
+    ]
 
 
 def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: range) -> tuple[Floats, Floats]:

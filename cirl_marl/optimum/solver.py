@@ -20,13 +20,17 @@ STATUS = tuple(highspy.HighsBasisStatus(i) for i in range(len(highspy.HighsBasis
 """HiGHS's basis statuses by their numbers."""
 
 
+WARM_ITERATIONS = 2000
+"""Simplex iterations from a given basis after which interior points, which need none, are the faster way."""
+
+
 class Infeasible(CirlError):
     """A program without solution; as every variable is bounded, HiGHS's 'unbounded or infeasible' means the same."""
 
 
 @dataclass(frozen=True, slots=True)
 class Basis:
-    """Which variables and rows are basic, and at which bound the others are; HiGHS completes one that does not fit.
+    """Which variables and rows are basic, and at which bound the others are; HiGHS completes one that is too small.
 
     Attributes:
         columns: status of each variable, as HiGHS counts them, shape (columns,).
@@ -35,6 +39,11 @@ class Basis:
 
     columns: Integers
     rows: Integers
+
+    def without_first(self, problem: Program, intervals: int) -> Basis:
+        """Return what is left of the basis of ``problem`` for the program without its first ``intervals``."""
+        rows = np.concatenate([problem.interval_of_rows(matrix) for matrix in (problem.equal, problem.under)])
+        return Basis(self.columns[intervals * problem.layout.size :], self.rows[rows >= intervals])
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +77,10 @@ def solve(problem: Program, basis: Basis | None = None) -> Solution:
     highs.passModel(_model(problem, scale))
     if basis is not None:
         highs.setBasis(_highs_basis(basis))
+        highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
     highs.run()
+    if highs.getModelStatus() == highspy.HighsModelStatus.kIterationLimit:
+        return solve(problem)
     if basis is None and highs.getModelStatus() != highspy.HighsModelStatus.kOptimal:
         highs.setOptionValue("solver", "simplex")  # slower and steadier
         highs.clearSolver()

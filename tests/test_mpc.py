@@ -1,0 +1,169 @@
+"""Model predictive control against closed forms, the open-loop plan and the bound."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Control,
+    ControlError,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    Node,
+    Role,
+    Service,
+    VectorEnv,
+)
+from cirl_marl.controllers.mpc import MPC
+from cirl_marl.evaluate import rollout
+from cirl_marl.optimum import NoCertificate, Plan, bound, envelope
+
+RESERVE = Node(id="reserve", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0))
+USE = Node(id="use", initial=(10.0, 10.0))
+TIP = Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0))
+VALVE = Control(kind=ControlKind.RATE, low=0.5, neutral=2.0, high=2.0)
+ORDER = Control(kind=ControlKind.FLOW, low=0.0, neutral=9.0, high=9.0)
+EXTRACTION = Arc(id="extraction", donor="reserve", recipient="use", law=Law.CONTROLLED, control=ORDER)
+LOSS = Arc(id="loss", donor="use", recipient="tip", rate=0.3)
+SERVED = Service(id="served", provider="use", quantity="stock", low=10.0)
+
+
+def in_use(stock: float = 10.0, horizon: int = 8) -> Network:
+    """Return a network that mines for a stock in use that decays: reserve → use → tip, intervals of 0.5, Δ = 1."""
+    use = replace(USE, initial=(stock, stock))
+    episode = Episode(control_interval=0.5, horizon=horizon)
+    return Network(
+        name="in_use", nodes=(RESERVE, use, TIP), arcs=(EXTRACTION, LOSS), services=(SERVED,), episode=episode
+    )
+
+
+def test_single_valve() -> None:
+    """Extraction a·w·x from a reserve is least at the lowest w: λ̄ = −x_0 (1 − e^{−a w̲ T})/T."""
+    arc = Arc(id="extraction", donor="reserve", recipient="use", rate=0.4, control=VALVE)
+    network = Network(name="valve", nodes=(RESERVE, USE), arcs=(arc,), episode=Episode(control_interval=0.5, horizon=8))
+    run = rollout(VectorEnv(network, num_envs=1), MPC())
+    assert run.episode_circularity[0] == pytest.approx(-100 * (1 - math.exp(-0.4 * 0.5 * 4)) / 4, rel=1e-6)
+
+
+@pytest.mark.parametrize("replan", [1, 3])
+def test_equals_the_open_loop_plan_where_the_program_is_exact(replan: int) -> None:
+    """A stock x in use that decays at the rate a needs U = a·x mined and loses as much: λ̄ = −2·a·x."""
+    env = VectorEnv(in_use(), num_envs=1)
+    found = bound(in_use(), min_service=1.0, degree=4)
+    planned = rollout(env, Plan(found))
+    run = rollout(env, MPC(min_service=1.0, degree=4, replan=replan))
+    assert run.episode_circularity[0] == pytest.approx(-6.0, rel=1e-4)
+    np.testing.assert_allclose(run.circularity_mean, planned.circularity_mean, rtol=1e-3)
+    np.testing.assert_allclose(run.service, 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_a_short_window_sees_what_comes_after(horizon: int) -> None:
+    """With prices on its last stocks a window as short as one interval plans as the whole episode does."""
+    run = rollout(VectorEnv(in_use(), num_envs=1), MPC(horizon=horizon, min_service=1.0, degree=4, replan=1))
+    assert run.episode_circularity[0] == pytest.approx(-6.0, rel=1e-3)
+    np.testing.assert_allclose(run.service, 1.0, atol=1e-4)
+
+
+def test_a_service_out_of_reach_is_approached() -> None:
+    """From a stock of 2 a level of 1 throughout cannot be had: all is mined until the stock is there, then kept."""
+    run = rollout(VectorEnv(in_use(stock=2.0, horizon=10), num_envs=1), MPC(min_service=1.0, degree=3, replan=1))
+    rising = 2.0 * np.exp(-0.15 * np.arange(1, 3)) + 30.0 * (1 - np.exp(-0.15 * np.arange(1, 3)))
+    np.testing.assert_allclose(run.service[0, :2], rising / 10, rtol=1e-6)
+    np.testing.assert_allclose(run.service[0, 4:], 1.0, atol=1e-3)
+
+
+def test_weight_decides_whether_service_is_worth_its_price() -> None:
+    """Without a weight nothing is mined; with a large one the service is kept."""
+    env = VectorEnv(in_use(), num_envs=1)
+    idle, busy = (rollout(env, MPC(service_weight=weight)) for weight in (0.0, 100.0))
+    assert idle.flow[:, 0].max() < 1e-6
+    assert busy.episode_service[0] > 0.999
+
+
+@pytest.mark.parametrize(("name", "horizon"), [("copper_net", None), ("copper_net", 12), ("carbo_net", None)])
+def test_keeps_the_service_from_random_starts(name: str, horizon: int | None) -> None:
+    """From drawn starts it meets the demanded level, nearer than open-loop plans, within 3 % of the bound."""
+    env = VectorEnv(name, num_envs=2, horizon=24)
+    env.reset(seed=11)
+    starts = env.physical.stock[: len(env.network.nodes)].T.copy()
+    demanded = 0.9
+    run = rollout(env, MPC(horizon=horizon, min_service=demanded), seed=11)
+    plans = [bound(name, start, min_service=demanded, horizon=24, degree=1) for start in starts]
+    planned = rollout(env, Plan(plans), seed=11)
+    off, open_loop = (np.abs(each.episode_service - demanded).max() for each in (run, planned))
+    assert off < 2e-3
+    assert off < open_loop
+    best = envelope(name, starts, solves=3, min_service=demanded, horizon=24, degree=1)
+    proved = best.at(starts, run.episode_service)
+    gap = (proved - run.episode_circularity) / np.abs(proved)
+    assert (gap >= 0).all() and (gap < 0.03).all(), gap
+
+
+def test_every_copy_has_its_own_plan() -> None:
+    """Copies side by side do what each does alone, and a second episode is planned from its own start."""
+    together = VectorEnv("carbo_net", num_envs=2, horizon=6)
+    run = rollout(together, MPC(min_service=0.9), seed=3)
+    for i in range(2):
+        alone = rollout(VectorEnv("carbo_net", num_envs=1, horizon=6), MPC(min_service=0.9), seed=3 + i)
+        np.testing.assert_allclose(run.circularity[i], alone.circularity[0], rtol=1e-12)
+    assert np.abs(run.circularity[0] - run.circularity[1]).max() > 1e-3
+    controller, lone = MPC(min_service=0.9), VectorEnv("carbo_net", num_envs=1, horizon=6)
+    observations = lone.reset(seed=3)
+    controller.start(lone, 0)
+    for _ in range(6):  # the last of these starts the second episode
+        observations, *_ = lone.step(controller.act(observations))
+    fresh = MPC(min_service=0.9)
+    fresh.start(lone, 0)
+    for agent, action in controller.act(observations).items():
+        np.testing.assert_array_equal(action, fresh.act(observations)[agent])
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario", "said"),
+    [
+        ("net_zero", None, "inner physics"),
+        ("solids_net", None, "move batches"),
+        ("copper_net", "paper", "solver 'euler'"),
+    ],
+)
+def test_networks_that_it_refuses(name: str, scenario: str | None, said: str) -> None:
+    """Networks without linear flow laws are refused before the episode starts, with the reason."""
+    env = VectorEnv(name, num_envs=1, scenario=scenario)
+    env.reset(seed=0)
+    with pytest.raises(NoCertificate, match=said):
+        MPC().start(env, 0)
+
+
+def test_the_episode_ends() -> None:
+    """There is nothing to plan after the last decision."""
+    env = VectorEnv(in_use(), num_envs=1)
+    controller = MPC()
+    rollout(env, controller)
+    with pytest.raises(ControlError, match="over after 8 steps"):
+        controller.act({})
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"min_service": 0.9, "service_weight": 1.0}, "two ways"),
+        ({"min_service": 2.0}, "must lie in"),
+        ({"degree": 0}, "degree"),
+        ({"replan": 0}, "replan"),
+        ({"horizon": 0}, "horizon"),
+        ({"horizon": 2, "replan": 3}, "shorter than the 3 decisions"),
+    ],
+)
+def test_bad_options(options: dict[str, float], said: str) -> None:
+    """Options that cannot be used are named."""
+    with pytest.raises(CirlError, match=said):
+        MPC(**options)  # type: ignore[arg-type]
