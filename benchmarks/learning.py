@@ -14,10 +14,10 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from cirl_marl.evaluate import Estimate, estimate
 from cirl_marl.learners import RunDirectory, load_recipe, train
 from cirl_marl.learners.run import write_json
 from cirl_marl.report.run import evaluate_run
+from cirl_marl.statistics import Estimate, estimate
 
 console = Console(width=140)
 CONTROLLERS = ("trained", "neutral", "random")

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from cirl_marl.controllers.basic import Controller
 from cirl_marl.network import Floats, Network
 from cirl_marl.staged import CIRO_FACTOR
+from cirl_marl.statistics import estimate
 from cirl_marl.vector_env import VectorEnv
 
 EVALUATION_SEEDS = 2**31
@@ -62,38 +62,6 @@ class Rollout:
         """Mean service level of each episode, shape (B,)."""
         mean: Floats = self.service.mean(axis=1)
         return mean
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A mean with the half-width of its 95 % confidence interval (Student's t over episodes or seeds)."""
-
-    mean: float
-    half_width: float
-
-    def __str__(self) -> str:
-        """Return ``mean ± half-width``."""
-        return f"{self.mean:.4g} ± {self.half_width:.2g}"
-
-    def as_dict(self) -> dict[str, float | None]:
-        """Return the two numbers by name; None stands for one that is not defined."""
-        return {
-            name: value if np.isfinite(value) else None
-            for name, value in zip(("mean", "half_width"), (self.mean, self.half_width), strict=True)
-        }
-
-
-def estimate(samples: Floats) -> Estimate:
-    """Return the mean of independent samples and the half-width of its 95 % confidence interval.
-
-    >>> str(estimate(np.array([1.0, 2.0, 3.0])))
-    '2 ± 2.5'
-    """
-    samples = np.asarray(samples, dtype=float)
-    if len(samples) < 2:
-        return Estimate(float(samples.mean()), float("nan"))
-    error = float(samples.std(ddof=1)) / np.sqrt(len(samples))
-    return Estimate(float(samples.mean()), float(stats.t.ppf(0.975, len(samples) - 1) * error))
 
 
 def rollout(

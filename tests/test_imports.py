@@ -19,6 +19,7 @@ LAYERS = (
         "validate",
         "network",
         "staged",
+        "statistics",
     },
     {"compartments"},
     {"schema", "mistakes", "conversion", "definition", "writing", "catalogue"},

@@ -1,0 +1,138 @@
+"""Means with confidence intervals: over episodes, and over training seeds.
+
+Results of few training seeds are reported as the interquartile mean (IQM) with stratified bootstrap intervals: the
+quarter of lowest and the quarter of highest scores are left out, which is steadier than the mean and sees more than the
+median; seeds are resampled within each network, the stratum.
+
+References: Agarwal et al. 2021, Deep Reinforcement Learning at the Edge of the Statistical Precipice (rliable).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats
+
+ENOUGH_SEEDS = 5
+"""Fewest training seeds whose interval is reported without a mark."""
+TRIMMED = 0.25
+"""Share of the scores that the interquartile mean leaves out at either end."""
+RESAMPLES = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A mean with the half-width of its 95 % confidence interval (Student's t over episodes or seeds)."""
+
+    mean: float
+    half_width: float
+
+    def __str__(self) -> str:
+        """Return ``mean ± half-width``."""
+        return f"{self.mean:.4g} ± {self.half_width:.2g}"
+
+    def as_dict(self) -> dict[str, float | None]:
+        """Return the two numbers by name; None stands for one that is not defined."""
+        return {"mean": defined(self.mean), "half_width": defined(self.half_width)}
+
+
+def estimate(samples: Floats) -> Estimate:
+    """Return the mean of independent samples and the half-width of its 95 % confidence interval.
+
+    >>> str(estimate(np.array([1.0, 2.0, 3.0])))
+    '2 ± 2.5'
+    """
+    samples = np.asarray(samples, dtype=float)
+    if len(samples) < 2:
+        return Estimate(float(samples.mean()), float("nan"))
+    error = float(samples.std(ddof=1)) / np.sqrt(len(samples))
+    return Estimate(float(samples.mean()), float(stats.t.ppf(0.975, len(samples) - 1) * error))
+
+
+@dataclass(frozen=True, slots=True)
+class Aggregate:
+    """A figure with its 95 % confidence interval.
+
+    Attributes:
+        value: the figure.
+        low: lower end of the interval, NaN if there is none.
+        high: upper end, likewise.
+        seeds: training seeds of each stratum; None if the interval is over episodes.
+    """
+
+    value: float
+    low: float
+    high: float
+    seeds: int | None = None
+
+    @property
+    def few(self) -> bool:
+        """Whether the interval rests on fewer training seeds than it should."""
+        return self.seeds is not None and self.seeds < ENOUGH_SEEDS
+
+    def as_dict(self) -> dict[str, float | None]:
+        """Return the three numbers by name; None stands for one that is not defined."""
+        return {name: defined(getattr(self, name)) for name in ("value", "low", "high")}
+
+
+def over_episodes(samples: Floats) -> Aggregate:
+    """Return the mean of independent episodes with its interval (Student's t)."""
+    found = estimate(samples)
+    return Aggregate(found.mean, found.mean - found.half_width, found.mean + found.half_width)
+
+
+def interquartile_mean(scores: ArrayLike) -> float:
+    """Return the mean of all scores but the lowest and the highest quarter, each rounded down to whole scores.
+
+    >>> interquartile_mean([0.0, 1.0, 2.0, 3.0, 100.0])
+    2.0
+    """
+    return float(stats.trim_mean(np.asarray(scores, dtype=float).ravel(), TRIMMED))
+
+
+def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Aggregate:
+    """Return the interquartile mean of scores of training seeds with its stratified percentile bootstrap interval.
+
+    Scores of different networks must be on one scale, such as a gain or a gap. A single seed has no interval.
+
+    Args:
+        scores: of each network, one score a seed.
+        resamples: bootstrap samples.
+        seed: of the resampling.
+
+    Raises:
+        CirlError: if there are no scores, or a network has another number of seeds than the first.
+    """
+    strata = [np.asarray(each, dtype=float) for each in scores]
+    seeds = strata[0].size if strata else 0
+    if not seeds or any(each.shape != (seeds,) for each in strata):
+        raise CirlError(f"scores must be one sequence for each network, equally long; got {[s.shape for s in strata]}")
+    value = interquartile_mean(strata)
+    if seeds == 1 or not np.isfinite(value):
+        return Aggregate(value, float("nan"), float("nan"), seeds)
+    found = stats.bootstrap(
+        strata,
+        _joint_mean,
+        n_resamples=resamples,
+        vectorized=True,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    )
+    interval = found.confidence_interval
+    return Aggregate(value, float(interval.low), float(interval.high), seeds)
+
+
+def defined(value: float) -> float | None:
+    """Return a number as JSON has it: None if it is not finite."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _joint_mean(*strata: Floats, axis: int = -1) -> Floats:
+    mean: Floats = stats.trim_mean(np.concatenate(strata, axis=axis), TRIMMED, axis=axis)
+    return mean
