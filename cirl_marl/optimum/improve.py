@@ -25,7 +25,7 @@ DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
 PENALTY = 3.0
 """Price of missing service in the merit, times the price that the bound puts on it."""
-TRUST, SMALLEST = 0.25, 1e-3
+TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions."""
 
 
