@@ -18,7 +18,7 @@ from cirl_marl.state import Outcome, Snapshot
 from cirl_marl.vector_env import VectorEnv
 
 RENDER_MODES = ("rgb_array", "human")
-OPTIONS = ("observe", "circularity", "horizon")
+OPTIONS = ("observe", "circularity", "circularity_weight", "horizon")
 
 
 class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
@@ -216,7 +216,8 @@ def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParall
 
     Args:
         network: catalogue name, path of a definition file, or a network.
-        **options: ``scenario``, ``agents``, ``reward``, ``observe``, ``circularity``, ``horizon``, ``render_mode``.
+        **options: ``scenario``, ``agents``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``,
+            ``horizon``, ``render_mode``.
 
     >>> env = parallel_env("copper_net", agents=["mine", "use_to_collection"])
     >>> observations, infos = env.reset(seed=0)

@@ -54,6 +54,7 @@ class VectorEnv:
         reward: str | None = None,
         observe: str | None = None,
         circularity: str = "end",
+        circularity_weight: float | None = None,
         horizon: int | None = None,
     ) -> None:
         """Make the environments.
@@ -66,6 +67,7 @@ class VectorEnv:
             reward: reward mode; None takes the scenario's own, which is ``mixed`` unless the definition says otherwise.
             observe: ``local``, ``neighbours``, ``full`` or ``model``; None takes the scenario's own.
             circularity: whether the team reward is λ at the ``end`` of the interval or its ``mean`` over it.
+            circularity_weight: w in [0, 1], weight of λ in the reward; None takes the definition's.
             horizon: decisions per episode; None takes the definition's.
 
         Raises:
@@ -78,6 +80,8 @@ class VectorEnv:
                 raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
         if horizon is not None:
             found = found.with_options(episode={"horizon": horizon})
+        if circularity_weight is not None:
+            found = found.with_options(objective={"circularity_weight": _share(circularity_weight)})
         self.network = found
         self.num_envs = num_envs
         self.reward_mode = _choice("reward", found.objective.reward if reward is None else reward, REWARDS)
@@ -326,6 +330,12 @@ class VectorEnv:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
         return self.layout.observe(quantities, time, self.scoring.levels(quantities))
+
+
+def _share(weight: float) -> float:
+    if isinstance(weight, bool) or not isinstance(weight, int | float) or not 0 <= weight <= 1:
+        raise CirlError(f"circularity_weight must be a number in [0, 1], got {weight!r}")
+    return float(weight)
 
 
 def _choice(what: str, value: str, known: Sequence[str]) -> str:

@@ -325,3 +325,19 @@ def test_time_limit_may_be_the_end() -> None:
         paid[bootstrap] = model.rollout_buffer.rewards.copy()
     np.testing.assert_array_equal(paid[True][:-1], paid[False][:-1])
     assert (paid[True][-1] != paid[False][-1]).all()
+
+
+def test_weight_of_circularity_is_an_option(tmp_path: Path) -> None:
+    """The reward follows it, a run keeps it as an option beside the unchanged definition, and bad values are named."""
+    half, most = (vector_env("copper_net", num_envs=2, reward="team", circularity_weight=w) for w in (None, 0.9))
+    assert (half.network.objective.circularity_weight, most.network.objective.circularity_weight) == (0.5, 0.9)
+    assert cirl_marl.parallel_env("copper_net", circularity_weight=1.0).network.objective.circularity_weight == 1.0
+    recipe = small(Learner(scheme="joint", algorithm="PPO", parameters=SMALL))
+    training = train("copper_net", recipe, directory=tmp_path / "run", horizon=8, steps=16, circularity_weight=0.9)
+    assert training.run is not None
+    assert training.run.config.options["circularity_weight"] == 0.9
+    assert training.run.make_env(1).network == training.env.network
+    assert training.run.network().objective.circularity_weight == 0.5
+    for wrong in (1.5, "0.5", True):
+        with pytest.raises(cirl_marl.CirlError, match=r"circularity_weight must be a number in \[0, 1\]"):
+            vector_env("copper_net", circularity_weight=wrong)

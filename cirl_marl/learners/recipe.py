@@ -168,7 +168,7 @@ def recipe_schema() -> dict[str, Any]:
     return schema
 
 
-OPTIONS = ("reward", "observe", "circularity", "horizon", "scenario")
+OPTIONS = ("reward", "observe", "circularity", "circularity_weight", "horizon", "scenario")
 
 
 def load_recipe(name: str | Path) -> Recipe:

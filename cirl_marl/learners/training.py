@@ -253,7 +253,8 @@ def train(
         agents: who acts and learns; None takes the network's choice.
         callbacks: Stable-Baselines3 callbacks by name of the learner.
         report: called after every joint step.
-        **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``horizon``; they override the recipe's.
+        **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``, ``horizon``; they
+            override the recipe's.
 
     Returns:
         The finished training; ``trainees[name].model`` is the Stable-Baselines3 model.
@@ -308,10 +309,12 @@ def resume(directory: str | Path, *, report: Callable[[Progress], None] | None =
 
 def _create(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
     """Start the run directory; the definition is copied if it is still what was trained on, and written if not."""
-    horizon = {"horizon": network.episode.horizon}
+    asked: dict[str, dict[str, object]] = {"episode": {"horizon": network.episode.horizon}}
+    if "circularity_weight" in config.options:
+        asked["objective"] = {"circularity_weight": network.objective.circularity_weight}
     source = network.source
     if source is not None and source.is_file():
-        read = load_network(source, scenario=network.scenario_name).with_options(episode=horizon)
+        read = load_network(source, scenario=network.scenario_name).with_options(**asked)
         if read == network:
             return RunDirectory.create(directory, config, source)
     directory.parent.mkdir(parents=True, exist_ok=True)
