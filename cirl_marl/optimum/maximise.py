@@ -57,7 +57,8 @@ def bound(
 
     Raises:
         NoCertificate: for a network whose flows are not linear laws: inner physics, batches, inexact solvers.
-        CirlError: for input that cannot be used, a service that no plan reaches, or a solver that fails.
+        CirlError: for input that cannot be used, a service that no plan reaches (or only just, by less than the
+            solver's tolerance of 1e-7), or a solver that fails.
     """
     check_options(service_weight, min_service, degree)
     admissible = Admissible.of(_found(network, scenario, horizon), agents)
