@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.controllers.basic import Controller
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.staged import CIRO_FACTOR
 from cirl_marl.statistics import estimate
@@ -116,11 +117,26 @@ def interval_ends(network: Network) -> Floats:
     return ends
 
 
+def first_seed(seed: int) -> int:
+    """Return the seed of the first episode of the evaluation ``seed``.
+
+    Raises:
+        CirlError: if ``seed`` is negative.
+    """
+    if seed < 0:
+        raise CirlError(f"seed must not be negative, got {seed}")
+    return EVALUATION_SEEDS + SEED_SPACING * seed
+
+
+def relative(difference: Floats, reference: Floats) -> Floats:
+    """Return ``difference``/|``reference``|, NaN where the reference is 0."""
+    return np.divide(difference, np.abs(reference), out=np.full_like(difference, np.nan), where=reference != 0)
+
+
 def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
     """Return the circularity gain (λ̄ − λ̄_neutral)/|λ̄_neutral| of each episode, shape (B,); NaN where λ̄_neutral = 0."""
     reference = neutral.episode_circularity
-    difference = rollout_.episode_circularity - reference
-    return np.divide(difference, np.abs(reference), out=np.full_like(difference, np.nan), where=reference != 0)
+    return relative(rollout_.episode_circularity - reference, reference)
 
 
 def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:

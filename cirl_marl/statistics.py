@@ -63,18 +63,11 @@ class Aggregate:
         value: the figure.
         low: lower end of the interval, NaN if there is none.
         high: upper end, likewise.
-        seeds: training seeds of each stratum; None if the interval is over episodes.
     """
 
     value: float
     low: float
     high: float
-    seeds: int | None = None
-
-    @property
-    def few(self) -> bool:
-        """Whether the interval rests on fewer training seeds than it should."""
-        return self.seeds is not None and self.seeds < ENOUGH_SEEDS
 
     def as_dict(self) -> dict[str, float | None]:
         """Return the three numbers by name; None stands for one that is not defined."""
@@ -115,7 +108,7 @@ def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed:
         raise CirlError(f"scores must be one sequence for each network, equally long; got {[s.shape for s in strata]}")
     value = interquartile_mean(strata)
     if seeds == 1 or not np.isfinite(value):
-        return Aggregate(value, float("nan"), float("nan"), seeds)
+        return Aggregate(value, float("nan"), float("nan"))
     found = stats.bootstrap(
         strata,
         _joint_mean,
@@ -125,7 +118,7 @@ def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed:
         rng=np.random.default_rng(seed),
     )
     interval = found.confidence_interval
-    return Aggregate(value, float(interval.low), float(interval.high), seeds)
+    return Aggregate(value, float(interval.low), float(interval.high))
 
 
 def defined(value: float) -> float | None:

@@ -26,7 +26,7 @@ LAYERS = (
     {"batches", "flows", "inner", "simulate", "actuators", "starts", "state", "observe", "reward", "credit"},
     {"vector_env"},
     {"parallel_env", "single_env", "goal_env", "registration"},
-    {"controllers", "optimum", "learners", "evaluate", "report", "nested", "testing"},
+    {"controllers", "optimum", "learners", "evaluate", "results", "comparison", "report", "nested", "testing"},
     {"paper"},
     {"cli"},
 )

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from cirl_marl.controllers import Controller, Neutral, Random
-from cirl_marl.controllers.trained import Trained
-from cirl_marl.errors import CirlError, RunError
-from cirl_marl.evaluate import EVALUATION_SEEDS, SEED_SPACING, Rollout, interval_ends, rollout, summary
+from cirl_marl.comparison import compare
+from cirl_marl.errors import RunError
+from cirl_marl.evaluate import Rollout, interval_ends, summary
 from cirl_marl.learners.run import RunDirectory, write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
 from cirl_marl.report.digraph import save_before_after
+from cirl_marl.statistics import estimate
 from cirl_marl.vector_env import VectorEnv
 
 
@@ -23,17 +23,17 @@ def evaluate_run(
     *,
     episodes: int = 64,
     seed: int = 0,
-    progress: Callable[[str, int], None] | None = None,
+    bounds: bool = True,
+    progress: Callable[[str, float], None] = lambda what, share: None,
 ) -> tuple[dict[str, Any], dict[str, Rollout], VectorEnv]:
     """Compare the trained policies with neutral and random control on fresh episodes.
-
-    All controllers start from the same states; their seeds lie above those that training draws.
 
     Args:
         run: a run with a checkpoint.
         episodes: number of episodes.
         seed: different seeds evaluate on different episodes.
-        progress: called with the controller's name and the number of intervals done.
+        bounds: whether to hold the episodes against the best possible, which takes longer than the episodes.
+        progress: called with what is being done and the share of all that is done.
 
     Returns:
         The figures, which are also written to ``evaluation.json``, the rollouts by controller, and the environment.
@@ -42,26 +42,21 @@ def evaluate_run(
         CirlError: if ``episodes`` or ``seed`` cannot be used.
         RunError: if the run is incomplete.
     """
-    if episodes < 2:
-        raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
-    if seed < 0:
-        raise CirlError(f"seed must not be negative, got {seed}")
-    first = EVALUATION_SEEDS + SEED_SPACING * seed
-    trained = Trained(run)
+    comparison = compare([run], ("neutral", "random"), episodes=episodes, seed=seed, bounds=bounds, progress=progress)
+    entries = dict(zip(("trained", "neutral", "random"), comparison.entries, strict=True))
+    rollouts = {name: entry.rollout for name, entry in entries.items()}
     env = run.make_env(episodes)
-    controllers: Mapping[str, Controller] = {"trained": trained, "neutral": Neutral(), "random": Random()}
-    rollouts = {
-        name: rollout(
-            env,
-            controller,
-            seed=first,
-            progress=None if progress is None else _named(progress, name),
-        )
-        for name, controller in controllers.items()
-    }
     figures = summary(env, rollouts)
+    for name, entry in entries.items():
+        if entry.bound is not None and entry.gap is not None:
+            figures["controllers"][name] |= {
+                "bound": estimate(entry.bound).as_dict(),
+                "gap": estimate(entry.gap).as_dict(),
+            }
+    if comparison.yardstick.reason:
+        figures["no_bound"] = comparison.yardstick.reason
     config = run.config
-    figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": first}
+    figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": comparison.first_seed}
     write_json(run.path / "evaluation.json", figures)
     return figures, rollouts, env
 
@@ -98,7 +93,3 @@ def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv)
     returns = {agent: np.array(metrics.get(f"return:{agent}", [])) for agent in env.agents}
     save_learning_curves(curves, np.array(metrics.get("env_steps", [])), returns)
     return [*drawn, curves]
-
-
-def _named(progress: Callable[[str, int], None], name: str) -> Callable[[int], None]:
-    return lambda steps: progress(name, steps)

@@ -93,6 +93,9 @@ def evaluation_table(figures: Mapping[str, Any]) -> Table:
     title = f"{figures['episodes']} fresh episodes, mean ± half-width of the 95 % confidence interval"
     table = Table(title=title)
     columns = ["controller", f"λ̄ ({figures['unit']})", "gain over neutral", "service level", "return", "local return"]
+    bounded = all("gap" in row for row in figures["controllers"].values())
+    if bounded:
+        columns.append("gap to bound")
     weighted = all("time_window_circularity" in row for row in figures["controllers"].values())
     if weighted:
         columns.append(f"weighted, time window ({figures['unit']})")
@@ -110,6 +113,7 @@ def evaluation_table(figures: Mapping[str, Any]) -> Table:
             _figure(row["service_level"], "{:.4f}"),
             f"{mean['return']:.4g}",
             f"{mean['local_return']:.4g}",
+            *([_figure(row["gap"], "{:.1%}")] if bounded else []),
             *([_figure(row["time_window_circularity"], "{:.4g}")] if weighted else []),
         )
     return table

@@ -1,0 +1,23 @@
+"""The command line, ``cirl``; each module holds a few commands."""
+
+from __future__ import annotations
+
+import sys
+
+from cirl_marl.cli import comparing, networks, training
+from cirl_marl.cli.common import app, errors, plain
+from cirl_marl.errors import CirlError, LearnerError
+
+__all__ = ["app", "comparing", "main", "networks", "training"]
+
+
+def main() -> None:
+    """Run the command line; input that cannot be used ends it with exit code 2, a failed learner with 1."""
+    try:
+        app()
+    except (CirlError, OSError) as error:
+        errors.print(f"[bold red]error:[/] {plain(error)}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except LearnerError as error:
+        errors.print(f"[bold red]training failed:[/] {plain(error)}", highlight=False, soft_wrap=True)
+        sys.exit(1)

@@ -1,0 +1,124 @@
+"""What the commands share: the application, consoles, options, progress bars."""
+
+from __future__ import annotations
+
+import sys
+import time as clock
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from cirl_marl.errors import CirlError
+
+app = typer.Typer(
+    help="Material networks whose compartments learn to raise circularity.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+console = Console(width=None if sys.stdout.isatty() else 140)
+errors = Console(stderr=True)
+
+NetworkName = Annotated[str, typer.Argument(metavar="NETWORK", help="Name in the catalogue, or a .toml file.")]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a training run.")]
+Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]
+Episodes = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
+MinService = Annotated[
+    float | None,
+    typer.Option(min=0.0, max=1.0, help="Mean service level that mpc and optimum plan for; default: all there is."),
+]
+
+
+def plain(error: BaseException) -> str:
+    """Keep rich from reading brackets in a message as markup."""
+    return str(error).replace("[", r"\[")
+
+
+def say(line: str) -> None:
+    """Print a line as it is, whatever its length."""
+    console.print(line.replace("[", r"\["), soft_wrap=True, highlight=False)
+
+
+def folder_for(path: Path, option: str) -> Path:
+    """Return ``path``, which is or can become a folder.
+
+    Raises:
+        CirlError: if it is something else.
+    """
+    if path.exists() and not path.is_dir():
+        raise CirlError(f"{option} {path}: is a file, not a folder")
+    return path
+
+
+@contextmanager
+def bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Progress bar; the yielded function takes the steps done so far."""
+    with Progress(
+        TextColumn(what), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=console, transient=True
+    ) as progress:
+        task = progress.add_task(what, total=total)
+
+        yield lambda done: progress.update(task, completed=done)
+
+
+@contextmanager
+def shares() -> Iterator[Callable[[str, float], None]]:
+    """Progress bar of several things; the yielded function takes what is being done and the share of all done."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("preparing", total=1.0)
+        yield lambda what, share: progress.update(task, description=what, completed=share)
+
+
+@contextmanager
+def training_bar() -> Iterator[Any]:
+    """Live line of a training: joint steps/s, λ̄ and service level of the last episode; plain lines if no terminal."""
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[speed]:,.0f} joint steps/s"),
+        TextColumn("λ̄ {task.fields[circularity]}"),
+        TextColumn("service {task.fields[service]}"),
+        TimeRemainingColumn(),
+    )
+    live = console.is_terminal
+    with Progress(*columns, console=console, disable=not live) as progress:
+        task = progress.add_task("training", total=None, speed=0.0, circularity="…", service="…")
+        shown = clock.perf_counter()
+        state: Any = None
+
+        def update(now: Any) -> None:
+            nonlocal shown, state
+            state = now
+            if now.episode:
+                circularity, service = f"{now.circularity:.4g}", f"{now.service_level:.3f}"
+                progress.update(task, circularity=circularity, service=service)
+            if clock.perf_counter() - shown > (0.2 if live else 10.0):
+                shown = clock.perf_counter()
+                progress.update(task, completed=now.env_steps, total=now.total, speed=_speed(now))
+                if not live:
+                    _say(now)
+
+        yield update
+        if state is not None:
+            progress.update(task, completed=state.total, total=state.total, speed=_speed(state))
+            if not live:
+                _say(state)
+
+
+def _speed(state: Any) -> float:
+    return float(state.env_steps / max(state.seconds, 1e-9))
+
+
+def _say(state: Any) -> None:
+    console.print(
+        f"{min(state.env_steps, state.total):,}/{state.total:,} steps, {_speed(state):,.0f} joint steps/s, "
+        f"λ {state.circularity:.4g}, service {state.service_level:.3f}"
+    )

@@ -1,0 +1,62 @@
+"""``cirl compare``: policies and controllers against each other and the best possible."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cirl_marl.cli.common import Episodes, MinService, Scenario, Seed, app, console, folder_for, say, shares
+from cirl_marl.controllers.named import CONTROLLERS
+
+
+@app.command()
+def compare(
+    runs: Annotated[
+        list[Path] | None, typer.Argument(metavar="RUN...", help="Training runs of one environment; may be left out.")
+    ] = None,
+    controllers: Annotated[
+        str, typer.Option(help=f"Comma-separated, of {', '.join(CONTROLLERS)}; neutral is always there.")
+    ] = "neutral,random",
+    network: Annotated[
+        str | None, typer.Option(help="Catalogue name or .toml file; default: the network of the runs.")
+    ] = None,
+    scenario: Scenario = None,
+    episodes: Episodes = 16,
+    seed: Seed = 0,
+    min_service: MinService = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for episodes.csv, summary.csv, summary.json and comparison.png.")
+    ] = None,
+) -> None:
+    """Compare trained runs and controllers on the same fresh episodes, and with the best possible.
+
+    Runs of one recipe with different seeds share a row: the interquartile mean over seeds with its bootstrap interval.
+    The gap to the bound is to the highest circularity of any episode from the same start that serves at least as well.
+    mpc and optimum solve linear programs for every episode: minutes for each on the larger networks.
+    """
+    from cirl_marl.comparison import compare as compared
+    from cirl_marl.comparison.files import write_comparison
+    from cirl_marl.report.comparison import comparison_notes, comparison_table
+
+    names = [name.strip() for name in controllers.split(",") if name.strip()]
+    folder = None if out is None else folder_for(out, "--out")
+    with shares() as progress:
+        found = compared(
+            runs or [],
+            names,
+            network=network,
+            scenario=scenario,
+            episodes=episodes,
+            seed=seed,
+            min_service=min_service,
+            progress=progress,
+        )
+    console.print(comparison_table(found))
+    for note in comparison_notes(found):
+        say(note)
+    if folder is not None:
+        asked = {"controllers": names, "episodes": episodes, "seed": seed, "min_service": min_service}
+        for path in write_comparison(found, folder, **asked):
+            say(f"wrote {path}")

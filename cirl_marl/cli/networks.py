@@ -1,0 +1,150 @@
+"""``cirl networks | show | check | simulate | plan``: networks without learning."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from cirl_marl.catalogue import load_network, networks, recipes
+from cirl_marl.cli.common import NetworkName, Scenario, Seed, app, bar, console, errors, plain
+from cirl_marl.controllers.named import CONTROLLERS, SETTABLE, named_controller
+from cirl_marl.errors import CirlError, DefinitionError
+from cirl_marl.evaluate import Rollout, interval_ends, rollout
+from cirl_marl.vector_env import VectorEnv
+
+
+@app.command("networks")
+def list_networks() -> None:
+    """List the networks and the learner recipes of the catalogue."""
+    from cirl_marl.report.tables import networks_table
+
+    console.print(networks_table({name: load_network(name) for name in networks()}))
+    console.print(f"recipes for --agents: {', '.join(recipes())}")
+
+
+@app.command()
+def show(
+    network: NetworkName,
+    scenario: Scenario = None,
+    picture: Annotated[Path | None, typer.Option(help="Where to draw it; default: NETWORK.png here.")] = None,
+) -> None:
+    """Show the compartments, flows and circularity of a network at its start state, and draw it."""
+    from cirl_marl.report.digraph import save_network
+    from cirl_marl.report.tables import arcs_table, nodes_table
+
+    found = load_network(network, scenario=scenario)
+    env = VectorEnv(found, num_envs=1)
+    middle = {node.id: sum(node.initial) / 2 for node in found.nodes}
+    env.reset(seed=0, options={"initial_state": middle})
+    stock, flow = env.physical.stock[: len(found.nodes), 0], env.physical.flow[:, 0]
+    console.print(nodes_table(found, stock))
+    console.print(arcs_table(found, flow))
+    for service in found.services:
+        ends = [f"at least {service.low:g}"] if service.low > 0 else []
+        ends += [] if np.isinf(service.high) else [f"at most {service.high:g}"]
+        console.print(
+            f"service '{service.id}': {service.measure or service.quantity} of {service.provider} {' and '.join(ends)}"
+        )
+    console.print(f"λ of the start state: {float(found.circularity(flow)):.5g} {found.mass_unit}")
+    path = picture or Path(f"{found.name}.png")
+    if path.suffix != ".png" or not path.parent.is_dir():
+        raise CirlError(f"--picture {path}: needs the name of a .png file in a folder that exists")
+    save_network(path, found, stock, flow, title=found.title)
+    console.print(f"picture: {path}")
+
+
+@app.command()
+def check(files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Definition files.")]) -> None:
+    """Check definition files and name every mistake; exit code 2 if there is one."""
+    from cirl_marl.definition import read_network
+
+    faulty = False
+    for path in files:
+        try:
+            network = read_network(path)
+        except DefinitionError as error:
+            faulty = True
+            errors.print(plain(error), highlight=False, soft_wrap=True)
+        else:
+            scenarios = ", ".join([network.scenario_name, *network.scenarios])
+            console.print(
+                f"{path}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
+                f"scenarios {scenarios}: no mistakes",
+                soft_wrap=True,
+            )
+    if faulty:
+        raise typer.Exit(2)
+
+
+@app.command()
+def simulate(
+    network: NetworkName,
+    control: Annotated[str, typer.Option(help=f"Who acts: {', '.join(CONTROLLERS)}.")] = "neutral",
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="AGENT=VALUE in [-1, 1], held constant under --control constant or scripted; repeatable."
+        ),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Control intervals; default: the horizon.")] = None,
+    seed: Seed = 0,
+    scenario: Scenario = None,
+    out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
+) -> None:
+    """Simulate a network under a controller without learning; write a CSV and a picture."""
+    from cirl_marl.report.curves import save_trajectory
+
+    controller = named_controller(control, held=_held(control, set_ or []))
+    env = VectorEnv(network, num_envs=1, scenario=scenario, horizon=steps)
+    found = env.network
+    with bar("simulating", found.episode.horizon) as progress:
+        run = rollout(env, controller, seed=seed, progress=progress)
+    folder = out or Path()
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"{found.name}_{control}"
+    time = interval_ends(found)
+    _write_csv(folder / f"{name}.csv", env, time, run)
+    save_trajectory(folder / f"{name}.png", found, time, run.stock.T, run.flow.T, run.circularity[0], load=run.load.T)
+    console.print(
+        f"λ̄ = {float(run.episode_circularity[0]):.5g} {found.mass_unit}, "
+        f"service level {float(run.episode_service[0]):.4f}"
+    )
+    console.print(f"wrote {folder / name}.csv and {folder / name}.png")
+
+
+def _held(control: str, settings: list[str]) -> dict[str, float]:
+    """Return the values of --set by agent."""
+    if settings and control not in SETTABLE:
+        raise CirlError(f"--set goes with --control constant or scripted, not with {control}")
+    held = {}
+    for setting in settings:
+        agent, _, value = setting.partition("=")
+        try:
+            held[agent] = float(value)
+        except ValueError:
+            raise CirlError(f"--set {setting}: needs AGENT=VALUE with a number in [-1, 1]") from None
+    return held
+
+
+def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> None:
+    from cirl_marl.learners.run import write_atomically
+
+    network, physics = env.network, env.dynamics.inner
+    header = [f"time ({network.time_unit})", f"circularity ({network.mass_unit})", "service level"]
+    header += [f"stock of {node.id} ({network.mass_unit})" for node in network.nodes]
+    header += [f"flow of {arc.id} ({network.mass_unit}/{network.time_unit})" for arc in network.arcs]
+    header += [f"mass on {line.id} ({network.mass_unit})" for line in env.dynamics.batches.lines]
+    header += [physics.names[row] for row in physics.visible]
+
+    def write(target: Path) -> None:
+        with target.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            columns = (time, run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
+            writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+
+    write_atomically(path, write)

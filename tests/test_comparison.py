@@ -1,0 +1,164 @@
+"""Comparisons: the same episodes for all, honest gaps, grouped seeds, whole files or none."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cirl_marl.comparison import compare
+from cirl_marl.comparison.files import FILES, write_comparison
+from cirl_marl.definition import read_network
+from cirl_marl.errors import CirlError, RunError
+from cirl_marl.learners import train
+from cirl_marl.network import Network
+from cirl_marl.report.run import evaluate_run
+from cirl_marl.results import published
+from cirl_marl.statistics import interquartile_mean
+
+GUIDE = Path(__file__).parent.parent / "envs" / "README.md"
+
+
+@pytest.fixture(scope="module")
+def bottles(tmp_path_factory: pytest.TempPathFactory) -> Network:
+    """Return the small network of the guide, for a fortnight."""
+    text = GUIDE.read_text().split("```toml\n")[1].split("```")[0]
+    path = tmp_path_factory.mktemp("definition") / "bottles.toml"
+    path.write_text(text.replace("horizon = { value = 60", "horizon = { value = 14"))
+    return read_network(path)
+
+
+@pytest.fixture(scope="module")
+def runs(bottles: Network, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return three seeds of one recipe."""
+    folder = tmp_path_factory.mktemp("runs")
+    for seed in range(3):
+        train(bottles, "independent_a2c", directory=folder / str(seed), seed=seed, steps=320, envs=8)
+    return [folder / str(seed) for seed in range(3)]
+
+
+def test_common_random_numbers(bottles: Network, runs: list[Path]) -> None:
+    """Who else is compared changes nobody's episodes; seeds of training are out of reach."""
+    alone = compare(runs[:1], ["neutral"], episodes=4, bounds=False)
+    among = compare(runs, ["random", "neutral"], episodes=4, bounds=False)
+    assert alone.first_seed >= 2**31
+    for one in alone.entries:
+        other = next(each for each in among.entries if (each.name, each.seed) == (one.name, one.seed))
+        np.testing.assert_array_equal(one.circularity, other.circularity)
+        np.testing.assert_array_equal(one.service, other.service)
+    fresh = compare([], ["neutral"], network=bottles, episodes=4, seed=1, bounds=False)
+    assert not np.isin(fresh.entries[0].circularity, alone.entries[-1].circularity).any()
+
+
+def test_rows_are_recipes_and_controllers(runs: list[Path]) -> None:
+    """Seeds of a recipe share a row, whose figure is the interquartile mean of their means."""
+    found = compare(runs, ["neutral", "random"], episodes=3, bounds=False)
+    trained, neutral, _ = found.rows
+    assert [row.name for row in found.rows] == ["independent_a2c", "neutral", "random"]
+    assert (trained.seeds, trained.few, neutral.seeds, neutral.few) == ((0, 1, 2), True, (), False)
+    figure = trained.figure("circularity")
+    assert figure is not None
+    means = [entry.circularity.mean() for entry in trained.entries]
+    assert figure.value == pytest.approx(interquartile_mean(means))
+    assert min(means) <= figure.low <= figure.high <= max(means)
+    assert trained.figure("gap") is None
+
+
+def test_gap_is_to_the_best_episode_that_serves_as_well(bottles: Network) -> None:
+    """No episode beats its bound; serving less raises the bound, so starving does not close the gap."""
+    found = compare([], ["neutral", "random", "mpc", "optimum"], network=bottles, episodes=3)
+    gaps = {}
+    for entry in found.entries:
+        assert entry.gap is not None and entry.bound is not None
+        assert (entry.gap > -1e-9).all()
+        np.testing.assert_allclose(entry.gap, (entry.bound - entry.circularity) / np.abs(entry.bound))
+        gaps[entry.name] = float(entry.gap.mean())
+    assert max(gaps["mpc"], gaps["optimum"]) < 0.1 < gaps["random"] < gaps["neutral"]
+    front = found.yardstick.front
+    assert (np.diff(front[:, 0]) > 0).all()
+    assert (np.diff(front[:, 1]) <= 1e-9).all()
+
+
+def test_network_without_certificate() -> None:
+    """There is a comparison, without gap, and the reason."""
+    found = compare([], ["random"], network="net_zero", episodes=2)
+    assert found.entries[0].gap is None
+    assert "no bound is proved" in found.yardstick.reason
+
+
+def test_files_are_whole_and_say_where_they_come_from(runs: list[Path], tmp_path: Path) -> None:
+    """Every episode of every policy is a row; the provenance holds hashes of all that was read."""
+    found = compare(runs, ["neutral"], episodes=3)
+    assert write_comparison(found, tmp_path / "out", episodes=3) == [tmp_path / "out" / name for name in FILES]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(FILES)
+    with (tmp_path / "out" / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 4 * 3
+    assert float(rows[0]["circularity (t)"]) == found.entries[0].circularity[0]
+    assert {"training seed", "service level", "bound (t)", "gap to bound", "start seed"} <= set(rows[0])
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [row["name"] for row in summary["rows"]] == ["independent_a2c", "neutral"]
+    origin = summary["provenance"]
+    assert [run["seed"] for run in origin["runs"]] == [0, 1, 2]
+    assert all(len(run["config_sha256"]) == 64 for run in origin["runs"])
+    assert {"numpy", "torch", "cirl-marl"} <= set(origin["versions"])
+    assert len(origin["network"]["definition_sha256"]) == 64
+    assert origin["options"] == {"episodes": 3}
+
+
+def test_failed_writing_leaves_nothing(tmp_path: Path) -> None:
+    """Neither files nor a new folder; an old folder keeps what it had."""
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "kept.txt").write_text("kept")
+    for folder in ("new", "old"):
+        with pytest.raises(RuntimeError, match="disk"), published(tmp_path / folder) as partial:
+            (partial / "half.csv").write_text("half")
+            raise RuntimeError("disk")
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == ["old", "old/kept.txt"]
+
+
+def test_other_environments_are_refused(bottles: Network, runs: list[Path], tmp_path: Path) -> None:
+    """The message names the run and what differs; observations and rewards may."""
+    train(bottles, "independent_a2c", directory=tmp_path / "longer", steps=320, envs=8, horizon=15)
+    with pytest.raises(RunError, match=r"longer: not the same environment as .*: horizon 15, not 14"):
+        compare([runs[0], tmp_path / "longer"])
+    train(bottles, "independent_a2c", directory=tmp_path / "alone", steps=320, envs=8, agents=["quarry"])
+    with pytest.raises(RunError, match=r"agents \['quarry'\], not \['quarry', 'refill'\]"):
+        compare([runs[0], tmp_path / "alone"])
+    with pytest.raises(RunError, match=r"0: not the same .* the network given: network 'bottles', not 'copper_net'"):
+        compare(runs[:1], network="copper_net")
+    with pytest.raises(RunError, match=r"scenario 'default', not 'crisis'"):
+        compare(runs[:1], network=bottles, scenario="crisis")
+    train(bottles, "independent_a2c", directory=tmp_path / "seeing", steps=320, envs=8, observe="full", reward="local")
+    both = compare([runs[0], tmp_path / "seeing"], ["neutral"], episodes=2, bounds=False)
+    assert [row.name for row in both.rows] == ["independent_a2c", f"independent_a2c ({tmp_path / 'seeing'})", "neutral"]
+
+
+def test_bad_input(bottles: Network, runs: list[Path]) -> None:
+    """Each mistake has its own message."""
+    with pytest.raises(CirlError, match="give a training run or a network"):
+        compare()
+    with pytest.raises(CirlError, match="Did you mean 'mpc'"):
+        compare([], ["mcp"], network=bottles)
+    with pytest.raises(CirlError, match="must be distinct"):
+        compare([], ["random", "random"], network=bottles)
+    with pytest.raises(CirlError, match="at least 2"):
+        compare(runs, episodes=1)
+    with pytest.raises(RunError, match="the same recipe and seed 0"):
+        compare([runs[0], runs[0]])
+
+
+def test_evaluation_has_the_gap(runs: list[Path]) -> None:
+    """``evaluate_run`` is the comparison of one run with neutral and random control."""
+    from cirl_marl.learners import RunDirectory
+
+    figures, rollouts, _ = evaluate_run(RunDirectory(runs[1]), episodes=3)
+    assert list(rollouts) == ["trained", "neutral", "random"]
+    same = compare([runs[1]], ["neutral", "random"], episodes=3)
+    gap = same.entries[0].gap
+    assert gap is not None
+    assert figures["controllers"]["trained"]["gap"]["mean"] == pytest.approx(float(gap.mean()))
+    assert json.loads((runs[1] / "evaluation.json").read_text()) == figures
