@@ -70,6 +70,7 @@ def rollout(
     controller: Controller,
     *,
     seed: int = EVALUATION_SEEDS,
+    start: Mapping[str, float] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Rollout:
     """Run one whole episode in every copy of ``env``.
@@ -78,9 +79,10 @@ def rollout(
         env: copy i is reset with ``seed + i``.
         controller: who acts.
         seed: first seed; the same seed gives every controller the same start states.
+        start: initial stocks and inner states that are given instead of drawn; see ``VectorEnv.reset``.
         progress: called with the number of intervals done.
     """
-    observations = env.reset(seed=seed)
+    observations = env.reset(seed=seed, options={"initial_state": start or {}})
     controller.start(env, seed)
     steps = env.network.episode.horizon
     shape = (env.num_envs, steps)

@@ -97,6 +97,35 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert run(monkeypatch, "report", "run", "--episodes", "4") == 0
 
 
+def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A controller's plan has units in its columns; a comparison without runs writes its four files."""
+    assert run(monkeypatch, "plan", "carbo_net", "--control", "neutral", "--out", "plan.csv") == 0
+    header, *rows = Path("plan.csv").read_text().splitlines()
+    assert header.startswith("from (day),to (day),")
+    assert len(rows) == 160
+    assert run(monkeypatch, "compare", "--network", "net_zero", "--controllers", "random", "--episodes", "2",
+               "--out", "out") == 0  # fmt: skip
+    printed = capsys.readouterr().out
+    assert "gap to bound: network 'net_zero'" in printed
+    assert "no bound is proved" in printed
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        "comparison.png",
+        "episodes.csv",
+        "summary.csv",
+        "summary.json",
+    ]
+
+
+def test_infeasible_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A service that nobody can deliver is said to be out of reach, with the most that can be had; no file is left."""
+    text = (folder("envs") / "README.md").read_text().split("```toml\n")[1].split("```")[0]
+    Path("bottles.toml").write_text(text.replace("low = { value = 95", "low = { value = 500"))
+    asked = ("plan", "bottles.toml", "--control", "optimum", "--min-service", "0.9", "--out", "p.csv")
+    assert run(monkeypatch, *asked) == 2
+    assert "no actions reach a mean service level of 0.9; at most 0." in capsys.readouterr().err
+    assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
+
+
 def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The CSV holds masses on the way and what an agent may see of inner states; the regulator runs where it can."""
     monkeypatch.chdir(tmp_path)
@@ -128,11 +157,21 @@ def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         (["simulate", "copper_net", "--control", "constant", "--set", "mine=nan"], "must lie in [-1, 1]"),
         (["simulate", "copper_net", "--set", "mine=0"], "goes with --control constant"),
         (["simulate", "copper_net", "--control", "lqr"], "rate controls multiply flows"),
+        (["plan", "copper_net", "--out", "p.csv"], "which control?"),
+        (["plan", "copper_net", "--control", "mcp", "--out", "p.csv"], "Did you mean 'mpc'?"),
+        (["plan", "copper_net", "--control", "lqr", "--out", "p.csv"], "rate controls multiply flows"),
+        (["plan", "net_zero", "--control", "optimum", "--out", "p.csv"], "no bound is proved"),
+        (["plan", "copper_net", "--control", "neutral", "--out", "no/p.csv"], "in a folder that exists"),
+        (["plan", "copper_net", "--control", "neutral", "--min-service", "1", "--out", "p.csv"], "goes with mpc"),
+        (["plan", "nowhere", "--out", "p.csv"], "nowhere: no such run directory"),
         (["compare"], "give a training run or a network"),
         (["compare", "nowhere"], "nowhere: no such run directory"),
         (["compare", "--network", "coper_net"], "Did you mean 'copper_net'?"),
         (["compare", "--network", "copper_net", "--controllers", "mcp"], "Did you mean 'mpc'?"),
-        (["compare", "--network", "copper_net", "--controllers", "lqr", "--out", "new"], "rate controls multiply flows"),
+        (
+            ["compare", "--network", "copper_net", "--controllers", "lqr", "--out", "new"],
+            "rate controls multiply flows",
+        ),
         (["compare", "--network", "net_zero", "--controllers", "lqr", "--out", "new"], "is no linear system"),
         (["compare", "--network", "net_zero", "--controllers", "mpc", "--out", "new"], "no bound is proved"),
         (["compare", "nowhere", "--scenario", "paper"], "goes with a network; runs have their own"),

@@ -10,10 +10,12 @@ import numpy as np
 import typer
 
 from cirl_marl.catalogue import load_network, networks, recipes
-from cirl_marl.cli.common import NetworkName, Scenario, Seed, app, bar, console, errors, plain
+from cirl_marl.cli.common import MinService, NetworkName, Scenario, Seed, app, bar, console, errors, plain, say
+from cirl_marl.controllers import Controller
 from cirl_marl.controllers.named import CONTROLLERS, SETTABLE, named_controller
 from cirl_marl.errors import CirlError, DefinitionError
 from cirl_marl.evaluate import Rollout, interval_ends, rollout
+from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
 
 
@@ -109,11 +111,65 @@ def simulate(
     time = interval_ends(found)
     _write_csv(folder / f"{name}.csv", env, time, run)
     save_trajectory(folder / f"{name}.png", found, time, run.stock.T, run.flow.T, run.circularity[0], load=run.load.T)
+    _say_figures(run, found)
+    console.print(f"wrote {folder / name}.csv and {folder / name}.png")
+
+
+@app.command()
+def plan(
+    source: Annotated[
+        str, typer.Argument(metavar="RUN | NETWORK", help="Training run; or with --control a network, as elsewhere.")
+    ],
+    out: Annotated[Path, typer.Option(help="CSV file to write.")],
+    control: Annotated[
+        str | None, typer.Option(help=f"Who acts in a network: {', '.join(CONTROLLERS)}; a run acts by its policies.")
+    ] = None,
+    scenario: Scenario = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Start as the first episode of this evaluation; default: mid-range.")
+    ] = None,
+    min_service: MinService = None,
+) -> None:
+    """Write what a policy or controller does in one episode: its actions in physical units over time, as CSV.
+
+    A row is a control interval: when it begins and ends, the value of every control (a flow ordered, a factor on what a
+    valve lets through, or an input of a model) with its unit, the resulting flows, circularity and service level.
+    """
+    from cirl_marl.schedule import schedule
+
+    if out.suffix != ".csv" or not out.parent.is_dir():
+        raise CirlError(f"--out {out}: needs the name of a .csv file in a folder that exists")
+    env, controller = _actor(source, control, scenario, min_service)
+    with bar("planning", env.network.episode.horizon) as progress:
+        found = schedule(env, controller, seed=seed, progress=progress)
+    found.write(out)
+    _say_figures(found.rollout, env.network)
+    say(f"wrote {out}")
+
+
+def _actor(
+    source: str, control: str | None, scenario: str | None, min_service: float | None
+) -> tuple[VectorEnv, Controller]:
+    if control is not None and (Path(source) / "config.json").is_file():
+        raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
+    if control is not None:
+        return VectorEnv(source, num_envs=1, scenario=scenario), named_controller(control, min_service=min_service)
+    if source in networks() or source.endswith(".toml"):
+        raise CirlError(f"plan {source}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
+    if scenario is not None or min_service is not None:
+        raise CirlError("--scenario and --min-service go with --control; a run has its own scenario and policies")
+    from cirl_marl.controllers.trained import Trained
+    from cirl_marl.learners.run import RunDirectory
+
+    run = RunDirectory(source)
+    return run.make_env(1), Trained(run)
+
+
+def _say_figures(run: Rollout, network: Network) -> None:
     console.print(
-        f"λ̄ = {float(run.episode_circularity[0]):.5g} {found.mass_unit}, "
+        f"λ̄ = {float(run.episode_circularity[0]):.5g} {network.mass_unit}, "
         f"service level {float(run.episode_service[0]):.4f}"
     )
-    console.print(f"wrote {folder / name}.csv and {folder / name}.png")
 
 
 def _held(control: str, settings: list[str]) -> dict[str, float]:

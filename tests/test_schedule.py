@@ -1,0 +1,76 @@
+"""Plans as tables: physical units, the same episode as a rollout, whole files."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cirl_marl.controllers import Constant, Neutral, Random
+from cirl_marl.errors import CirlError
+from cirl_marl.evaluate import first_seed, rollout
+from cirl_marl.schedule import schedule
+from cirl_marl.vector_env import VectorEnv
+
+
+def test_neutral_plan_holds_the_neutral_controls() -> None:
+    """Valve factors and orders are the definition's neutral values, at every interval, in its units."""
+    env = VectorEnv("copper_net", num_envs=1, horizon=4)
+    found = schedule(env, Neutral())
+    table = dict(zip(found.header, found.columns, strict=True))
+    np.testing.assert_allclose(table["from (day)"], [0.0, 0.25, 0.5, 0.75])
+    np.testing.assert_allclose(table["to (day)"], [0.25, 0.5, 0.75, 1.0])
+    for agent in env.agents:
+        control = env.network.compartments[agent].control
+        assert control is not None
+        column = {"rate": "valve factor (1)", "flow": "flow ordered (kt/day)"}[control.kind.value]
+        np.testing.assert_allclose(table[f"{agent}: {column}"], control.neutral)
+    np.testing.assert_array_equal(table["mean circularity (kt)"], found.rollout.circularity_mean[0])
+
+
+def test_orders_have_the_unit_of_a_flow() -> None:
+    """A control that sets a flow is tabulated in mass/time, at the value that the action stands for."""
+    env = VectorEnv("carbo_net", num_envs=1, horizon=2)
+    agent, control = next(
+        (a, c) for a in env.agents if (c := env.network.compartments[a].control) is not None and c.kind.value == "flow"
+    )
+    found = schedule(env, Constant({agent: 1.0}))
+    unit = f"{env.network.mass_unit}/{env.network.time_unit}"
+    column = found.columns[found.header.index(f"{agent}: flow ordered ({unit})")]
+    np.testing.assert_allclose(column, control.high)
+
+
+def test_inputs_of_models_are_named() -> None:
+    """Inputs carry the name of the model, which ends in the unit; the physics runs from mid-range stocks."""
+    found = schedule(VectorEnv("net_zero", num_envs=1, horizon=3), Neutral())
+    assert {"digester: dilution_per_day", "microalgae: light_umol_m2_s"} <= set(found.header)
+    assert np.isfinite(found.columns).all()
+
+
+def test_seeded_plan_is_an_episode_of_the_evaluation() -> None:
+    """With a seed the plan is the first episode that an evaluation with this seed sees; else it starts mid-range."""
+    env = VectorEnv("copper_net", num_envs=1, horizon=3)
+    found = schedule(env, Random(), seed=2)
+    again = rollout(env, Random(), seed=first_seed(2))
+    np.testing.assert_array_equal(found.rollout.circularity, again.circularity)
+    assert not np.array_equal(schedule(env, Neutral()).rollout.stock, schedule(env, Neutral(), seed=2).rollout.stock)
+
+
+def test_file(tmp_path: Path) -> None:
+    """A header and a row for each interval; no folder, no file."""
+    found = schedule(VectorEnv("copper_net", num_envs=1, horizon=5), Neutral())
+    found.write(tmp_path / "plan.csv")
+    with (tmp_path / "plan.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert tuple(header) == found.header
+    np.testing.assert_allclose(np.array(rows, dtype=float).T, found.columns, rtol=1e-9)
+    with pytest.raises(CirlError, match="does not exist"):
+        found.write(tmp_path / "no" / "plan.csv")
+
+
+def test_several_copies_are_refused() -> None:
+    """A plan is of one episode."""
+    with pytest.raises(CirlError, match="of one copy"):
+        schedule(VectorEnv("copper_net", num_envs=2), Neutral())
