@@ -116,10 +116,53 @@ def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     ]
 
 
+def bottles(**changes: str) -> None:
+    """Write the small network of the guide as ``bottles.toml``, with some texts replaced."""
+    text = (folder("envs") / "README.md").read_text().split("```toml\n")[1].split("```")[0]
+    for old, new in {"value = 60": "value = 7", **changes}.items():
+        text = text.replace(old, new)
+    Path("bottles.toml").write_text(text)
+
+
+def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Both fronts are printed, tabulated and drawn in one picture; the runs stay."""
+    bottles()
+    asked = ("--agents", "independent_a2c", "--points", "2", "--steps", "320", "--episodes", "2", "--out", "out")
+    assert run(monkeypatch, "pareto", "bottles.toml", *asked) == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("bound    service", "plan     service", "(weight 1, seed 0)"))
+    assert {path.name for path in Path("out").iterdir()} == {"pareto.csv", "pareto.json", "pareto.png", "runs"}
+
+
+def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A run of another network, a plan of a run under a controller, a recipe of other agents: nothing is written."""
+    bottles()
+    options = ("--agents", "independent_a2c", "--steps", "320", "--envs", "8", "--episodes", "2", "--out", "run")
+    assert run(monkeypatch, "train", "bottles.toml", *options) == 0
+    assert run(monkeypatch, "plan", "run", "--out", "plan.csv") == 0
+    assert Path("plan.csv").read_text().startswith("from (day),to (day),quarry: valve factor (1),")
+    assert run(monkeypatch, "compare", "run", "--episodes", "2", "--out", "compared") == 0
+    capsys.readouterr()
+    recipe = (folder("agents") / "independent_a2c.toml").read_text()
+    Path("recipe.toml").write_text(f'{recipe}\n[[match]]\nagents = ["quary"]\nalgorithm = "PPO"\n')
+    before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
+    for arguments, message in (
+        (["compare", "run", "--network", "copper_net", "--out", "new"], "network 'bottles', not 'copper_net'"),
+        (["compare", "run", "run", "--out", "new"], "the same recipe and seed 0"),
+        (["plan", "run", "--control", "mpc", "--out", "new.csv"], "leave out --control"),
+        (["plan", "run", "--scenario", "crisis", "--out", "new.csv"], "a run has its own scenario"),
+        (["pareto", "bottles.toml", "--agents", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
+        (["train", "bottles.toml", "--agents", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
+        (["compare", "run", "--out", "recipe.toml"], "is a file, not a folder"),
+    ):
+        assert run(monkeypatch, *arguments) == 2
+        assert message in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in Path().rglob("*")} == before
+
+
 def test_infeasible_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A service that nobody can deliver is said to be out of reach, with the most that can be had; no file is left."""
-    text = (folder("envs") / "README.md").read_text().split("```toml\n")[1].split("```")[0]
-    Path("bottles.toml").write_text(text.replace("low = { value = 95", "low = { value = 500"))
+    bottles(**{"low = { value = 95": "low = { value = 500"})
     asked = ("plan", "bottles.toml", "--control", "optimum", "--min-service", "0.9", "--out", "p.csv")
     assert run(monkeypatch, *asked) == 2
     assert "no actions reach a mean service level of 0.9; at most 0." in capsys.readouterr().err
@@ -164,6 +207,8 @@ def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         (["plan", "copper_net", "--control", "neutral", "--out", "no/p.csv"], "in a folder that exists"),
         (["plan", "copper_net", "--control", "neutral", "--min-service", "1", "--out", "p.csv"], "goes with mpc"),
         (["plan", "nowhere", "--out", "p.csv"], "nowhere: no such run directory"),
+        (["pareto", "net_zero", "--out", "new"], "no bound is proved"),
+        (["pareto", "coper_net", "--out", "new"], "Did you mean 'copper_net'?"),
         (["compare"], "give a training run or a network"),
         (["compare", "nowhere"], "nowhere: no such run directory"),
         (["compare", "--network", "coper_net"], "Did you mean 'copper_net'?"),

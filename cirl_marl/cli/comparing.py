@@ -1,4 +1,4 @@
-"""``cirl compare``: policies and controllers against each other and the best possible."""
+"""``cirl compare | pareto``: policies and controllers against each other and the best possible."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from cirl_marl.cli.common import Episodes, MinService, Scenario, Seed, app, console, folder_for, say, shares
+from cirl_marl.cli.common import (
+    Episodes,
+    MinService,
+    NetworkName,
+    Scenario,
+    Seed,
+    app,
+    console,
+    folder_for,
+    say,
+    shares,
+)
 from cirl_marl.controllers.named import CONTROLLERS
 
 
@@ -60,3 +71,55 @@ def compare(
         asked = {"controllers": names, "episodes": episodes, "seed": seed, "min_service": min_service}
         for path in write_comparison(found, folder, **asked):
             say(f"wrote {path}")
+
+
+@app.command()
+def pareto(
+    network: NetworkName,
+    agents: Annotated[
+        str | None, typer.Option(help="Learner recipe to train with several weights; default: bound and plans only.")
+    ] = None,
+    points: Annotated[int, typer.Option(min=2, help="Service levels of the bound, and weights of the learners.")] = 5,
+    seeds: Annotated[int, typer.Option(min=1, help="Training seeds of each weight: 0, 1, …")] = 1,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Environment steps of each training; default: the recipe's.")
+    ] = None,
+    episodes: Episodes = 16,
+    scenario: Scenario = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK.")
+    ] = None,
+) -> None:
+    """Draw service against circularity: what is possible, what plans achieve, what learners reach.
+
+    The bound is swept over the service demanded, the learners over the weight of circularity in their reward, 0 to 1.
+    Finished trainings are kept: the same command goes on where it was stopped.
+    """
+    from cirl_marl.pareto import pareto as swept
+
+    folder = folder_for(out or Path("runs") / f"pareto-{Path(network).stem}", "--out")
+    try:
+        with shares() as progress:
+            found = swept(
+                network,
+                agents,
+                directory=folder,
+                scenario=scenario,
+                points=points,
+                seeds=seeds,
+                steps=steps,
+                episodes=episodes,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        say(f"\nstopped; finished trainings are kept in {folder}. The same command goes on.")
+        raise typer.Exit(130) from None
+    for kind in ("bound", "plan", "trained", "neutral"):
+        for point in found.of(kind):
+            about = "" if point.weight is None else f"  (weight {point.weight:.3g}, seed {point.seed})"
+            say(f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {found.network.mass_unit}{about}")
+    if found.reason:
+        say(f"no bound: {found.reason}")
+    asked = {"agents": agents, "points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
+    for path in found.write(folder, **asked):
+        say(f"wrote {path}")

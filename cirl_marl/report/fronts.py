@@ -28,7 +28,7 @@ class Series:
         name: in the legend.
         service: mean service levels, shape (points,).
         circularity: λ̄, shape (points,), mass.
-        joined: whether they make a front: a line through them by service.
+        joined: whether a line goes through them in their order.
     """
 
     name: str
@@ -54,11 +54,10 @@ def save_fronts(path: str | Path, network: Network, series: Sequence[Series], bo
     axes = figure.subplots()
     for place, each in enumerate(series):
         colour = SERIES[place % len(SERIES)]
-        order = np.argsort(each.service) if each.joined else np.arange(len(each.service))
         line = DASHES[place % len(DASHES)] if each.joined else ""
         axes.plot(
-            each.service[order],
-            each.circularity[order],
+            each.service,
+            each.circularity,
             color=colour,
             marker=MARKERS[place % len(MARKERS)],
             linestyle=line,

@@ -1,0 +1,87 @@
+"""Sweeps between service and circularity: bounds above plans, trainings kept, honest where nothing is proved."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cirl_marl.definition import read_network
+from cirl_marl.errors import CirlError, RunError
+from cirl_marl.network import Network
+from cirl_marl.optimum import NoCertificate
+from cirl_marl.pareto import FILES, Sweep, pareto
+
+GUIDE = Path(__file__).parent.parent / "envs" / "README.md"
+
+
+@pytest.fixture(scope="module")
+def bottles(tmp_path_factory: pytest.TempPathFactory) -> Network:
+    """Return the small network of the guide, for a fortnight."""
+    text = GUIDE.read_text().split("```toml\n")[1].split("```")[0]
+    path = tmp_path_factory.mktemp("definition") / "bottles.toml"
+    path.write_text(text.replace("horizon = { value = 60", "horizon = { value = 14"))
+    return read_network(path)
+
+
+def swept(network: Network, directory: Path, **options: object) -> Sweep:
+    """Sweep with three weights and a short training."""
+    return pareto(network, "independent_a2c", directory=directory, points=3, steps=320, episodes=2, **options)  # type: ignore[arg-type]
+
+
+def test_bounds_are_above_plans(bottles: Network, tmp_path: Path) -> None:
+    """More service costs circularity; each plan delivers what was demanded and stays below its bound."""
+    found = pareto(bottles, directory=tmp_path, points=4)
+    bounds, plans = found.of("bound"), found.of("plan")
+    assert len(bounds) == len(plans) >= 3
+    assert (np.diff([each.service for each in bounds]) > 0).all()
+    assert (np.diff([each.circularity for each in bounds]) <= 1e-9).all()
+    for most, plan in zip(bounds, plans, strict=True):
+        assert plan.service >= most.service - 1e-3
+        assert plan.circularity <= most.circularity + 1e-9 or plan.service < most.service
+        assert plan.circularity == pytest.approx(most.circularity, rel=0.05)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_trainings_are_kept(bottles: Network, tmp_path: Path) -> None:
+    """Every weight is trained once; the second time nothing is, and the figures are the same."""
+    found = swept(bottles, tmp_path)
+    assert [each.weight for each in found.of("trained")] == [0.0, 0.5, 1.0]
+    stamps = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("status.json")}
+    assert len(stamps) == 3
+    again = swept(bottles, tmp_path)
+    assert again.points == found.points
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("status.json")} == stamps
+    assert [path.name for path in found.write(tmp_path / "out", points=3)] == list(FILES)
+    with (tmp_path / "out" / "pareto.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["kind"] for row in rows].count("trained") == 3
+    assert {row["circularity weight"] for row in rows} == {"", "0.0", "0.5", "1.0"}
+    longer = pareto(bottles, "independent_a2c", directory=tmp_path / "other", points=2, steps=640, episodes=2)
+    (tmp_path / "runs").rename(tmp_path / "old")
+    (tmp_path / "other" / "runs").rename(tmp_path / "runs")
+    assert len(longer.runs) == 2
+    with pytest.raises(RunError, match=r"another sweep \(640 steps, not 320\); choose another folder"):
+        swept(bottles, tmp_path)
+
+
+def test_network_without_certificate(tmp_path: Path) -> None:
+    """Only the learners have a front, with the reason; without learners there is nothing to show."""
+    with pytest.raises(NoCertificate, match="no bound is proved"):
+        pareto("net_zero", directory=tmp_path)
+    found = pareto("net_zero", "independent_a2c", directory=tmp_path, points=2, steps=320, episodes=2)
+    assert found.of("bound") == found.of("plan") == []
+    assert len(found.of("trained")) == 2
+    assert "no bound is proved" in found.reason
+
+
+def test_weight_without_effect_is_refused(bottles: Network, tmp_path: Path) -> None:
+    """A reward in which the weight has no part cannot be swept; nothing is trained."""
+    recipe = (GUIDE.parent.parent / "agents" / "independent_a2c.toml").read_text()
+    path = tmp_path / "team.toml"
+    path.write_text(recipe + '\n[environment]\nreward = "circularity"\n')
+    with pytest.raises(CirlError, match="the weight of circularity has no part"):
+        pareto(bottles, path, directory=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
