@@ -30,8 +30,8 @@ wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clea
 	build/clean/bin/python -m pip install --disable-pip-version-check --quiet -c constraints.txt dist/*.whl
 	$(PYTHON) tests/installed.py build/clean
 
-study: $(VENV)/.runtime  ## five seeds of the default recipe on each network (about half an hour)
-	$(BIN)/python benchmarks/learning.py --markdown runs/study.md
+study: $(VENV)/.runtime  ## every recipe and controller on every network, against the bound (hours; it can be stopped)
+	$(BIN)/python benchmarks/study.py
 
 speed: $(VENV)/.runtime  ## table of speed ratios
 	$(PIP) install --quiet -c constraints.txt -e '.[benchmarks]'
