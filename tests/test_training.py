@@ -404,3 +404,13 @@ def test_budgets_are_whole_numbers(options: dict[str, Any]) -> None:
     """Zero, negative and fractional budgets are errors that name the option; none falls back on a default."""
     with pytest.raises(cirl_marl.CirlError, match=f"{next(iter(options))} must be a whole number"):
         train("copper_net", ppo_recipe(), **options)
+
+
+def test_run_opens_with_the_horizon_that_it_was_trained_with(tmp_path: Path) -> None:
+    """Whether the horizon came as an option or in the network itself."""
+    network = cirl_marl.load_network("carbo_net").with_options(episode={"horizon": 7})
+    in_network = train(network, ppo_recipe(), directory=tmp_path / "network", steps=4)
+    as_option = train("carbo_net", ppo_recipe(), directory=tmp_path / "option", steps=4, horizon=7)
+    for training in (in_network, as_option):
+        assert training.run is not None
+        assert training.run.make_env(1).network.episode.horizon == 7

@@ -309,9 +309,8 @@ def resume(directory: str | Path, *, report: Callable[[Progress], None] | None =
 
 def _create(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
     """Start the run directory; the definition is copied if it is still what was trained on, and written if not."""
-    asked: dict[str, dict[str, object]] = {"episode": {"horizon": network.episode.horizon}}
-    if "circularity_weight" in config.options:
-        asked["objective"] = {"circularity_weight": network.objective.circularity_weight}
+    groups = {"horizon": ("episode", network.episode), "circularity_weight": ("objective", network.objective)}
+    asked = {group: {name: getattr(now, name)} for name, (group, now) in groups.items() if name in config.options}
     source = network.source
     if source is not None and source.is_file():
         read = load_network(source, scenario=network.scenario_name).with_options(**asked)
