@@ -112,7 +112,7 @@ def main(
     recipes: Annotated[list[str] | None, typer.Option("--recipe", help="Recipes; default: all of the study.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Training seeds 0, 1, …")] = 5,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of every run, for a trial.")] = None,
-    episodes: Annotated[int, typer.Option(min=2, help="Evaluation episodes of each run.")] = 32,
+    episodes: Annotated[int, typer.Option(min=2, help="Evaluation episodes of each run.")] = 16,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 2,
     table: Annotated[bool, typer.Option("--table", help="Train nothing: only what is complete is compared.")] = False,
     document: Annotated[Path, typer.Option(help="Whose tables are written.")] = DOCUMENT,
