@@ -24,14 +24,19 @@ from rich.console import Console
 from rich.progress import Progress
 
 import cirl_marl
-from cirl_marl.comparison import Comparison, Row, compare
+from cirl_marl.comparison import Comparison, Row, compare, yardstick
+from cirl_marl.comparison.compare import starting_stocks
 from cirl_marl.comparison.files import write_comparison
+from cirl_marl.controllers import LQR, Controller, Neutral
+from cirl_marl.controllers.mpc import MPC, SERVICE_FIRST
 from cirl_marl.errors import CirlError, RunError, unknown
+from cirl_marl.evaluate import first_seed, rollout
 from cirl_marl.learners import RunDirectory, load_recipe, train
 from cirl_marl.learners.run import versions, write_atomically, write_json
 from cirl_marl.network import Floats
 from cirl_marl.report.style import SERIES, dressed, save
-from cirl_marl.statistics import Aggregate, interquartile_mean, over_seeds
+from cirl_marl.statistics import Aggregate, interquartile_mean, over_episodes, over_seeds
+from cirl_marl.vector_env import VectorEnv
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
 PICTURES = DOCUMENT.parent / "pictures"
@@ -70,6 +75,11 @@ CASES = {
     "net_zero": Case(SMALL),
     "solids_net": Case(SMALL, ("random", "neutral", "scripted"), {"reward": "mixed"}),
 }
+LQR_CASES: tuple[tuple[str, str, dict[str, float] | None], ...] = (
+    ("copper_net", "use_to_collection", None),
+    ("carbo_net", "urban_to_capture", {"urban_air": 637.2}),
+)
+"""Networks, the one agent that acts, and set-points other than the definition's; LQR is for flows that are set."""
 CREDIT = ("circularity", "difference")
 """Rewards that the section on difference rewards sets against each other."""
 CREDIT_STEPS = 30_720
@@ -137,6 +147,8 @@ def main(
     done = [job for job in credit if (job.directory / "study.json").is_file()]
     if len(done) == len(credit) and credit:
         sections["difference"] = "\n".join(_credit_table(done))
+    if not only:
+        sections["lqr"] = "\n".join(_lqr_table(episodes))
     sections["made"] = _made()
     _write(document, sections)
 
@@ -222,6 +234,30 @@ def _figure(found: Aggregate | None, form: str, *, interval: bool = True) -> str
     if not interval or not np.isfinite(found.low):
         return form.format(found.value)
     return f"{form.format(found.value)} [{form.format(found.low)}, {form.format(found.high)}]"
+
+
+def _lqr_table(episodes: int) -> Iterator[str]:
+    """Compare LQR, MPC and neutral control where a single agent acts."""
+    yield "| network | who acts | controller | λ̄ | service level | bound | gap to the bound |"
+    yield "|-|-|-|-|-|-|-|"
+    for name, agent, set_points in LQR_CASES:
+        env = VectorEnv(name, num_envs=episodes, agents=[agent])
+        starts = starting_stocks(env, first_seed(0))
+        acting: dict[str, Controller] = {
+            "neutral": Neutral(),
+            "lqr": LQR(set_points=set_points),
+            "mpc": MPC(service_weight=SERVICE_FIRST),
+        }
+        runs = {label: rollout(env, each, seed=first_seed(0)) for label, each in acting.items()}
+        levels = [float(run.episode_service.mean()) for run in runs.values()]
+        measure = yardstick(env.network, env.agents, starts, levels)
+        for label, run in runs.items():
+            proved = measure.at(starts, run.episode_service)
+            assert proved is not None
+            gap = over_episodes((proved - run.episode_circularity) / np.abs(proved))
+            cells = [_figure(over_episodes(each), "{:.4g}") for each in (run.episode_circularity, run.episode_service)]
+            shown = _figure(over_episodes(proved), "{:.4g}", interval=False)
+            yield f"| {name} | {agent} | {label} | {' | '.join(cells)} | {shown} | {_figure(gap, '{:.1%}')} |"
 
 
 def _credit_table(jobs: Sequence[Job]) -> Iterator[str]:
