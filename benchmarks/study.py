@@ -49,7 +49,7 @@ class Case:
     """What is compared on a network.
 
     Attributes:
-        steps: environment steps by recipe; roughly equal computing time on one network.
+        steps: environment steps by recipe; a joint learner computes least per step.
         controllers: that need no training and fit the network.
         options: of the environment, for the recipes that would be paid by ``team``.
     """
@@ -65,7 +65,7 @@ LARGE = {
     "difference_ppo": 60_000,
     "shared_ppo": 80_000,
     "mappo": 80_000,
-    "joint_ppo": 400_000,
+    "joint_ppo": 1_500_000,
     "joint_sac": 30_000,
 }
 SMALL = dict.fromkeys(RECIPES, 10_240) | {"joint_sac": 7_680}

@@ -84,8 +84,9 @@ def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.Monke
 
 def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A run is trained, evaluated on fresh seeds, drawn, and evaluated again."""
+    bottles()
     arguments = ["--steps", "6000", "--envs", "32", "--seed", "3", "--out", "run", "--episodes", "4"]
-    assert run(monkeypatch, "train", "carbo_net", *arguments) == 0
+    assert run(monkeypatch, "train", "bottles.toml", *arguments) == 0
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("joint steps/s", "trained", "neutral", "random", "gain over neutral"))
     for name in ("evaluation.json", "metrics.csv", "config.json", "versions.json"):
@@ -93,7 +94,8 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     pictures = {path.name for path in Path("run/pictures").iterdir()}
     assert pictures == {"flows_before_after.png", "circularity.png", "learning_curves.png"}
     assert run(monkeypatch, "evaluate", "run", "--episodes", "4", "--seed", "7") == 0
-    assert "local return of each agent" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "local return of each agent" in printed and "gap to bound" in printed
     assert run(monkeypatch, "report", "run", "--episodes", "4") == 0
 
 
