@@ -205,7 +205,7 @@ def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         (["plan", "copper_net", "--out", "p.csv"], "which control?"),
         (["plan", "copper_net", "--control", "mcp", "--out", "p.csv"], "Did you mean 'mpc'?"),
         (["plan", "copper_net", "--control", "lqr", "--out", "p.csv"], "rate controls multiply flows"),
-        (["plan", "net_zero", "--control", "optimum", "--out", "p.csv"], "no bound is proved"),
+        (["plan", "net_zero", "--control", "mpc", "--out", "p.csv"], "no bound is proved"),
         (["plan", "copper_net", "--control", "neutral", "--out", "no/p.csv"], "in a folder that exists"),
         (["plan", "copper_net", "--control", "neutral", "--min-service", "1", "--out", "p.csv"], "goes with mpc"),
         (["plan", "nowhere", "--out", "p.csv"], "nowhere: no such run directory"),

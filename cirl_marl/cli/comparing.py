@@ -46,6 +46,7 @@ def compare(
     Runs of one recipe with different seeds share a row: the interquartile mean over seeds with its bootstrap interval.
     The gap to the bound is to the highest circularity of any episode from the same start that serves at least as well.
     mpc and optimum solve linear programs for every episode: minutes for each on the larger networks.
+    Where nothing bounds a network, optimum is the best plan that a search by simulation finds, without certificate.
     """
     from cirl_marl.comparison import compare as compared
     from cirl_marl.comparison.files import write_comparison

@@ -135,6 +135,7 @@ def plan(
     A row is a control interval: when it begins and ends, the value of every control (a flow ordered, a factor on what a
     valve lets through, or an input of a model) with its unit, the resulting flows, circularity and service level.
     """
+    from cirl_marl.controllers.optimum import Optimum
     from cirl_marl.schedule import schedule
 
     if out.suffix != ".csv" or not out.parent.is_dir():
@@ -144,6 +145,8 @@ def plan(
         found = schedule(env, controller, seed=seed, progress=progress)
     found.write(out)
     _say_figures(found.rollout, env.network)
+    if isinstance(controller, Optimum) and controller.note:
+        say(controller.note)
     say(f"wrote {out}")
 
 

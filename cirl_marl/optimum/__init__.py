@@ -1,4 +1,4 @@
-"""The best achievable circularity: a proven upper bound, its certificate, and the plan it suggests."""
+"""The best achievable circularity: a proven upper bound, its certificate, its plan, and the best plan found."""
 
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.bound import Bound, Envelope
@@ -6,11 +6,13 @@ from cirl_marl.optimum.certificate import Certificate, Verification
 from cirl_marl.optimum.improve import improved
 from cirl_marl.optimum.maximise import bound, envelope
 from cirl_marl.optimum.plan import Plan, achieved
+from cirl_marl.optimum.search import Incumbent, search, search_each, standard_candidates
 
 __all__ = [
     "Bound",
     "Certificate",
     "Envelope",
+    "Incumbent",
     "NoCertificate",
     "Plan",
     "Verification",
@@ -18,4 +20,7 @@ __all__ = [
     "bound",
     "envelope",
     "improved",
+    "search",
+    "search_each",
+    "standard_candidates",
 ]

@@ -1,29 +1,51 @@
-"""The controller that carries out the plans of bounds, and what they achieve in the simulator."""
+"""The controller that carries out plans, and what those of bounds achieve in the simulator."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.errors import ControlError
 from cirl_marl.evaluate import Rollout, rollout
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.bound import Bound
+from cirl_marl.optimum.population import starting_states
 from cirl_marl.vector_env import VectorEnv
 
 SAME = 1e-9
 """Relative difference of starts that count as the same."""
 
 
+class Planned(Protocol):
+    """What has a plan: a bound, or an incumbent."""
+
+    @property
+    def network(self) -> Network:
+        """The network, under the scenario and horizon that the plan is for."""
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Who acts."""
+
+    @property
+    def initial(self) -> Floats:
+        """Stocks at the start, and inner states if there are any, the first of ``VectorEnv.state_names``."""
+
+    @property
+    def actions(self) -> Floats:
+        """Normalised actions, shape (steps, entries)."""
+
+
 class Plan:
     """Replays the actions of a plan, whatever it observes; each copy may have its own."""
 
-    def __init__(self, bounds: Bound | Sequence[Bound]) -> None:
-        """Take one bound for all copies, or one for each."""
-        self._bounds = [bounds] if isinstance(bounds, Bound) else list(bounds)
+    def __init__(self, plans: Planned | Sequence[Planned]) -> None:
+        """Take one bound or incumbent for all copies, or one for each."""
+        self._plans = list(plans) if isinstance(plans, Sequence) else [plans]
         self._actions = np.empty((0, 0, 0))
         self._step = 0
 
@@ -33,13 +55,11 @@ class Plan:
         Raises:
             ControlError: if the plan is not for ``env``: another network, horizon, choice of agents or start.
         """
-        if len(self._bounds) not in (1, env.num_envs):
-            raise ControlError(f"plan: {len(self._bounds)} plans for {env.num_envs} copies; give one, or one for each")
-        stock = env.physical.stock[: len(env.network.nodes)].T
-        for copy, start in enumerate(stock):
-            bound = self._bounds[copy % len(self._bounds)]
-            self._check(bound, env, start, copy)
-        actions = np.stack([bound.actions for bound in self._bounds], axis=1)
+        if len(self._plans) not in (1, env.num_envs):
+            raise ControlError(f"plan: {len(self._plans)} plans for {env.num_envs} copies; give one, or one for each")
+        for copy, start in enumerate(starting_states(env)):
+            self._check(self._plans[copy % len(self._plans)], env, start, copy)
+        actions = np.stack([plan.actions for plan in self._plans], axis=1)
         self._actions = np.broadcast_to(actions, (len(actions), env.num_envs, actions.shape[2]))
         ends = np.cumsum([0, *(len(neutral) for neutral in env.neutral_action.values())])
         self._entries = {a: slice(ends[i], ends[i + 1]) for i, a in enumerate(env.neutral_action)}
@@ -57,20 +77,22 @@ class Plan:
         self._step += 1
         return {agent: actions[:, entries] for agent, entries in self._entries.items()}
 
-    def _check(self, bound: Bound, env: VectorEnv, start: Floats, copy: int) -> None:
-        ours, theirs = bound.network, env.network
+    def _check(self, plan: Planned, env: VectorEnv, start: Floats, copy: int) -> None:
+        ours, theirs = plan.network, env.network
         if (ours.nodes, ours.arcs, ours.episode) != (theirs.nodes, theirs.arcs, theirs.episode):
             raise ControlError(
                 f"plan: it is for network '{ours.name}', scenario '{ours.scenario_name}', {ours.episode.horizon} steps,"
                 f" not for '{theirs.name}', '{theirs.scenario_name}', {theirs.episode.horizon} steps"
             )
-        if bound.agents != env.agents:
-            raise ControlError(f"plan: it is for agents {list(bound.agents)}, not {list(env.agents)}")
-        distant = np.abs(start - bound.initial) > SAME * bound.initial.sum()
+        if plan.agents != env.agents:
+            raise ControlError(f"plan: it is for agents {list(plan.agents)}, not {list(env.agents)}")
+        nodes = len(theirs.nodes)
+        size = np.concatenate([np.full(nodes, plan.initial[:nodes].sum()), np.abs(plan.initial[nodes:])])
+        distant = np.abs(start[: len(size)] - plan.initial) > SAME * size
         if distant.any():
-            node = int(distant.argmax())
-            planned = f"{bound.initial[node]:g} in '{ours.nodes[node].id}'"
-            raise ControlError(f"plan: it starts from {planned}, copy {copy} from {start[node]:g}")
+            row = int(distant.argmax())
+            planned = f"{plan.initial[row]:g} in '{env.state_names[row]}'"
+            raise ControlError(f"plan: it starts from {planned}, copy {copy} from {start[row]:g}")
 
 
 def achieved(bound: Bound) -> Rollout:

@@ -52,6 +52,8 @@ def comparison_notes(comparison: Comparison) -> list[str]:
         notes.append("bound: the highest λ̄ of any episode from the same start with at least the same service")
     elif comparison.yardstick.reason:
         notes.append(f"gap to bound: {comparison.yardstick.reason}")
+        if any(row.name == "optimum" for row in comparison.rows):
+            notes.append("optimum: the best plan found by search, no certificate")
     return notes
 
 
