@@ -19,7 +19,7 @@ from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe, resume, train
 from cirl_marl.learners.run import write_json
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum import NoCertificate, achieved, bound, improved
+from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
 from cirl_marl.results import provenance, published, write_table
 from cirl_marl.statistics import interquartile_mean
 from cirl_marl.vector_env import VectorEnv
@@ -59,6 +59,7 @@ class Sweep:
         points: of every kind.
         runs: training runs.
         reason: why there is no bound; empty if there is.
+        front: service levels and what the multipliers of all bounds prove there, shape (levels, 2).
     """
 
     network: Network
@@ -66,6 +67,7 @@ class Sweep:
     points: tuple[Point, ...]
     runs: tuple[RunDirectory, ...] = field(default=())
     reason: str = ""
+    front: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
     def of(self, kind: str) -> list[Point]:
         """Return the points of one kind."""
@@ -79,12 +81,11 @@ class Sweep:
         header = ["kind", "service level", f"circularity ({mass})", "circularity weight", "training seed"]
         plain = [[each.kind, each.service, each.circularity, each.weight, each.seed] for each in self.points]
         about = {"provenance": provenance(self.network, self.runs, **options), "no_bound": self.reason or None}
-        front = np.array([(each.service, each.circularity) for each in self.of("bound")]).reshape(-1, 2)
         with published(folder) as partial:
             write_table(partial / FILES[0], header, plain)
             write_json(partial / FILES[1], about | {"columns": header, "points": plain})
             title = f"{self.network.title or self.network.name}: service against circularity"
-            save_fronts(partial / FILES[2], self.network, list(self._series()), front, title=title)
+            save_fronts(partial / FILES[2], self.network, list(self._series()), self.front, title=title)
         return [folder / name for name in FILES]
 
     def _series(self) -> Iterator[Any]:
@@ -149,14 +150,15 @@ def pareto(
     share = 1.0 if chosen is None else points / (points + points * seeds)
     reason = ""
     possible: tuple[Point, ...] = ()
+    front = np.empty((0, 2))
     try:
-        possible = tuple(_possible(found, points, lambda what, part: progress(what, part * share)))
+        possible, front = _possible(found, points, lambda what, part: progress(what, part * share))
     except NoCertificate as missing:
         if chosen is None:
             raise
         reason, share = str(missing), 0.0
     if chosen is None:
-        return Sweep(found, None, possible)
+        return Sweep(found, None, possible, front=front)
     runs = []
     for place in range(points * seeds):
         asked = _Asked(found, chosen, place // seeds / (points - 1), place % seeds, steps)
@@ -166,7 +168,7 @@ def pareto(
     learnt = tuple(point for group in groups for point in _learnt(group, episodes))
     neutral = [each for each in learnt if each.kind == "neutral"][:1]
     trained = [each for each in learnt if each.kind == "trained"]
-    return Sweep(found, chosen, (*possible, *trained, *neutral), tuple(runs), reason)
+    return Sweep(found, chosen, (*possible, *trained, *neutral), tuple(runs), reason, front)
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,17 +231,21 @@ def _check_fit(network: Network, recipe: Recipe) -> None:
         )
 
 
-def _possible(network: Network, points: int, progress: Progress) -> Iterator[Point]:
-    """Yield bounds by demanded service, and what their improved plans do in the simulator."""
+def _possible(network: Network, points: int, progress: Progress) -> tuple[tuple[Point, ...], Floats]:
+    """Return bounds by demanded service, what their improved plans do in the simulator, and the front they prove."""
+    found: list[Point] = []
+    bounds: list[Bound] = []
     progress("bounds", 0.0)
     least, most = (bound(network, service_weight=weight).service for weight in (1 / SERVICE_FIRST, SERVICE_FIRST))
     for place, level in enumerate(_levels(least, most, points)):
         solved = bound(network, min_service=level)
-        yield Point(kind="bound", service=level, circularity=solved.objective)
+        bounds.append(solved)
+        found.append(Point(kind="bound", service=level, circularity=solved.objective))
         episode = achieved(improved(solved))
         service, circularity = float(episode.episode_service[0]), float(episode.episode_circularity[0])
-        yield Point(kind="plan", service=service, circularity=circularity)
+        found.append(Point(kind="plan", service=service, circularity=circularity))
         progress("bounds and plans", (place + 1) / points)
+    return tuple(found), Envelope(tuple(bounds)).front()
 
 
 def _levels(least: float, most: float, points: int) -> list[float]:

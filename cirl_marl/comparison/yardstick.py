@@ -26,7 +26,7 @@ class Yardstick:
 
     Attributes:
         envelope: proves them; None if nothing is proved.
-        front: service level and bound on λ̄ of each program at the mean start, shape (programs, 2), by service.
+        front: service levels and bounds on λ̄ at the mean start, shape (points, 2), by service.
         reason: why nothing is proved; empty if something is, or nothing was asked for.
     """
 
@@ -69,5 +69,5 @@ def yardstick(
     for level in levels:
         solved.append(bound(network, starts.mean(axis=0), min_service=level, agents=agents or None))
         progress()
-    front = np.array([(level, each.objective) for level, each in zip(levels, solved, strict=True)])
-    return Yardstick(Envelope(tuple(solved)), front)
+    envelope = Envelope(tuple(solved))
+    return Yardstick(envelope, envelope.front())
