@@ -21,7 +21,7 @@ EVERYWHERE = [(name, scenario) for name in networks() for scenario in (None, *lo
 
 @pytest.mark.parametrize(("name", "scenario"), EVERYWHERE)
 def test_plan_achieves_what_it_says_and_no_less_than_its_candidates(name: str, scenario: str | None) -> None:
-    """In each network a lone copy that replays the plan earns the figures that it was chosen for, bit for bit."""
+    """In each network a lone copy that replays the plan earns the figures that it was chosen for."""
     found = search(name, scenario=scenario, horizon=6, service_weight=1.0, knots=2, population=8, iterations=2)
     env = VectorEnv(name, scenario=scenario, num_envs=1, horizon=6)
     run = rollout(env, Plan(found))
