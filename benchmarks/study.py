@@ -249,8 +249,7 @@ def _lqr_table(episodes: int) -> Iterator[str]:
             "mpc": MPC(service_weight=SERVICE_FIRST),
         }
         runs = {label: rollout(env, each, seed=first_seed(0)) for label, each in acting.items()}
-        levels = [float(run.episode_service.mean()) for run in runs.values()]
-        measure = yardstick(env.network, env.agents, starts, levels)
+        measure = yardstick(env.network, env.agents, starts, [run.episode_service for run in runs.values()])
         for label, run in runs.items():
             proved = measure.at(starts, run.episode_service)
             assert proved is not None

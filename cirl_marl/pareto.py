@@ -14,6 +14,7 @@ import numpy as np
 from cirl_marl.catalogue import load_network
 from cirl_marl.comparison import compare
 from cirl_marl.comparison.contenders import differences
+from cirl_marl.comparison.yardstick import FRONT
 from cirl_marl.controllers.mpc import SERVICE_FIRST
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe, resume, train
@@ -245,7 +246,8 @@ def _possible(network: Network, points: int, progress: Progress) -> tuple[tuple[
         service, circularity = float(episode.episode_service[0]), float(episode.episode_circularity[0])
         found.append(Point(kind="plan", service=service, circularity=circularity))
         progress("bounds and plans", (place + 1) / points)
-    return tuple(found), Envelope(tuple(bounds)).front()
+    levels = np.linspace(least, most, FRONT)
+    return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels)], axis=1)
 
 
 def _levels(least: float, most: float, points: int) -> list[float]:

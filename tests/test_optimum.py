@@ -30,7 +30,7 @@ from cirl_marl import (
 from cirl_marl.controllers import Neutral
 from cirl_marl.evaluate import rollout
 from cirl_marl.flows import FlowLaws
-from cirl_marl.optimum import Bound, Certificate, Envelope, NoCertificate, Plan, achieved, bound, envelope, improved
+from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, improved
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verified
 from cirl_marl.optimum.maximise import starting_stocks
@@ -496,18 +496,3 @@ def test_bad_input(options: dict[str, object], said: str) -> None:
     """Options that cannot be used are named."""
     with pytest.raises(CirlError, match=said):
         bound(load_network("copper_net"), **options)  # type: ignore[arg-type]
-
-
-def test_front_lies_on_the_members_and_between_them() -> None:
-    """At the demanded levels the front is what was solved; between them it falls, and no other solution exceeds it."""
-    members = tuple(bound("carbo_net", min_service=level, horizon=6, degree=1) for level in (0.9, 0.97, 1 - 1e-6))
-    levels, proved = Envelope(members).front(11).T
-    for member in members:
-        assert member.min_service is not None
-        (here,) = np.flatnonzero(levels == member.min_service)
-        assert proved[here] == pytest.approx(member.objective, rel=1e-9)
-    assert (np.diff(levels) > 0).all() and (np.diff(proved) <= 0).all()
-    solved = bound("carbo_net", min_service=float(levels[3]), horizon=6, degree=1).objective
-    assert solved <= proved[3] + 1e-6 * abs(solved)
-    with pytest.raises(CirlError, match="demanded service"):
-        Envelope((bound("carbo_net", horizon=6, degree=1),)).front()

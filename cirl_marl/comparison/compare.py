@@ -202,9 +202,9 @@ def _measured(
     services: dict[str, list[Floats]] = {}
     for name, run in zip(names, rollouts, strict=True):
         services.setdefault(name, []).append(run.episode_service)
-    levels = [float(np.mean(each)) for each in services.values()]
+    delivered = [np.mean(each, axis=0) for each in services.values()]
     try:
-        measure = yardstick(env.network, env.agents, starts, levels, progress=progress)
+        measure = yardstick(env.network, env.agents, starts, delivered, progress=progress)
         return measure, [measure.at(starts, run.episode_service) for run in rollouts]
     except NoCertificate as missing:
         return _unproved(len(rollouts), str(missing))

@@ -1,23 +1,28 @@
 """How good each episode could have been: bounds on λ̄ for its own start and the service that it delivered.
 
 An episode is held against the best λ̄ of those that deliver at least as much, so that none looks good by starving the
-service. A program is solved for each row of a comparison, at the mean start and the mean service; the multipliers prove
-a bound for every other start and service, so that no episode needs a program of its own.
+service. For each row of a comparison two programs are solved, at the mean start and where that one proves least; their
+multipliers prove a bound for every other start and service, so that no episode needs a program of its own.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum import Envelope, bound
+from cirl_marl.optimum import Bound, Envelope, envelope
 
 STEP = 1e-4
-"""Service levels are demanded in these steps, rounded down: rows that hardly differ share a program."""
+"""Service levels are demanded in these steps, rounded down: rows that hardly differ share their programs."""
+MARGIN = 1e-6
+"""Kept from the highest service that can be had, where the solver's tolerance would call the program infeasible."""
+SOLVES = 2
+"""Programs of each row; docs/bound.md shows what more would change."""
+FRONT = 41
+"""Service levels at which the front is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,27 +52,31 @@ def yardstick(
     network: Network,
     agents: Sequence[str],
     starts: Floats,
-    services: Sequence[float],
+    services: Sequence[Floats],
     *,
     progress: Callable[[], None] = lambda: None,
 ) -> Yardstick:
-    """Solve the program at the mean of ``starts`` for each of some mean service levels.
+    """Solve the programs for the service levels that some rows delivered.
 
     Args:
         network: under its scenario and horizon.
         agents: who acts.
         starts: shape (episodes, nodes), mass.
-        services: mean service levels.
-        progress: called after each.
+        services: mean service levels of each row, shape (episodes,).
+        progress: called after each row.
 
     Raises:
         NoCertificate: if the network has flows for which nothing is proved.
         CirlError: if the solver fails.
     """
-    levels = sorted({max(0.0, math.floor(level / STEP) * STEP) for level in services})
-    solved = []
-    for level in levels:
-        solved.append(bound(network, starts.mean(axis=0), min_service=level, agents=agents or None))
+    members: dict[int, tuple[Bound, ...]] = {}
+    for service in services:
+        demanded = np.maximum(np.floor((service - MARGIN) / STEP) * STEP, 0.0)
+        level = round(float(demanded.mean()) / STEP)
+        if level not in members:
+            solved = envelope(network, starts, solves=SOLVES, min_service=demanded, agents=agents or None)
+            members[level] = solved.members
         progress()
-    envelope = Envelope(tuple(solved))
-    return Yardstick(envelope, envelope.front())
+    everyone = Envelope(tuple(each for level in sorted(members) for each in members[level]))
+    levels = STEP * np.linspace(min(members), max(members), FRONT)
+    return Yardstick(everyone, np.stack([levels, everyone.at(starts.mean(axis=0), levels)], axis=1))

@@ -123,20 +123,6 @@ class Envelope:
             proved[i] = min(verified(problem, each.certificate, each.solution).bound for each in self.members)
         return proved.reshape(shape)
 
-    def front(self, points: int = 41) -> Floats:
-        """Return demanded service levels, from the members' least to their highest, and the bounds there.
-
-        For bounds on λ̄ with a demanded service, from the start of the first member; shape (points, 2).
-
-        Raises:
-            CirlError: if the members demand no service.
-        """
-        demanded = [each.min_service for each in self.members if each.min_service is not None]
-        if not demanded:
-            raise CirlError("a front needs bounds with a demanded service (min_service)")
-        levels = np.unique(np.concatenate([demanded, np.linspace(min(demanded), max(demanded), points)]))
-        return np.stack([levels, self.at(min_service=levels)], axis=1)
-
 
 def check_stocks(network: Network, stocks: Floats) -> None:
     """Refuse stocks, shape (nodes,), that no episode can start from.
