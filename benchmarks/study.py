@@ -145,7 +145,7 @@ def main(
         shutil.copyfile(RESULTS / name / "comparison.png", PICTURES / f"study_{name}.png")
         sections[name] = "\n".join(_table(comparison, runs))
     done = [job for job in credit if (job.directory / "study.json").is_file()]
-    if len(done) == len(credit) and credit:
+    if {dict(job.options)["reward"] for job in done} == set(CREDIT):
         sections["difference"] = "\n".join(_credit_table(done))
     if not only:
         sections["lqr"] = "\n".join(_lqr_table(episodes))
@@ -171,7 +171,7 @@ def _credit_jobs(out: Path, seeds: int, steps: int | None) -> Iterator[Job]:
 
 
 def _train(jobs: Sequence[Job], workers: int) -> None:
-    """Run what is missing, the longest first come, several at a time."""
+    """Run what is missing, several at a time."""
     missing = [job for job in jobs if not (job.directory / "study.json").is_file()]
     with Progress(console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("training", total=len(missing))
@@ -265,15 +265,15 @@ def _credit_table(jobs: Sequence[Job]) -> Iterator[str]:
     _draw_credit(curves)
     start = interquartile_mean([curve[1][0] for each in curves.values() for curve in each])
     best = max(interquartile_mean([curve[1][-1] for curve in each]) for each in curves.values())
-    yield "| reward | λ̄ of the last training episodes (kt) | environment steps to half of the better one's gain |"
-    yield "|-|-|-|"
+    yield "| reward | λ̄ of the last training episodes (kt) | steps to half of the better one's gain | seeds |"
+    yield "|-|-|-|-|"
     for reward, each in curves.items():
         last = over_seeds([[float(curve[1][-3:].mean()) for curve in each]])
         half = [_first(curve, (start + best) / 2) for curve in each]
         reached = [steps for steps in half if steps is not None]
         every = len(reached) == len(half)
         when = _figure(over_seeds([reached]), "{:,.0f}") if every else f"reached by {len(reached)} of {len(half)} seeds"
-        yield f"| {reward} | {_figure(last, '{:.4g}')} | {when} |"
+        yield f"| {reward} | {_figure(last, '{:.4g}')} | {when} | {len(each)} |"
     yield ""
     yield "![λ̄ while learning](pictures/study_difference.png)"
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
@@ -34,6 +36,12 @@ settings.load_profile("cirl_marl")
 
 ROLES = list(Role)
 LAWS = [law for law in Law if law is not Law.COMPARTMENT]
+
+
+@pytest.fixture
+def make_network() -> Callable[[int, int, int], Network]:
+    """``random_network``, for tests of one that once failed."""
+    return random_network
 
 
 def random_network(seed: int, nodes: int, arcs: int) -> Network:

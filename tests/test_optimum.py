@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -92,6 +93,14 @@ def episodes(network: Network, seed: int) -> tuple[Floats, Floats, Floats]:
         service += outcome.service_level / network.episode.horizon
         highest = np.maximum(highest, env.physical.stock[: len(network.nodes)])
     return circularity, service, highest.max(axis=1)
+
+
+def test_presolve_is_not_believed(make_network: Callable[[int, int, int], Network]) -> None:
+    """HiGHS's presolve calls the program of this network infeasible; neutral control solves it."""
+    network = certifiable(make_network(431, 9, 8), 0.03125, pulls=True)
+    start = [node.initial[1] for node in network.nodes]
+    found = bound(network, start)
+    assert found.verify().bound == found.objective
 
 
 @given(

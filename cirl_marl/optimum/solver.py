@@ -83,6 +83,7 @@ def solve(problem: Program, basis: Basis | None = None) -> Solution:
         return solve(problem)
     if basis is None and highs.getModelStatus() != highspy.HighsModelStatus.kOptimal:
         highs.setOptionValue("solver", "simplex")  # slower and steadier
+        highs.setOptionValue("presolve", "off")  # its own tolerance is too small for rows that fix a stock twice over
         highs.clearSolver()
         highs.run()
     status = highs.getModelStatus()
