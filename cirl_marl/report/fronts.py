@@ -59,7 +59,7 @@ def save_fronts(path: str | Path, network: Network, series: Sequence[Series], bo
             each.service,
             each.circularity,
             color=colour,
-            marker=MARKERS[place % len(MARKERS)],
+            marker=MARKERS[(place + place // len(SERIES)) % len(MARKERS)],  # colours come round before pairs do
             linestyle=line,
             linewidth=1.4,
             alpha=0.9,
