@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.errors import RunError
-from cirl_marl.learners.run import write_json
+from cirl_marl.learners.run import write_atomically
 
 CURVE_POINTS = 500
 WINDOW = 100
@@ -156,11 +156,25 @@ class Results:
         """Keep a result, in one step."""
         self.path.mkdir(parents=True, exist_ok=True)
         figures = {"gain": result.gain, "gain_per_step": result.gain_per_step}
-        write_json(self.file(result.row), asdict(result) | figures)
+        text = _one_line_each(asdict(result) | figures)
+        write_atomically(self.file(result.row), lambda partial: partial.write_text(text))
 
     def all(self) -> list[Result]:
         """Return every result in the directory, by file name."""
         return [_read(path) for path in sorted(self.path.glob("*.json")) if not path.name.startswith(".")]
+
+
+def _one_line_each(plain: dict[str, Any]) -> str:
+    """Return JSON with a line for each key, so that a learning curve is one line and not a thousand.
+
+    >>> print(_one_line_each({"episodes": 2, "curve": [(50, -2.0), (100, -1.0)]}), end="")
+    {
+      "episodes": 2,
+      "curve": [[50, -2.0], [100, -1.0]]
+    }
+    """
+    lines = (f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in plain.items())
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def _read(path: Path) -> Result:
