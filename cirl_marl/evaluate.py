@@ -12,7 +12,7 @@ from cirl_marl.controllers.basic import Controller
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.staged import CIRO_FACTOR
-from cirl_marl.statistics import estimate
+from cirl_marl.statistics import over_episodes
 from cirl_marl.vector_env import VectorEnv
 
 EVALUATION_SEEDS = 2**31
@@ -144,23 +144,27 @@ def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
 def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
     """Return the figures of each controller beside those of ``neutral``, ready for JSON.
 
-    Each figure is a mean over episodes with the half-width of its 95 % confidence interval; gains are paired, episode
-    by episode, with the neutral controller's from the same start. A network that states the criticality of its material
-    has its time-window circularity as well (see ``staged.time_window_circularity``).
+    Each figure is a mean over episodes with its 95 % confidence interval; gains are paired, episode by episode, with
+    the neutral controller's from the same start. A network that states the criticality of its material has its
+    time-window circularity as well (see ``staged.time_window_circularity``).
     """
     neutral = rollouts["neutral"]
     figures = {}
     for name, run in rollouts.items():
         figures[name] = {
-            "circularity": estimate(run.episode_circularity).as_dict(),
-            "circularity_gain": estimate(gain(run, neutral)).as_dict(),
-            "service_level": estimate(run.episode_service).as_dict(),
-            "service_level_over_neutral": estimate(run.episode_service - neutral.episode_service).as_dict(),
-            "return": {agent: estimate(run.returns[i]).as_dict() for i, agent in enumerate(env.agents)},
-            "local_return": {agent: estimate(run.local_returns[i]).as_dict() for i, agent in enumerate(env.agents)},
+            "circularity": over_episodes(run.episode_circularity).as_dict(),
+            "circularity_gain": over_episodes(gain(run, neutral)).as_dict(),
+            "service_level": over_episodes(run.episode_service).as_dict(),
+            "service_level_over_neutral": over_episodes(run.episode_service - neutral.episode_service).as_dict(),
+            "return": _by_agent(env, run.returns),
+            "local_return": _by_agent(env, run.local_returns),
         }
         criticality = env.network.objective.criticality
         if criticality is not None:
             weighted = CIRO_FACTOR * criticality * run.episode_circularity
-            figures[name]["time_window_circularity"] = estimate(weighted).as_dict()
+            figures[name]["time_window_circularity"] = over_episodes(weighted).as_dict()
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}
+
+
+def _by_agent(env: VectorEnv, samples: Floats) -> dict[str, Any]:
+    return {agent: over_episodes(row).as_dict() for agent, row in zip(env.agents, samples, strict=True)}

@@ -27,35 +27,6 @@ RESAMPLES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
-    """A mean with the half-width of its 95 % confidence interval (Student's t over episodes or seeds)."""
-
-    mean: float
-    half_width: float
-
-    def __str__(self) -> str:
-        """Return ``mean ± half-width``."""
-        return f"{self.mean:.4g} ± {self.half_width:.2g}"
-
-    def as_dict(self) -> dict[str, float | None]:
-        """Return the two numbers by name; None stands for one that is not defined."""
-        return {"mean": defined(self.mean), "half_width": defined(self.half_width)}
-
-
-def estimate(samples: Floats) -> Estimate:
-    """Return the mean of independent samples and the half-width of its 95 % confidence interval.
-
-    >>> str(estimate(np.array([1.0, 2.0, 3.0])))
-    '2 ± 2.5'
-    """
-    samples = np.asarray(samples, dtype=float)
-    if len(samples) < 2:
-        return Estimate(float(samples.mean()), float("nan"))
-    error = float(samples.std(ddof=1)) / np.sqrt(len(samples))
-    return Estimate(float(samples.mean()), float(stats.t.ppf(0.975, len(samples) - 1) * error))
-
-
-@dataclass(frozen=True, slots=True)
 class Aggregate:
     """A figure with its 95 % confidence interval.
 
@@ -75,9 +46,19 @@ class Aggregate:
 
 
 def over_episodes(samples: Floats) -> Aggregate:
-    """Return the mean of independent episodes with its interval (Student's t)."""
-    found = estimate(samples)
-    return Aggregate(found.mean, found.mean - found.half_width, found.mean + found.half_width)
+    """Return the mean of independent episodes with its interval (Student's t); a single one has no interval.
+
+    >>> found = over_episodes(np.array([1.0, 2.0, 3.0]))
+    >>> f"{found.value:.1f} [{found.low:.1f}, {found.high:.1f}]"
+    '2.0 [-0.5, 4.5]'
+    """
+    samples = np.asarray(samples, dtype=float)
+    mean = float(samples.mean())
+    if len(samples) < 2:
+        return Aggregate(mean, float("nan"), float("nan"))
+    error = float(samples.std(ddof=1)) / np.sqrt(len(samples))
+    half_width = float(stats.t.ppf(0.975, len(samples) - 1) * error)
+    return Aggregate(mean, mean - half_width, mean + half_width)
 
 
 def interquartile_mean(scores: ArrayLike) -> float:

@@ -160,5 +160,5 @@ def test_evaluation_has_the_gap(runs: list[Path]) -> None:
     same = compare([runs[1]], ["neutral", "random"], episodes=3)
     gap = same.entries[0].gap
     assert gap is not None
-    assert figures["controllers"]["trained"]["gap"]["mean"] == pytest.approx(float(gap.mean()))
+    assert figures["controllers"]["trained"]["gap"]["value"] == pytest.approx(float(gap.mean()))
     assert json.loads((runs[1] / "evaluation.json").read_text()) == figures

@@ -514,7 +514,7 @@ def test_summary_reports_the_time_window(controller: Controller, sorted_items: i
     env = VectorEnv(one_batch(empty + use + after), num_envs=1)
     assert [line.id for line in env.dynamics.batches.lines][2] == "truck"
     run = rollout(env, controller, seed=4)
-    found = summary(env, {"neutral": run})["controllers"]["neutral"]["time_window_circularity"]["mean"]
+    found = summary(env, {"neutral": run})["controllers"]["neutral"]["time_window_circularity"]["value"]
     assert found == pytest.approx(2.0 * 0.1 * run.episode_circularity[0], rel=1e-12)
     closed = time_window_circularity(
         [BATCH_KG],

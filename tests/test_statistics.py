@@ -75,6 +75,7 @@ def test_over_episodes_is_students_t() -> None:
     found = over_episodes(np.array([1.0, 2.0, 3.0]))
     assert found.value == 2.0
     assert (found.low, found.high) == pytest.approx((2 - 2.4841, 2 + 2.4841), abs=1e-4)
+    assert over_episodes(np.array([7.0])).as_dict() == {"value": 7.0, "low": None, "high": None}
 
 
 @pytest.mark.parametrize("scores", [[], [[]], [[1.0, 2.0], [1.0]], [[[1.0]]]])

@@ -14,7 +14,7 @@ from cirl_marl.evaluate import Rollout, interval_ends, summary
 from cirl_marl.learners.run import RunDirectory, write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
 from cirl_marl.report.digraph import save_before_after
-from cirl_marl.statistics import estimate
+from cirl_marl.statistics import over_episodes
 from cirl_marl.vector_env import VectorEnv
 
 
@@ -50,8 +50,8 @@ def evaluate_run(
     for name, entry in entries.items():
         if entry.bound is not None and entry.gap is not None:
             figures["controllers"][name] |= {
-                "bound": estimate(entry.bound).as_dict(),
-                "gap": estimate(entry.gap).as_dict(),
+                "bound": over_episodes(entry.bound).as_dict(),
+                "gap": over_episodes(entry.gap).as_dict(),
             }
     if comparison.yardstick.reason:
         figures["no_bound"] = comparison.yardstick.reason

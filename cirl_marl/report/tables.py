@@ -103,7 +103,7 @@ def evaluation_table(figures: Mapping[str, Any]) -> Table:
         table.add_column(column, justify="left" if column == "controller" else "right")
     for name, row in figures["controllers"].items():
         mean = {
-            which: float(np.mean([value["mean"] for value in row[which].values()]))
+            which: float(np.mean([found["value"] for found in row[which].values()]))
             for which in ("return", "local_return")
         }
         table.add_row(
@@ -131,7 +131,15 @@ def local_returns_table(figures: Mapping[str, Any]) -> Table:
     return table
 
 
-def _figure(estimate: Mapping[str, float | None], form: str) -> str:
-    if estimate["mean"] is None or estimate["half_width"] is None:
+def _figure(found: Mapping[str, float | None], form: str) -> str:
+    """Write a mean with the half-width of its interval, which is Student's and so symmetric; alone if it has none.
+
+    >>> _figure({"value": 0.25, "low": 0.2, "high": 0.3}, "{:+.1%}")
+    '+25.0% ± 5.0%'
+    """
+    value, high = found["value"], found["high"]
+    if value is None:
         return "–"
-    return f"{form.format(estimate['mean'])} ± {form.format(estimate['half_width']).lstrip('+')}"
+    if high is None:
+        return form.format(value)
+    return f"{form.format(value)} ± {form.format(high - value).lstrip('+')}"
