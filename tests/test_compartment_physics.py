@@ -465,6 +465,7 @@ class TestBalances:
         state = np.array([1.0, 1.0, methanogens, acids, alkalinity, carbon])[:, None]
         free = carbon + acids - alkalinity
         pressure = digester.partial_pressure(state)[0]
+        assert np.isfinite(pressure)
         phi = free + 16.0 + 453.0 / 19.8 * digester.growth(state)[1][0]
         if phi > 1.0:  # below, the two roots are of either sign and the expression has lost its meaning
             residual = 16.0 * pressure**2 - phi * pressure + free

@@ -73,7 +73,9 @@ def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
 
 def test_examples_run() -> None:
     """Each example runs to its end."""
-    for example in sorted((ROOT / "examples").glob("*.py")):
+    examples = sorted((ROOT / "examples").glob("*.py"))
+    assert examples
+    for example in examples:
         names: dict[str, object] = {"__name__": "__main__"}
         exec(compile(example.read_text(), str(example), "exec"), names)
         assert "λ" in str(names["summary"])

@@ -55,11 +55,13 @@ def test_import_is_light() -> None:
 
 def imported(path: Path) -> set[str]:
     """Return the modules of this library that a file imports when it is loaded."""
-    found = set()
+    names: list[str] = []
     for statement in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith("cirl_marl."):
-            found.add(str(statement.module).split(".")[1])
-    return found
+        if isinstance(statement, ast.ImportFrom):
+            names += [f"{statement.module}.{alias.name}" for alias in statement.names]
+        elif isinstance(statement, ast.Import):
+            names += [alias.name for alias in statement.names]
+    return {name.split(".")[1] for name in names if name.startswith("cirl_marl.")}
 
 
 def test_imports_go_one_way() -> None:

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 
 import cirl_marl
 from cirl_marl import DefinitionError, Network, VectorEnv, vector_env
@@ -23,6 +24,7 @@ from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.lockstep import Lockstep
 from cirl_marl.learners.recipe import Learner, Match, Normalisation, Recipe, Run
 from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.training import Training
 from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, WithState, unseen_state
 
 with warnings.catch_warnings():
@@ -64,8 +66,6 @@ def test_shared_policy_sees_and_does_what_supersuit_pads(name: str) -> None:
 def test_views_lose_nothing(network: Network, copies: int, seed: int) -> None:
     """Whatever the view, each agent's observation, action and reward is in its place, in every copy."""
     env = VectorEnv(network, num_envs=copies)
-    if not env.agents:
-        return
     observations, rng = env.reset(seed=seed), np.random.default_rng(seed)
     rewards = {agent: rng.normal(size=copies) for agent in env.agents}
     views: list[View] = [SharedPolicy(env, env.agents), AllAtOnce(env, env.agents)]
@@ -239,6 +239,34 @@ def test_trained_actors_need_no_state(tmp_path: Path) -> None:
     assert np.isfinite(rollout(env, controller).episode_circularity).all()
 
 
+class Beginning(BaseCallback):
+    """Remembers the parameters with which learning begins."""
+
+    def parameters_now(self) -> dict[str, torch.Tensor]:
+        """Return a copy of the policy's parameters."""
+        assert self.model is not None
+        return {name: value.detach().clone() for name, value in self.model.policy.named_parameters()}
+
+    def _on_training_start(self) -> None:
+        self.first = self.parameters_now()
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def learnt(name: str, recipe: Recipe, **options: Any) -> Training:
+    """Train, and require of every policy that learning moves each of its parameters and keeps them finite."""
+    network = cirl_marl.load_network(name)
+    began = {group.name: Beginning() for group in recipe.groups(network, network.agents)}
+    training = train(name, recipe, callbacks=began, **options)
+    assert set(training.trainees) == set(began)
+    for learner, callback in began.items():
+        for which, value in callback.parameters_now().items():
+            assert not torch.equal(value, callback.first[which]), f"{learner}: {which} did not move"
+            assert torch.isfinite(value).all(), f"{learner}: {which}"
+    return training
+
+
 def test_learners_share_by_match(tmp_path: Path) -> None:
     """Nodes may share one policy and arcs another, beside an agent that learns alone; every policy moves."""
     matches = [
@@ -247,7 +275,7 @@ def test_learners_share_by_match(tmp_path: Path) -> None:
         Match(agents=["use_to_collection", "collection_to_sorting"], scheme="joint", algorithm="PPO", parameters=SMALL),
     ]
     recipe = small(Learner(scheme="shared", algorithm="PPO", parameters=SMALL), match=matches)
-    training = train("copper_net", recipe, directory=tmp_path / "run", horizon=8)
+    training = learnt("copper_net", recipe, directory=tmp_path / "run", horizon=8)
     members = {name: trainee.seat.view.agents for name, trainee in training.trainees.items()}
     assert set(members) == {"shared-learner-0", "shared-learner-2", "joint-learner", "mine"}
     assert sorted(a for agents in members.values() for a in agents) == sorted(training.env.agents)
@@ -277,11 +305,7 @@ def shortened(name: str) -> Recipe:
 @pytest.mark.parametrize("name", JOINT_RECIPES)
 def test_every_recipe_learns_on_every_network(name: str, network: str) -> None:
     """The recipes of the catalogue train on each network, and their policies move."""
-    training = train(network, shortened(name), horizon=4, seed=1)
-    for trainee in training.trainees.values():
-        parameters = [p.detach().numpy() for p in trainee.model.policy.parameters()]
-        assert all(np.isfinite(p).all() for p in parameters)
-        assert trainee.model._n_updates > 0
+    learnt(network, shortened(name), horizon=4, seed=1)
 
 
 def seen_values(training: Any) -> NDArray[np.floating]:
