@@ -265,7 +265,7 @@ def test_missing_file(tmp_path: Path) -> None:
 
 
 def test_unknown_names_give_the_nearest() -> None:
-    """Networks and scenarios; agents and options are in test_environments."""
+    """Networks and scenarios; agents and options are in test_bad_input."""
     with pytest.raises(CirlError, match=r"unknown network 'coper_net'. Did you mean 'copper_net'"):
         load_network("coper_net")
     with pytest.raises(CirlError, match=r"unknown scenario 'papers'. Did you mean 'paper'"):

@@ -1,0 +1,181 @@
+"""What the environments refuse, by name and with the nearest match: actions, options, starts, seeds, snapshots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cirl_marl import (
+    CirlError,
+    ControlError,
+    VectorEnv,
+    load_network,
+    parallel_env,
+    single_agent_env,
+    vector_env,
+)
+
+AGENTS = ("mine", "use_to_collection")
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        ({"mine": [np.nan], "use_to_collection": [0.0]}, "'mine'.* is nan"),
+        ({"mine": [0.0], "use_to_collection": [np.inf]}, "'use_to_collection'.* is inf"),
+        ({"mine": [0.0], "use_to_collection": [1.5]}, r"'use_to_collection'.* is 1.5.*\[-1, 1\]"),
+        ({"mine": [0.0, 0.0], "use_to_collection": [0.0]}, "'mine' has shape"),
+        ({"mine": 0.0, "use_to_collection": [0.0]}, "'mine' has shape"),
+        ({"mine": [0.0]}, "missing for .*'use_to_collection'"),
+        ({"mine": [0.0], "use_to_colection": [0.0]}, "Did you mean 'use_to_collection'"),
+        ({"mine": [0.0], "use_to_collection": [0.0], "use": [0.0]}, "unknown agent 'use'"),
+        ({}, "missing for"),
+        ({"mine": ["much"], "use_to_collection": [0.0]}, "'mine' is array.*much"),
+    ],
+)
+def test_bad_actions(actions: dict[str, Any], message: str) -> None:
+    """A refused action names its agent and leaves the environment as it was."""
+    env = parallel_env("copper_net", agents=AGENTS)
+    env.reset(seed=0)
+    before = env.state().copy()
+    with pytest.raises(ControlError, match=message):
+        env.step(actions)
+    np.testing.assert_array_equal(env.state(), before)
+    env.step({agent: [0.0] for agent in AGENTS})
+
+
+def test_acting_outside_an_episode() -> None:
+    """Before reset and after the end."""
+    env = parallel_env("copper_net", agents=AGENTS, horizon=1)
+    with pytest.raises(ControlError, match=r"reset\(\)"):
+        env.state()
+    with pytest.raises(ControlError, match=r"reset\(\)"):
+        env.step({agent: [0.0] for agent in AGENTS})
+    env.reset(seed=0)
+    assert all(env.step({agent: [0.0] for agent in AGENTS})[3].values())
+    assert env.agents == []
+    with pytest.raises(ControlError, match=r"reset\(\)"):
+        env.step({agent: [0.0] for agent in AGENTS})
+    env.reset()
+    assert env.agents == list(AGENTS)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"agents": ["mime"]}, "unknown agent 'mime'. Did you mean 'mine'"),
+        ({"agents": ["landfill"]}, "unknown agent 'landfill'"),
+        ({"agents": []}, "at least one"),
+        ({"agents": ["mine", "mine"]}, "distinct"),
+        ({"agents": "mine"}, "sequence of ids in a fixed order"),
+        ({"reward": "mixd"}, "unknown reward 'mixd'. Did you mean 'mixed'"),
+        ({"observe": "neighbors"}, "unknown observation mode 'neighbors'. Did you mean 'neighbours'"),
+        ({"observe": "stocks"}, "stocks"),
+        ({"circularity": "ends"}, "unknown circularity 'ends'. Did you mean 'end'"),
+        ({"scenario": "papr"}, "unknown scenario 'papr'. Did you mean 'paper'"),
+        ({"num_envs": 0}, "num_envs.*0"),
+        ({"horizon": 0}, "horizon must be a whole number of at least 1, got 0"),
+    ],
+)
+def test_bad_options(options: dict[str, Any], message: str) -> None:
+    """A wrong option is an error that gives the nearest valid one."""
+    with pytest.raises(CirlError, match=message):
+        VectorEnv("copper_net", **options)
+
+
+def test_bad_options_of_the_views() -> None:
+    """Names that only a view knows."""
+    with pytest.raises(CirlError, match="unknown network"):
+        parallel_env("copper")
+    with pytest.raises(CirlError, match=r"unknown render_mode 'humn'. Did you mean 'human'"):
+        parallel_env("copper_net", render_mode="humn")
+    with pytest.raises(CirlError, match="several agents"):
+        single_agent_env("copper_net")
+    with pytest.raises(CirlError, match="agent=, not agents="):
+        single_agent_env("copper_net", agents=["mine"])
+    with pytest.raises(CirlError, match="Did you mean 'mine'"):
+        single_agent_env("copper_net", agent="mime")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"usage": 1.0}, "unknown node or inner state 'usage'. Did you mean 'use'"),
+        ({"use": -1.0}, "'use' is -1.0"),
+        ({"use": np.nan}, "'use' is nan"),
+        ({"use": [1.0, 2.0, 3.0]}, "'use' has shape"),
+        ({"use": 1e9}, "1e.09 kt.*widen"),
+        (np.zeros(6), "shape"),
+    ],
+)
+def test_bad_initial_state(given: Any, message: str) -> None:
+    """A refused state leaves the environment as it was."""
+    env = vector_env("copper_net", num_envs=2)
+    env.reset(3)
+    before = env.state()
+    with pytest.raises(ControlError, match=message):
+        env.reset(4, options={"initial_state": given})
+    np.testing.assert_array_equal(env.state(), before)
+
+
+@pytest.mark.parametrize("seed", [-1, [1, 2, 3], [1, -1], 1.5, "one"])
+def test_bad_seeds(seed: Any) -> None:
+    """A seed is a non-negative integer, or one for each copy."""
+    with pytest.raises(ControlError, match="seed"):
+        vector_env("copper_net", num_envs=2).reset(seed)
+
+
+def test_bad_snapshots() -> None:
+    """A snapshot of something else is refused."""
+    env = vector_env("copper_net", num_envs=2)
+    env.reset(0)
+    snapshot = env.snapshot()
+    for other in (
+        vector_env("copper_net", num_envs=3),
+        vector_env("copper_net", num_envs=2, agents=["mine"]),
+        vector_env("carbo_net", num_envs=2),
+        vector_env("copper_net", num_envs=2, scenario="paper", agents=list(env.agents)),
+    ):
+        with pytest.raises(ControlError, match="snapshot"):
+            other.restore(snapshot)
+
+
+@pytest.mark.parametrize("options", [{"state": {}}, {"x0": 1}, 5])
+def test_unknown_reset_options_are_errors(options: Any) -> None:
+    """A start state under another name is not silently ignored."""
+    env = parallel_env("copper_net")
+    with pytest.raises(ControlError, match="reset options"):
+        env.reset(seed=0, options=options)
+
+
+@pytest.mark.parametrize("actions", [None, [0.0], "mine"])
+def test_actions_that_are_no_mapping_are_errors(actions: Any) -> None:
+    """Whatever is handed in, the error says what is wanted."""
+    env, batch = parallel_env("copper_net"), vector_env("copper_net", num_envs=1)
+    env.reset(seed=0)
+    batch.reset(seed=0)
+    for step in (env.step, batch.step):
+        with pytest.raises(ControlError, match="must be a mapping"):
+            step(actions)
+
+
+def test_text_is_no_action() -> None:
+    """Numbers in quotation marks are refused, not parsed."""
+    env = parallel_env("copper_net")
+    env.reset(seed=0)
+    with pytest.raises(ControlError, match="agent 'refinery'"):
+        env.step({agent: ["0.5"] for agent in env.agents})
+
+
+def test_misspelt_options_name_the_nearest() -> None:
+    """Options of the environments and of ``with_options`` are checked."""
+    with pytest.raises(CirlError, match=r"unknown option 'horzon'\. Did you mean 'horizon'"):
+        parallel_env("copper_net", horzon=3)
+    with pytest.raises(CirlError, match=r"unknown field 'horzon'\. Did you mean 'horizon'"):
+        load_network("copper_net").with_options(episode={"horzon": 3})
+    with pytest.raises(CirlError, match=r"unknown group 'episod'\. Did you mean 'episode'"):
+        load_network("copper_net").with_options(episod={"horizon": 3})
+    with pytest.raises(CirlError, match="fixed order"):
+        parallel_env("copper_net", agents={"mine", "use"})
