@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import Progress
 
-import cirl_marl
+from benchmarks.document import made_with, write_sections
 from cirl_marl.comparison import Comparison, Row, compare, yardstick
 from cirl_marl.comparison.compare import starting_stocks
 from cirl_marl.comparison.files import write_comparison
@@ -32,7 +32,7 @@ from cirl_marl.controllers.mpc import MPC, SERVICE_FIRST
 from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.evaluate import first_seed, rollout
 from cirl_marl.learners import RunDirectory, load_recipe, train
-from cirl_marl.learners.run import versions, write_atomically, write_json
+from cirl_marl.learners.run import write_json
 from cirl_marl.network import Floats
 from cirl_marl.report.style import SERIES, dressed, save
 from cirl_marl.statistics import Aggregate, interquartile_mean, over_episodes, over_seeds
@@ -149,8 +149,8 @@ def main(
         sections["difference"] = "\n".join(_credit_table(done))
     if not only:
         sections["lqr"] = "\n".join(_lqr_table(episodes))
-    sections["made"] = _made()
-    _write(document, sections)
+    sections["made"] = made_with()
+    write_sections(document, sections)
 
 
 def _jobs(out: Path, network: str, recipes: Sequence[str], seeds: int, steps: int | None) -> Iterator[Job]:
@@ -300,23 +300,6 @@ def _draw_credit(curves: dict[str, list[tuple[Floats, Floats]]]) -> None:
     dressed(axes, title="λ̄ while learning, copper_net", ylabel="λ̄ of training episodes (kt)")
     axes.legend(frameon=False, fontsize=8)
     save(drawing, PICTURES / "study_difference.png")
-
-
-def _made() -> str:
-    found = ", ".join(f"{name} {version}" for name, version in versions().items())
-    return f"Made with cirl-marl {cirl_marl.__version__}: {found}."
-
-
-def _write(document: Path, sections: dict[str, str]) -> None:
-    """Put each section between its marks, ``<!-- name -->`` and ``<!-- /name -->``; the prose around them stays."""
-    text = document.read_text(encoding="utf-8")
-    for name, section in sections.items():
-        start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
-        if start not in text or end not in text:
-            raise CirlError(f"{document}: has no marks {start} and {end} to write between")
-        before, rest = text.split(start, 1)
-        text = f"{before}{start}\n{section}\n{end}{rest.split(end, 1)[1]}"
-    write_atomically(document, lambda path: path.write_text(text, encoding="utf-8"))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,32 @@
+"""Documents with measured tables: each is a section between marks and is written anew; the prose around it stays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import cirl_marl
+from cirl_marl.errors import CirlError
+from cirl_marl.learners.run import versions, write_atomically
+
+
+def write_sections(document: Path, sections: Mapping[str, str]) -> None:
+    """Put each section between its marks, ``<!-- name -->`` and ``<!-- /name -->``, all of them or none.
+
+    Raises:
+        CirlError: if the document lacks a mark.
+    """
+    text = document.read_text(encoding="utf-8")
+    for name, section in sections.items():
+        start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+        if start not in text or end not in text:
+            raise CirlError(f"{document}: has no marks {start} and {end} to write between")
+        before, rest = text.split(start, 1)
+        text = f"{before}{start}\n{section}\n{end}{rest.split(end, 1)[1]}"
+    write_atomically(document, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def made_with() -> str:
+    """Return a line with the versions that figures depend on."""
+    found = ", ".join(f"{name} {version}" for name, version in versions().items())
+    return f"Made with cirl-marl {cirl_marl.__version__}: {found}."
