@@ -1,9 +1,10 @@
-"""Random networks for property tests: ``st.from_type(Network)`` draws them."""
+"""Random networks for property tests, which ``st.from_type(Network)`` draws, and a recipe for short trainings."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -22,6 +23,9 @@ from cirl_marl import (
     Role,
     Service,
 )
+
+if TYPE_CHECKING:
+    from cirl_marl.learners.recipe import Recipe
 
 settings.register_profile(
     "cirl_marl",
@@ -42,6 +46,16 @@ LAWS = [law for law in Law if law is not Law.COMPARTMENT]
 def make_network() -> Callable[[int, int, int], Network]:
     """``random_network``, for tests of one that once failed."""
     return random_network
+
+
+@pytest.fixture
+def ppo_recipe() -> Recipe:
+    """Return a recipe for a few rollouts of PPO in two copies."""
+    from cirl_marl.learners.recipe import Learner, Recipe, Run
+
+    parameters = {"n_steps": 10, "batch_size": 20, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
+    learner = Learner(algorithm="PPO", parameters=parameters)
+    return Recipe(name="small", title="small", run=Run(steps=80, envs=2), learner=learner)
 
 
 def random_network(seed: int, nodes: int, arcs: int) -> Network:

@@ -1,12 +1,9 @@
-"""Training runs: determinism, every algorithm at once, failure, interruption, resumption, what is kept."""
+"""Training: determinism, every algorithm at once, failure, interruption, resumption."""
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
 import signal
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +20,11 @@ from cirl_marl import Arc, Control, ControlKind, LearnerError, Network, Node, Ru
 from cirl_marl.controllers.trained import Trained
 from cirl_marl.elements import Episode, Law
 from cirl_marl.learners import Recipe, RunDirectory, Training, resume, train
-from cirl_marl.learners.recipe import Learner, Match, Run
+from cirl_marl.learners.recipe import Match
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.trainee import derived_seed
 from cirl_marl.learners.views import OneAgent
 
-PPO_PARAMETERS: dict[str, Any] = {"n_steps": 10, "batch_size": 20, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
 OFF_POLICY = {
     "buffer_size": 1000,
     "learning_starts": 10,
@@ -37,7 +33,6 @@ OFF_POLICY = {
     "policy_kwargs": {"net_arch": [8]},
 }
 MIXED: dict[str, dict[str, Any]] = {
-    "PPO": PPO_PARAMETERS,
     "A2C": {"n_steps": 7, "policy_kwargs": {"net_arch": [8]}},
     "SAC": OFF_POLICY,
     "TD3": OFF_POLICY | {"action_noise": {"kind": "normal", "sigma": 0.1}},
@@ -54,24 +49,15 @@ MIXED: dict[str, dict[str, Any]] = {
 }
 
 
-def recipe(learner: Learner, match: list[Match] | None = None) -> Recipe:
-    """Return a small recipe."""
-    return Recipe(name="test", title="test", run=Run(steps=80, envs=2), learner=learner, match=match or [])
-
-
-def ppo_recipe(**changes: Any) -> Recipe:
-    """Return a small PPO recipe."""
-    return recipe(Learner(algorithm="PPO", parameters=PPO_PARAMETERS, **changes))
-
-
-def mixed_recipe() -> Recipe:
-    """Return a recipe in which the first agents of copper_net learn with ten different algorithms."""
-    agents = cirl_marl.load_network("copper_net").agents
+@pytest.fixture
+def mixed_recipe(ppo_recipe: Recipe) -> Recipe:
+    """Return a recipe in which agents of copper_net learn with ten different algorithms: PPO, and one each of MIXED."""
+    agents = cirl_marl.load_network("copper_net").agents[1:]
     matches = [
         Match(agents=[agent], algorithm=name, parameters=MIXED[name], policy=policy_of(name))
         for agent, name in zip(agents, MIXED, strict=False)
     ]
-    return recipe(Learner(algorithm="PPO", parameters=PPO_PARAMETERS), matches)
+    return ppo_recipe.model_copy(update={"match": matches})
 
 
 def policy_of(name: str) -> str:
@@ -94,22 +80,22 @@ def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) ->
     assert [name for name in one if not torch.equal(one[name], other[name])] == []
 
 
-def test_ten_algorithms_in_one_run_are_reproducible() -> None:
+def test_ten_algorithms_in_one_run_are_reproducible(mixed_recipe: Recipe) -> None:
     """The same seed gives bit-identical weights, for on-policy, off-policy and evolutionary learners side by side."""
-    first = train("copper_net", mixed_recipe(), seed=4, horizon=10)
+    first = train("copper_net", mixed_recipe, seed=4, horizon=10)
     names = {type(trainee.model).__name__ for trainee in first.trainees.values()}
-    assert names == set(MIXED)
-    again = train("copper_net", mixed_recipe(), seed=4, horizon=10)
+    assert names == {"PPO", *MIXED}
+    again = train("copper_net", mixed_recipe, seed=4, horizon=10)
     assert_same(weights(first), weights(again))
-    other = train("copper_net", mixed_recipe(), seed=5, horizon=10)
+    other = train("copper_net", mixed_recipe, seed=5, horizon=10)
     assert any(not torch.equal(value, weights(other)[name]) for name, value in weights(first).items())
 
 
-def test_every_algorithm_learns_something() -> None:
+def test_every_algorithm_learns_something(mixed_recipe: Recipe) -> None:
     """Training changes the weights of each learner, so none of them was starved or left out."""
     settings = {"seed": 0, "horizon": 10}
-    before = train("copper_net", mixed_recipe(), steps=1, **settings)  # type: ignore[arg-type]
-    after = train("copper_net", mixed_recipe(), steps=200, **settings)  # type: ignore[arg-type]
+    before = train("copper_net", mixed_recipe, steps=1, **settings)  # type: ignore[arg-type]
+    after = train("copper_net", mixed_recipe, steps=200, **settings)  # type: ignore[arg-type]
     start, end = weights(before), weights(after)
     for agent in after.env.agents:
         changed = [name for name in start if name.startswith(f"{agent}.") and not torch.equal(start[name], end[name])]
@@ -133,16 +119,16 @@ class Draws(BaseCallback):
         return True
 
 
-def test_callbacks_and_evaluations_do_not_change_what_is_learnt() -> None:
+def test_callbacks_and_evaluations_do_not_change_what_is_learnt(ppo_recipe: Recipe) -> None:
     """Weights are the same with a callback attached and with global draws between joint steps."""
-    plain = train("copper_net", ppo_recipe(), seed=1, horizon=10)
+    plain = train("copper_net", ppo_recipe, seed=1, horizon=10)
     callback = Draws()
 
     def report(_: object) -> None:
         np.random.rand(3)  # noqa: NPY002 (the legacy stream is the subject)
         torch.rand(3)
 
-    watched = train("copper_net", ppo_recipe(), seed=1, horizon=10, callbacks={"use": callback}, report=report)
+    watched = train("copper_net", ppo_recipe, seed=1, horizon=10, callbacks={"use": callback}, report=report)
     assert callback.calls == 40
     assert_same(weights(plain), weights(watched))
 
@@ -196,28 +182,30 @@ class Alone(Seat):
         return self.latest, rewards[self.name].astype(np.float32), done, details
 
 
-def test_lockstep_equals_plain_learning_where_agents_do_not_meet() -> None:
+def test_lockstep_equals_plain_learning_where_agents_do_not_meet(ppo_recipe: Recipe) -> None:
     """On chains that are not connected, learning together gives the bits of plain ``PPO.learn()`` alone."""
-    together = train(two_chains(), ppo_recipe(), seed=3, reward="local")
-    alone = train(two_chains(), ppo_recipe(), seed=3, reward="local", agents=["a"])
+    together = train(two_chains(), ppo_recipe, seed=3, reward="local")
+    alone = train(two_chains(), ppo_recipe, seed=3, reward="local", agents=["a"])
     lone = {name: value for name, value in weights(together).items() if name.startswith("a.")}
     assert_same(lone, weights(alone))
 
     env = VectorEnv(two_chains(), num_envs=2, reward="local", agents=["a"])
+    parameters = ppo_recipe.learner.parameters
     seat = Alone(env, [derived_seed(3, "copies", i) for i in range(2)])
-    model = PPO("MlpPolicy", VecNormalize(seat, gamma=0.99), seed=derived_seed(3, "a"), device="cpu", **PPO_PARAMETERS)
+    model = PPO("MlpPolicy", VecNormalize(seat, gamma=0.99), seed=derived_seed(3, "a"), device="cpu", **parameters)
     model.learn(80)
     assert_same(lone, {f"a.{name}": value for name, value in model.policy.state_dict().items()})
 
 
-def test_different_rollouts_and_shares_finish_cleanly() -> None:
+def test_different_rollouts_and_shares_finish_cleanly(ppo_recipe: Recipe) -> None:
     """Learners with different ``n_steps`` and different budgets end without waiting for each other."""
+    parameters = ppo_recipe.learner.parameters
     matches = [
-        Match(agents=["mine"], algorithm="PPO", parameters=PPO_PARAMETERS | {"n_steps": 3, "batch_size": 6}),
+        Match(agents=["mine"], algorithm="PPO", parameters=parameters | {"n_steps": 3, "batch_size": 6}),
         Match(agents=["use"], algorithm="A2C", parameters={"n_steps": 4}, share_of_steps=0.3),
         Match(agents=["sorting"], algorithm="ARS", parameters={"n_delta": 1}, share_of_steps=0.5),
     ]
-    training = train("copper_net", recipe(Learner(algorithm="PPO", parameters=PPO_PARAMETERS), matches), horizon=5)
+    training = train("copper_net", ppo_recipe.model_copy(update={"match": matches}), horizon=5)
     steps = {agent: trainee.model.num_timesteps for agent, trainee in training.trainees.items()}
     assert steps["mine"] == 84  # 14 rollouts of 3 steps in 2 copies: the first count of at least 80
     assert steps["use"] == 24
@@ -234,10 +222,10 @@ class Explodes(BaseCallback):
         return True
 
 
-def test_failure_names_the_agent_and_keeps_what_was_learnt(tmp_path: Path) -> None:
+def test_failure_names_the_agent_and_keeps_what_was_learnt(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """The error names agent and step; the run says why it failed and its policies can be used."""
     with pytest.raises(LearnerError, match=r"agent 'use' failed at joint step 10.*no more"):
-        train("copper_net", ppo_recipe(), directory=tmp_path / "run", horizon=5, callbacks={"use": Explodes()})
+        train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5, callbacks={"use": Explodes()})
     run = RunDirectory(tmp_path / "run")
     assert run.status["state"] == "failed"
     assert "agent 'use'" in run.status["reason"]
@@ -247,7 +235,7 @@ def test_failure_names_the_agent_and_keeps_what_was_learnt(tmp_path: Path) -> No
     assert set(controller.act(env.reset(seed=0))) == set(env.agents)
 
 
-def test_interruption_saves_and_resumption_finishes(tmp_path: Path) -> None:
+def test_interruption_saves_and_resumption_finishes(tmp_path: Path, mixed_recipe: Recipe) -> None:
     """Ctrl-C saves everything; the run goes on from there, and a finished run is not run again."""
     directory = tmp_path / "run"
 
@@ -256,7 +244,7 @@ def test_interruption_saves_and_resumption_finishes(tmp_path: Path) -> None:
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
-        train("copper_net", mixed_recipe(), directory=directory, horizon=5, report=interrupt)
+        train("copper_net", mixed_recipe, directory=directory, horizon=5, report=interrupt)
     status = RunDirectory(directory).status
     assert (status["state"], status["joint_steps"]) == ("interrupted", 15)
     assert not list(directory.rglob("*.partial*"))
@@ -271,146 +259,19 @@ def test_interruption_saves_and_resumption_finishes(tmp_path: Path) -> None:
         resume(directory)
 
 
-def test_run_directory_holds_what_is_needed(tmp_path: Path) -> None:
-    """Saved policies, with their normalisers, act exactly like those in memory."""
-    training = train("carbo_net", ppo_recipe(), directory=tmp_path / "run", horizon=5)
-    run = RunDirectory(tmp_path / "run")
-    assert run.config == training.config
-    env = run.make_env(3)
-    observations = env.reset(seed=9)
-    controller = Trained(run)
-    controller.start(env, 0)
-    actions = controller.act(observations)
-    for agent, trainee in training.trainees.items():
-        assert isinstance(trainee.env, VecNormalize)
-        seen = trainee.env.normalize_obs(np.ascontiguousarray(observations[agent]))
-        assert np.array_equal(actions[agent], trainee.model.predict(seen, deterministic=True)[0])
-    versions = json.loads((run.path / "versions.json").read_text())
-    assert versions["stable-baselines3"]
-    metrics = run.metrics()
-    assert metrics["env_steps"][-1] == 80
-    assert all(np.isfinite(metrics[f"return:{agent}"]).all() for agent in env.agents)
-    assert all(list((run.path / "tensorboard" / agent).glob("events*")) for agent in env.agents)
-
-
-def test_network_built_in_python_can_be_kept(tmp_path: Path) -> None:
-    """A run of a network without a file holds a definition that reads back as the same network."""
-    train(two_chains(), ppo_recipe(), directory=tmp_path / "run", reward="local")
-    network = RunDirectory(tmp_path / "run").make_env(1).network
-    assert (network.nodes, network.arcs, network.episode) == (
-        two_chains().nodes,
-        two_chains().arcs,
-        two_chains().episode,
-    )
-
-
-def test_half_written_runs_are_refused(tmp_path: Path) -> None:
-    """Whatever is missing from a run directory is named; nothing is overwritten."""
-    directory = tmp_path / "run"
-    train("copper_net", ppo_recipe(), directory=directory, horizon=5)
-    with pytest.raises(RunError, match="not empty"):
-        train("copper_net", ppo_recipe(), directory=directory, horizon=5)
-    with pytest.raises(RunError, match="no such run directory"):
-        Trained(tmp_path / "elsewhere")
-    for name in ("config.json", "status.json", "network.toml"):
-        broken = tmp_path / f"without_{name}"
-        shutil.copytree(directory, broken)
-        (broken / name).unlink()
-        with pytest.raises(RunError, match=name):
-            Trained(broken)
-    checkpoint = RunDirectory(directory).checkpoint
-    (checkpoint / "use.zip").write_bytes(b"PK half a file")
-    with pytest.raises(RunError, match=r"use\.zip"):
-        Trained(directory)
-    (checkpoint / "mine.zip").unlink()
-    with pytest.raises(RunError, match="lacks the policies of mine"):
-        Trained(directory)
-    (directory / "status.json").write_text('{"state": "run')
-    with pytest.raises(RunError, match=r"status.json: cannot be read"):
-        Trained(directory)
-
-
-def test_torch_threads_and_streams_are_left_alone() -> None:
+def test_torch_threads_and_streams_are_left_alone(ppo_recipe: Recipe) -> None:
     """Training leaves the caller's threads and random streams as they were."""
     torch.manual_seed(1)
     expected = torch.rand(2)
     torch.manual_seed(1)
     threads = torch.get_num_threads()
-    train("copper_net", ppo_recipe(), horizon=5)
+    train("copper_net", ppo_recipe, horizon=5)
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.rand(2), expected)
 
 
-def test_run_directory_describes_what_was_trained(tmp_path: Path) -> None:
-    """A network changed in Python, whatever part of it, is kept as it was trained, not as its file says."""
-    network = cirl_marl.load_network("copper_net")
-    arcs = tuple(replace(arc, rate=2 * arc.rate) if arc.id == "use_to_landfill" else arc for arc in network.arcs)
-    changed = replace(network, arcs=arcs).with_options(objective={"circularity_weight": 0.9})
-    train(changed, ppo_recipe(), directory=tmp_path / "changed", horizon=5)
-    kept = RunDirectory(tmp_path / "changed").make_env(1).network
-    assert (kept.arcs, kept.objective) == (changed.arcs, changed.objective)
-    paper = cirl_marl.load_network("copper_net", scenario="paper")
-    train(paper, ppo_recipe(), directory=tmp_path / "paper")
-    assert RunDirectory(tmp_path / "paper").make_env(1).network == paper
-    assert RunDirectory(tmp_path / "paper").config.scenario == "paper"
-
-
-def test_missing_or_damaged_normaliser_is_an_error(tmp_path: Path) -> None:
-    """A policy without its normaliser would act on the wrong numbers."""
-    directory = tmp_path / "run"
-    train("copper_net", ppo_recipe(), directory=directory, horizon=5)
-    normaliser = RunDirectory(directory).checkpoint / "use.normaliser.pkl"
-    normaliser.write_bytes(normaliser.read_bytes()[:50])
-    with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
-        Trained(directory)
-    normaliser.unlink()
-    with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
-        Trained(directory)
-
-
-@pytest.mark.parametrize(("name", "text"), [("config.json", "{}"), ("status.json", "{}"), ("status.json", "[]")])
-def test_files_that_say_something_else_are_refused(tmp_path: Path, name: str, text: str) -> None:
-    """A readable file with the wrong contents is named."""
-    train("copper_net", ppo_recipe(), directory=tmp_path / "run", horizon=5)
-    (tmp_path / "run" / name).write_text(text)
-    with pytest.raises(RunError, match=name):
-        Trained(tmp_path / "run")
-
-
-def test_metrics_survive_a_crash(tmp_path: Path) -> None:
-    """A row that a crash cut short is left out, and rows past the checkpoint are not repeated on resumption."""
-    directory = tmp_path / "run"
-
-    def stop(progress: Any) -> None:
-        if progress.env_steps == 60:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt):
-        train("copper_net", ppo_recipe(), directory=directory, horizon=5, report=stop)
-    metrics = directory / "metrics.csv"
-    before = RunDirectory(directory).metrics()["joint_step"]
-    metrics.write_text(metrics.read_text() + "35,70,1.0,-9")
-    assert RunDirectory(directory).metrics()["joint_step"] == before
-    metrics.write_text(metrics.read_text() + "\n")
-    resume(directory)
-    steps = RunDirectory(directory).metrics()["joint_step"]
-    assert steps == sorted(set(steps))
-    assert steps[: len(before)] == before
-    assert len(steps) > len(before)
-
-
 @pytest.mark.parametrize("options", [{"steps": 0}, {"steps": -5}, {"steps": 1.5}, {"envs": 0}, {"seed": -1}])
-def test_budgets_are_whole_numbers(options: dict[str, Any]) -> None:
+def test_budgets_are_whole_numbers(options: dict[str, Any], ppo_recipe: Recipe) -> None:
     """Zero, negative and fractional budgets are errors that name the option; none falls back on a default."""
     with pytest.raises(cirl_marl.CirlError, match=f"{next(iter(options))} must be a whole number"):
-        train("copper_net", ppo_recipe(), **options)
-
-
-def test_run_opens_with_the_horizon_that_it_was_trained_with(tmp_path: Path) -> None:
-    """Whether the horizon came as an option or in the network itself."""
-    network = cirl_marl.load_network("carbo_net").with_options(episode={"horizon": 7})
-    in_network = train(network, ppo_recipe(), directory=tmp_path / "network", steps=4)
-    as_option = train("carbo_net", ppo_recipe(), directory=tmp_path / "option", steps=4, horizon=7)
-    for training in (in_network, as_option):
-        assert training.run is not None
-        assert training.run.make_env(1).network.episode.horizon == 7
+        train("copper_net", ppo_recipe, **options)

@@ -1,0 +1,143 @@
+"""A training run on disk: what is kept, that it acts as what was learnt, and which damage is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import VecNormalize
+
+import cirl_marl
+from cirl_marl import RunError
+from cirl_marl.controllers.trained import Trained
+from cirl_marl.learners import Recipe, RunDirectory, resume, train
+
+
+def test_run_directory_holds_what_is_needed(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """Saved policies, with their normalisers, act exactly like those in memory."""
+    training = train("carbo_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
+    run = RunDirectory(tmp_path / "run")
+    assert run.config == training.config
+    env = run.make_env(3)
+    observations = env.reset(seed=9)
+    controller = Trained(run)
+    controller.start(env, 0)
+    actions = controller.act(observations)
+    for agent, trainee in training.trainees.items():
+        assert isinstance(trainee.env, VecNormalize)
+        seen = trainee.env.normalize_obs(np.ascontiguousarray(observations[agent]))
+        assert np.array_equal(actions[agent], trainee.model.predict(seen, deterministic=True)[0])
+    versions = json.loads((run.path / "versions.json").read_text())
+    assert versions["stable-baselines3"]
+    metrics = run.metrics()
+    assert metrics["env_steps"][-1] == 80
+    assert all(np.isfinite(metrics[f"return:{agent}"]).all() for agent in env.agents)
+    assert all(list((run.path / "tensorboard" / agent).glob("events*")) for agent in env.agents)
+
+
+def test_network_built_in_python_can_be_kept(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """A run of a network without a file holds a definition that reads back as the same network."""
+    network = replace(cirl_marl.load_network("copper_net"), source=None)
+    train(network, ppo_recipe, directory=tmp_path / "run")
+    assert RunDirectory(tmp_path / "run").make_env(1).network == network
+
+
+def test_half_written_runs_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """Whatever is missing from a run directory is named; nothing is overwritten."""
+    directory = tmp_path / "run"
+    train("copper_net", ppo_recipe, directory=directory, horizon=5)
+    with pytest.raises(RunError, match="not empty"):
+        train("copper_net", ppo_recipe, directory=directory, horizon=5)
+    with pytest.raises(RunError, match="no such run directory"):
+        Trained(tmp_path / "elsewhere")
+    for name in ("config.json", "status.json", "network.toml"):
+        broken = tmp_path / f"without_{name}"
+        shutil.copytree(directory, broken)
+        (broken / name).unlink()
+        with pytest.raises(RunError, match=name):
+            Trained(broken)
+    checkpoint = RunDirectory(directory).checkpoint
+    (checkpoint / "use.zip").write_bytes(b"PK half a file")
+    with pytest.raises(RunError, match=r"use\.zip"):
+        Trained(directory)
+    (checkpoint / "mine.zip").unlink()
+    with pytest.raises(RunError, match="lacks the policies of mine"):
+        Trained(directory)
+    (directory / "status.json").write_text('{"state": "run')
+    with pytest.raises(RunError, match=r"status.json: cannot be read"):
+        Trained(directory)
+
+
+def test_run_directory_describes_what_was_trained(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """A network changed in Python, whatever part of it, is kept as it was trained, not as its file says."""
+    network = cirl_marl.load_network("copper_net")
+    arcs = tuple(replace(arc, rate=2 * arc.rate) if arc.id == "use_to_landfill" else arc for arc in network.arcs)
+    changed = replace(network, arcs=arcs).with_options(objective={"circularity_weight": 0.9})
+    train(changed, ppo_recipe, directory=tmp_path / "changed", horizon=5)
+    kept = RunDirectory(tmp_path / "changed").make_env(1).network
+    assert (kept.arcs, kept.objective) == (changed.arcs, changed.objective)
+    paper = cirl_marl.load_network("copper_net", scenario="paper")
+    train(paper, ppo_recipe, directory=tmp_path / "paper")
+    assert RunDirectory(tmp_path / "paper").make_env(1).network == paper
+    assert RunDirectory(tmp_path / "paper").config.scenario == "paper"
+
+
+def test_missing_or_damaged_normaliser_is_an_error(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """A policy without its normaliser would act on the wrong numbers."""
+    directory = tmp_path / "run"
+    train("copper_net", ppo_recipe, directory=directory, horizon=5)
+    normaliser = RunDirectory(directory).checkpoint / "use.normaliser.pkl"
+    normaliser.write_bytes(normaliser.read_bytes()[:50])
+    with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
+        Trained(directory)
+    normaliser.unlink()
+    with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
+        Trained(directory)
+
+
+@pytest.mark.parametrize(("name", "text"), [("config.json", "{}"), ("status.json", "{}"), ("status.json", "[]")])
+def test_files_that_say_something_else_are_refused(tmp_path: Path, name: str, text: str, ppo_recipe: Recipe) -> None:
+    """A readable file with the wrong contents is named."""
+    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
+    (tmp_path / "run" / name).write_text(text)
+    with pytest.raises(RunError, match=name):
+        Trained(tmp_path / "run")
+
+
+def test_metrics_survive_a_crash(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """A row that a crash cut short is left out, and rows past the checkpoint are not repeated on resumption."""
+    directory = tmp_path / "run"
+
+    def stop(progress: Any) -> None:
+        if progress.env_steps == 60:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", ppo_recipe, directory=directory, horizon=5, report=stop)
+    metrics = directory / "metrics.csv"
+    before = RunDirectory(directory).metrics()["joint_step"]
+    metrics.write_text(metrics.read_text() + "35,70,1.0,-9")
+    assert RunDirectory(directory).metrics()["joint_step"] == before
+    metrics.write_text(metrics.read_text() + "\n")
+    resume(directory)
+    steps = RunDirectory(directory).metrics()["joint_step"]
+    assert steps == sorted(set(steps))
+    assert steps[: len(before)] == before
+    assert len(steps) > len(before)
+
+
+def test_run_opens_with_the_horizon_that_it_was_trained_with(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """Whether the horizon came as an option or in the network itself."""
+    network = cirl_marl.load_network("carbo_net").with_options(episode={"horizon": 7})
+    in_network = train(network, ppo_recipe, directory=tmp_path / "network", steps=4)
+    as_option = train("carbo_net", ppo_recipe, directory=tmp_path / "option", steps=4, horizon=7)
+    for training in (in_network, as_option):
+        assert training.run is not None
+        assert training.run.make_env(1).network.episode.horizon == 7
