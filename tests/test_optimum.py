@@ -505,3 +505,13 @@ def test_bad_input(options: dict[str, object], said: str) -> None:
     """Options that cannot be used are named."""
     with pytest.raises(CirlError, match=said):
         bound(load_network("copper_net"), **options)  # type: ignore[arg-type]
+
+
+def test_near_bound_is_where_the_solver_starts() -> None:
+    """From the solution for another level, start or even network the same optimum is found and proved."""
+    alone = bound("carbo_net", min_service=0.95, horizon=12)
+    start = alone.initial * 1.05
+    for near in (bound("carbo_net", start, min_service=0.99, horizon=12), bound("copper_net", horizon=3)):
+        found = bound("carbo_net", min_service=0.95, horizon=12, near=near)
+        assert found.objective == pytest.approx(alone.objective, rel=1e-6)
+        assert found.verify().bound == found.objective

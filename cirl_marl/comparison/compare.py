@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,8 @@ from cirl_marl.statistics import ENOUGH_SEEDS, Aggregate, over_episodes, over_se
 from cirl_marl.vector_env import VectorEnv
 
 FIGURES = ("circularity", "gain", "service", "bound", "gap")
+SOLVING = 0.7
+"""Share of solving programs in the work on bounds; the rest is to evaluate their multipliers for every episode."""
 Progress = Callable[[str, float], None]
 
 
@@ -179,8 +180,14 @@ def compare(
     measure, proved = _unproved(len(entered), "")
     if bounds:
         starts = starting_stocks(entered[0].env(episodes), first)
-        told = _counted(progress, len(entered) * share, share)
-        measure, proved = _measured(env, starts, [each.name for each in entered], rollouts, told)
+        done = len(entered) * share
+        measure, proved = _measured(
+            env,
+            starts,
+            [each.name for each in entered],
+            rollouts,
+            lambda part: progress("bounds", done + part * (1 - done)),
+        )
     neutral = next(run for contender, run in zip(entered, rollouts, strict=True) if contender.name == "neutral")
     entries = tuple(
         Entry(contender.name, contender.seed, contender.run, run, gain(run, neutral), bound)
@@ -196,7 +203,11 @@ def starting_stocks(env: VectorEnv, seed: int) -> Floats:
 
 
 def _measured(
-    env: VectorEnv, starts: Floats, names: Sequence[str], rollouts: Sequence[Rollout], progress: Callable[[], None]
+    env: VectorEnv,
+    starts: Floats,
+    names: Sequence[str],
+    rollouts: Sequence[Rollout],
+    progress: Callable[[float], None],
 ) -> tuple[Yardstick, list[Floats | None]]:
     """Return the yardstick of all rows, and the bounds of the episodes of each rollout."""
     services: dict[str, list[Floats]] = {}
@@ -204,8 +215,14 @@ def _measured(
         services.setdefault(name, []).append(run.episode_service)
     delivered = [np.mean(each, axis=0) for each in services.values()]
     try:
-        measure = yardstick(env.network, env.agents, starts, delivered, progress=progress)
-        return measure, [measure.at(starts, run.episode_service) for run in rollouts]
+        measure = yardstick(
+            env.network, env.agents, starts, delivered, progress=lambda share: progress(SOLVING * share)
+        )
+        proved = []
+        for place, run in enumerate(rollouts):
+            proved.append(measure.at(starts, run.episode_service))
+            progress(SOLVING + (1 - SOLVING) * (place + 1) / len(rollouts))
+        return measure, proved
     except NoCertificate as missing:
         return _unproved(len(rollouts), str(missing))
 
@@ -216,8 +233,3 @@ def _unproved(entries: int, reason: str) -> tuple[Yardstick, list[Floats | None]
 
 def _told(progress: Progress, what: str, done: float, each: float) -> Callable[[int], None]:
     return lambda steps: progress(what, done + each * steps)
-
-
-def _counted(progress: Progress, done: float, each: float) -> Callable[[], None]:
-    shares = itertools.count(1)
-    return lambda: progress("bounds", done + each * next(shares))

@@ -54,7 +54,7 @@ def yardstick(
     starts: Floats,
     services: Sequence[Floats],
     *,
-    progress: Callable[[], None] = lambda: None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Yardstick:
     """Solve the programs for the service levels that some rows delivered.
 
@@ -63,20 +63,28 @@ def yardstick(
         agents: who acts.
         starts: shape (episodes, nodes), mass.
         services: mean service levels of each row, shape (episodes,).
-        progress: called after each row.
+        progress: called with the share that is done.
 
     Raises:
         NoCertificate: if the network has flows for which nothing is proved.
         CirlError: if the solver fails.
     """
     members: dict[int, tuple[Bound, ...]] = {}
-    for service in services:
+    near: Bound | None = None
+    for row, service in enumerate(services):
+
+        def tell(solved: int, row: int = row) -> None:
+            progress((row + solved / SOLVES) / len(services))
+
+        tell(0)
         demanded = np.maximum(np.floor((service - MARGIN) / STEP) * STEP, 0.0)
         level = round(float(demanded.mean()) / STEP)
         if level not in members:
-            solved = envelope(network, starts, solves=SOLVES, min_service=demanded, agents=agents or None)
-            members[level] = solved.members
-        progress()
+            found = envelope(
+                network, starts, solves=SOLVES, min_service=demanded, agents=agents or None, near=near, progress=tell
+            )
+            members[level] = found.members
+            near = found.members[0]
     everyone = Envelope(tuple(each for level in sorted(members) for each in members[level]))
     levels = STEP * np.linspace(min(members), max(members), FRONT)
     return Yardstick(everyone, np.stack([levels, everyone.at(starts.mean(axis=0), levels)], axis=1))

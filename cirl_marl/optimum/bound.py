@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.certificate import Certificate, Verification, verified
+from cirl_marl.optimum.certificate import Certificate, Verification, proved, verified
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis
 
@@ -116,12 +116,12 @@ class Envelope:
         starts = np.broadcast_to(starts, (*shape, nodes)).reshape(-1, nodes)
         demanded = np.broadcast_to(demanded, shape).ravel()
         programs = Programs(Admissible.of(first.network, first.agents or None), first.degree, first.service_weight)
-        proved = np.empty(len(starts))
+        found = np.empty(len(starts))
         for i, (start, level) in enumerate(zip(starts, demanded.tolist(), strict=True)):
             check_stocks(first.network, start)
             problem = programs.program(start, None if first.min_service is None else level)
-            proved[i] = min(verified(problem, each.certificate, each.solution).bound for each in self.members)
-        return proved.reshape(shape)
+            found[i] = min(proved(problem, each.certificate) for each in self.members)
+        return found.reshape(shape)
 
 
 def check_stocks(network: Network, stocks: Floats) -> None:

@@ -61,20 +61,31 @@ def verified(problem: Program, certificate: Certificate, plan: Floats) -> Verifi
         certificate: the multipliers.
         plan: v of the plan, for its objective.
     """
-    y, given = certificate.equal, certificate.under
-    mu = np.minimum(given, 0.0)
+    bound, rounding, reduced, columns = _proved(problem, certificate)
+    small = np.abs(reduced) < 1e-6 * np.abs(problem.cost).max(initial=0.0)
+    return Verification(
+        bound=bound,
+        objective=problem.constant - math.fsum(problem.cost * plan),
+        infeasibility=float(np.maximum(certificate.under, 0.0).max(initial=0.0)),
+        charged=-math.fsum(columns[small]),
+        rounding=rounding,
+    )
+
+
+def proved(problem: Program, certificate: Certificate) -> float:
+    """Return the bound of ``verified`` alone."""
+    return _proved(problem, certificate)[0]
+
+
+def _proved(problem: Program, certificate: Certificate) -> tuple[float, float, Floats, Floats]:
+    """Return the bound, the allowance for rounding in it, d, and min(d_j l_j, d_j u_j)."""
+    y, mu = certificate.equal, np.minimum(certificate.under, 0.0)
     reduced = problem.cost - problem.equal.T @ y - problem.under.T @ mu
     size = np.abs(problem.cost) + abs(problem.equal).T @ np.abs(y) + abs(problem.under).T @ np.abs(mu)
     terms_per_column = np.diff(problem.equal.tocsc().indptr) + np.diff(problem.under.tocsc().indptr) + 4
     reach = np.maximum(np.abs(problem.low), np.abs(problem.high))
     columns = np.minimum(reduced * problem.low, reduced * problem.high)
     terms = np.concatenate([problem.equal_to * y, problem.under_to * mu, columns])
-    rounding = math.fsum(EPSILON * terms_per_column * size * reach) + 4 * EPSILON * math.fsum(np.abs(terms))
-    small = np.abs(reduced) < 1e-6 * np.abs(problem.cost).max(initial=0.0)
-    return Verification(
-        bound=problem.constant - math.fsum(terms) + 2 * rounding,
-        objective=problem.constant - math.fsum(problem.cost * plan),
-        infeasibility=float((given - mu).max(initial=0.0)),
-        charged=-math.fsum(columns[small]),
-        rounding=2 * rounding,
-    )
+    # twice what the errors can be, which leaves room for the errors of these two sums
+    rounding = 2 * EPSILON * (float(terms_per_column * size @ reach) + 4 * float(np.abs(terms).sum()))
+    return problem.constant - math.fsum(terms) + rounding, rounding, reduced, columns

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from cirl_marl.optimum.bound import Bound, Envelope, check_service, check_stocks
 from cirl_marl.optimum.certificate import verified
 from cirl_marl.optimum.objective import circularity_weights
 from cirl_marl.optimum.program import Program, Programs
-from cirl_marl.optimum.solver import Basis, Infeasible, solve
+from cirl_marl.optimum.solver import Basis, Infeasible, Solution, solve
 
 DEGREE = 2
 """Degree of the test polynomials; docs/bound.md has the gap against it."""
@@ -35,6 +36,7 @@ def bound(
     scenario: str | None = None,
     horizon: int | None = None,
     degree: int = DEGREE,
+    near: Bound | None = None,
 ) -> Bound:
     """Bound what any admissible actions can reach over one episode in the simulator.
 
@@ -54,6 +56,7 @@ def bound(
         scenario: scenario of the definition; None is the default.
         horizon: decisions per episode; None takes the definition's.
         degree: degree of the test polynomials, 1 or more; higher is tighter and slower.
+        near: a bound of a similar program, from whose solution this one is reached sooner: another start or level.
 
     Raises:
         NoCertificate: for a network whose flows are not linear laws: inner physics, batches, inexact solvers.
@@ -63,7 +66,8 @@ def bound(
     check_options(service_weight, min_service, degree)
     admissible = Admissible.of(_found(network, scenario, horizon), agents)
     start = starting_stocks(admissible.network, initial)
-    return _bounded(Programs(admissible, degree, service_weight), start, service_weight, min_service)
+    basis = None if near is None else near.basis
+    return _bounded(Programs(admissible, degree, service_weight), start, service_weight, min_service, basis)
 
 
 def envelope(
@@ -77,6 +81,8 @@ def envelope(
     scenario: str | None = None,
     horizon: int | None = None,
     degree: int = DEGREE,
+    near: Bound | None = None,
+    progress: Callable[[int], None] = lambda solved: None,
 ) -> Envelope:
     """Bound the objective from many starts with a few solutions.
 
@@ -93,6 +99,8 @@ def envelope(
         scenario: see ``bound``.
         horizon: see ``bound``.
         degree: see ``bound``.
+        near: see ``bound``.
+        progress: called with the number of programs solved.
 
     Raises:
         NoCertificate: see ``bound``.
@@ -115,13 +123,16 @@ def envelope(
         check_stocks(admissible.network, start)
         return _bounded(programs, start, service_weight, level, basis)
 
-    first = solved(starts.mean(axis=0), None if levels is None else float(levels.mean()), None)
+    basis = None if near is None else near.basis
+    first = solved(starts.mean(axis=0), None if levels is None else float(levels.mean()), basis)
+    progress(1)
     found, open_ = Envelope((first,)), np.ones(len(starts), dtype=bool)
-    for _ in range(min(solves - 1, len(starts))):
+    for count in range(min(solves - 1, len(starts))):
         worst = int(np.where(open_, found.at(starts, levels), np.inf).argmin())
         open_[worst] = False
         level = None if levels is None else float(levels[worst])
         found = Envelope((*found.members, solved(starts[worst], level, first.basis)))
+        progress(count + 2)
     return found
 
 
@@ -178,7 +189,7 @@ def _bounded(
     admissible, layout = programs.admissible, programs.layout
     problem = programs.program(start, min_service)
     try:
-        solution = solve(problem, basis)
+        solution = _solved(problem, basis)
     except Infeasible:
         raise CirlError(_unreachable(problem, min_service)) from None
     proof = verified(problem, solution.certificate, solution.plan)
@@ -204,6 +215,14 @@ def _bounded(
         certificate=solution.certificate,
         basis=solution.basis,
     )
+
+
+def _solved(problem: Program, basis: Basis | None) -> Solution:
+    """Solve from ``basis`` if there is one; that there is no solution is for the steadier methods to say."""
+    if basis is not None:
+        with suppress(Infeasible):
+            return solve(problem, basis)
+    return solve(problem)
 
 
 def _unreachable(problem: Program, min_service: float | None) -> str:

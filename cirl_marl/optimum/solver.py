@@ -79,7 +79,7 @@ def solve(problem: Program, basis: Basis | None = None) -> Solution:
         highs.setBasis(_highs_basis(basis))
         highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
     highs.run()
-    if highs.getModelStatus() == highspy.HighsModelStatus.kIterationLimit:
+    if basis is not None and highs.getModelStatus() == highspy.HighsModelStatus.kIterationLimit:
         return solve(problem)
     if basis is None and highs.getModelStatus() != highspy.HighsModelStatus.kOptimal:
         highs.setOptionValue("solver", "simplex")  # slower and steadier
