@@ -34,6 +34,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         possible_agents: compartments that act.
         state_names: what the entries of ``state()`` are, but for the last, the elapsed share of the episode.
         agents: the same while an episode runs, empty after it.
+        batch: the same environment for those who want arrays, with a single copy.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (PettingZoo declares it so)
@@ -59,39 +60,39 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
                 raise CirlError(unknown("option", option, (*OPTIONS, "scenario", "agents", "reward", "render_mode")))
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise CirlError(unknown("render_mode", render_mode, RENDER_MODES))
-        self._batch = VectorEnv(network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options)
-        self.network = self._batch.network
-        if not self._batch.agents:
+        self.batch = VectorEnv(network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options)
+        self.network = self.batch.network
+        if not self.batch.agents:
             raise CirlError(f"network '{self.network.name}': no compartment has a control, so nothing can act")
-        self.layout = self._batch.layout
-        self.possible_agents = list(self._batch.agents)
+        self.layout = self.batch.layout
+        self.possible_agents = list(self.batch.agents)
         self.agents: list[str] = []
-        self.observation_spaces = dict(self._batch.observation_spaces)
-        self.action_spaces = dict(self._batch.action_spaces)
-        self.state_names = self._batch.state_names
-        self._entries = sum(len(neutral) for neutral in self._batch.neutral_action.values())
+        self.observation_spaces = dict(self.batch.observation_spaces)
+        self.action_spaces = dict(self.batch.action_spaces)
+        self.state_names = self.batch.state_names
+        self._entries = sum(len(neutral) for neutral in self.batch.neutral_action.values())
         self.state_space = Box(-np.inf, np.inf, (len(self.state_names) + 1,), np.float64)
         self.render_mode = render_mode
         self._canvas: Any = None
 
     def observation_space(self, agent: str) -> Box[np.float32]:
         """Return the observation space of ``agent``, always the same object."""
-        return self._batch.observation_spaces[agent]
+        return self.batch.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Box[np.float32]:
         """Return the action space of ``agent``, always the same object."""
-        return self._batch.action_spaces[agent]
+        return self.batch.action_spaces[agent]
 
     @property
     def neutral_action(self) -> dict[str, NDArray[np.float32]]:
         """The action of each agent that leaves it neutral."""
-        return {agent: action.astype(np.float32) for agent, action in self._batch.neutral_action.items()}
+        return {agent: action.astype(np.float32) for agent, action in self.batch.neutral_action.items()}
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
         """Start an episode; ``options={"initial_state": {node: stock}}`` starts it from a given state."""
-        observation = self._batch.reset(seed, options)
+        observation = self.batch.reset(seed, options)
         self.agents = list(self.possible_agents)
         if self.render_mode == "human":
             self.render()
@@ -116,7 +117,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
                 raise ControlError("no episode is running: call reset()")
             return {}, {}, {}, {}, {}
         agents = self.possible_agents
-        outcome = self._batch.advance(self._stack(actions))
+        outcome = self.batch.advance(self._stack(actions))
         truncated = bool(outcome.truncated[0])
         if truncated:
             self.agents = []
@@ -134,21 +135,21 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
     def state(self) -> Floats:
         """Return the whole physical state: every stock in mass units, then the elapsed share of the episode."""
-        state: Floats = self._batch.state()[0]
+        state: Floats = self.batch.state()[0]
         return state
 
     def local_rewards(self) -> dict[str, float]:
         """Return the local reward that the current state gives each compartment, whether it acts or not."""
-        return {name: float(reward[0]) for name, reward in self._batch.local_rewards().items()}
+        return {name: float(reward[0]) for name, reward in self.batch.local_rewards().items()}
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the whole environment state, random streams included."""
-        return self._batch.snapshot()
+        return self.batch.snapshot()
 
     def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
         """Go back to a snapshot and return the observations there."""
-        observation = self._batch.restore(snapshot)
-        over = int(self._batch.physical.step[0]) >= self.network.episode.horizon
+        observation = self.batch.restore(snapshot)
+        over = int(self.batch.physical.step[0]) >= self.network.episode.horizon
         self.agents = [] if over else list(self.possible_agents)
         return {agent: seen[0] for agent, seen in observation.items()}
 
@@ -166,7 +167,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
         if self._canvas is None:
             self._canvas = Canvas(self.network, window=self.render_mode == "human")
-        state = self._batch.physical
+        state = self.batch.physical
         time = float(state.step[0]) * self.network.episode.control_interval
         image: NDArray[np.uint8] = self._canvas.draw(state.stock[: len(self.network.nodes), 0], state.flow[:, 0], time)
         return image if self.render_mode == "rgb_array" else None
@@ -190,7 +191,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             or stacked.shape != (self._entries, 1)
             or len(actions) != len(self.possible_agents)
         ):
-            return self._batch.stack({agent: np.asarray(action)[None] for agent, action in actions.items()})
+            return self.batch.stack({agent: np.asarray(action)[None] for agent, action in actions.items()})
         return stacked
 
     def _infos(self, outcome: Outcome) -> dict[str, dict[str, Any]]:

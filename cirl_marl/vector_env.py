@@ -98,6 +98,7 @@ class VectorEnv:
         self.state_names = (*self._starts.names, *self.dynamics.batches.names)
         self._batched = slice(len(found.nodes), self.dynamics.unit)
         self._state: State | None = None
+        self._latest = np.empty((0, num_envs), dtype=np.float32)
         _keep_freed_memory()
 
     @property
@@ -132,7 +133,8 @@ class VectorEnv:
             ControlError: for a seed, option or state that cannot be used; the environment is left as it was.
         """
         self._state = self._fresh(self._starts.begin(seed, options))
-        return self.by_agent(self._observe(self._state))
+        self._latest = self._observe(self._state)
+        return self.by_agent(self._latest)
 
     def step(
         self, actions: Mapping[str, ArrayLike]
@@ -159,7 +161,7 @@ class VectorEnv:
         observation = outcome.observation
         if outcome.truncated.any():
             self._report_ends(infos, outcome)
-            observation = self._restart(outcome.truncated)
+            observation = self._latest = self._restart(outcome.truncated)
         terminated = np.zeros(self.num_envs, dtype=bool)
         terminated.flags.writeable = outcome.truncated.flags.writeable = False  # one array for all agents
         return (
@@ -197,7 +199,7 @@ class VectorEnv:
         self._state = State(
             transition.stock, transition.inner, flow, step, batched, state.circularity + mean, state.service + service
         )
-        observation = self.layout.observe(quantities, step / horizon, levels)
+        observation = self._latest = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
 
@@ -218,6 +220,15 @@ class VectorEnv:
             [state.stock[: len(self.network.nodes)], state.inner, state.stock[self._batched], time[None]]
         ).T
 
+    def observations(self) -> dict[str, NDArray[np.float32]]:
+        """Return the observations that the agents act on next: those that the last reset, step or restore returned.
+
+        Raises:
+            ControlError: before the first ``reset``.
+        """
+        assert self.physical is not None
+        return self.by_agent(self._latest)
+
     def snapshot(self) -> Snapshot:
         """Return a copy of the state and the random streams; environments are not changed."""
         return Snapshot(self.physical.copied(), self._starts.saved_streams(), self.agents, self._identity)
@@ -234,7 +245,8 @@ class VectorEnv:
             raise ControlError(f"the snapshot (network, copies, agents) {theirs} does not fit {ours}")
         self._starts.restore_streams(snapshot.streams)
         self._state = snapshot.state.copied()
-        return self.by_agent(self._observe(self._state))
+        self._latest = self._observe(self._state)
+        return self.by_agent(self._latest)
 
     def close(self) -> None:
         """Do nothing; the environment holds no resources."""

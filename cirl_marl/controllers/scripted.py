@@ -140,6 +140,11 @@ class Scripted:
             }
             self._scripts[agent] = script, columns, (control.high + control.low) / 2, (control.high - control.low) / 2
 
+    @property
+    def scripted(self) -> tuple[str, ...]:
+        """Agents for whom a script acts; none before ``start``."""
+        return tuple(self._scripts)
+
     def act(self, observations: Arrays) -> Arrays:
         """Return each agent's action.
 

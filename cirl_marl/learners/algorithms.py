@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -56,6 +57,11 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     if name not in known:
         raise RecipeError(f"algorithm: {unknown('algorithm', name, known)}")
     return known[name]
+
+
+def off_policy() -> list[str]:
+    """Return the algorithms that learn from a replay buffer."""
+    return [name for name, found in algorithms().items() if issubclass(found, OffPolicyAlgorithm)]
 
 
 def parameters_of(name: str) -> list[str]:

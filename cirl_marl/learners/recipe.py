@@ -19,6 +19,7 @@ from cirl_marl.learners.algorithms import (
     algorithms,
     checked_parameters,
     checked_policy,
+    off_policy,
 )
 from cirl_marl.learners.views import Scheme, View, view_of
 from cirl_marl.mistakes import mistakes_of
@@ -44,6 +45,15 @@ class Normalisation(_Table):
         return self.observation or self.reward
 
 
+class Demonstrations(_Table):
+    """A controller that acts in the learner's place at first, while the learner keeps what it sees."""
+
+    controller: Literal["neutral", "random", "scripted", "lqr", "mpc", "optimum"]
+    steps: Annotated[int, Field(gt=0)] = Field(
+        description="environment steps, summed over the copies; they are the first of the run and count as such"
+    )
+
+
 class Learner(_Table):
     """One algorithm with its parameters."""
 
@@ -62,6 +72,28 @@ class Learner(_Table):
     share_of_steps: Annotated[float, Field(gt=0, le=1)] = Field(
         1.0, description="share of the run during which the agent learns; after it, it only acts"
     )
+    demonstrations: Demonstrations | None = Field(
+        None, description="of an off-policy learner: whose transitions fill its replay buffer before it acts itself"
+    )
+
+    def check_demonstrations(self, steps: int) -> None:
+        """Refuse demonstrations that the algorithm cannot keep, or that a run of ``steps`` has no room for.
+
+        Raises:
+            RecipeError: naming the key.
+        """
+        if self.demonstrations is None:
+            return
+        if self.algorithm not in off_policy():
+            raise RecipeError(
+                f"demonstrations: {self.algorithm} has no replay buffer to keep them in; "
+                f"use one of {', '.join(off_policy())}"
+            )
+        if self.demonstrations.steps > steps * self.share_of_steps:
+            share = "" if self.share_of_steps == 1 else f" times share_of_steps {self.share_of_steps}"
+            raise RecipeError(
+                f"demonstrations.steps: {self.demonstrations.steps} is more than the {steps} steps of the run{share}"
+            )
 
 
 class Match(Learner):
@@ -158,6 +190,22 @@ class Recipe(_Table):
                 if agent not in agents:
                     raise RecipeError(f"recipe '{self.name}': match.agents: {unknown('agent', agent, agents)}")
 
+    def check_demonstrations(self, steps: int) -> None:
+        """Refuse demonstrations that an algorithm cannot keep, or that a run of ``steps`` has no room for.
+
+        Raises:
+            RecipeError: naming the learner and the key.
+        """
+        for where, learner in self.learners():
+            try:
+                learner.check_demonstrations(steps)
+            except RecipeError as error:
+                raise RecipeError(f"recipe '{self.name}': {where}.{error}") from None
+
+    def learners(self) -> tuple[tuple[str, Learner], ...]:
+        """Return every learner and what messages call its table."""
+        return ("learner", self.learner), *((f"match.{i}", match) for i, match in enumerate(self.match))
+
 
 def recipe_schema() -> dict[str, Any]:
     """Return the JSON schema of recipe files, with which editors complete and check them."""
@@ -187,13 +235,14 @@ def load_recipe(name: str | Path) -> Recipe:
     for key in recipe.environment:
         if key not in OPTIONS:
             mistakes.append(f"environment: {unknown('option', key, OPTIONS)}")
-    for where, learner in (("learner", recipe.learner), *((f"match.{i}", m) for i, m in enumerate(recipe.match))):
+    for where, learner in recipe.learners():
         try:
             algorithm_class(learner.algorithm)
             checked_parameters(learner.algorithm, learner.parameters)
             checked_policy(learner.algorithm, learner.policy)
             if learner.policy == CENTRAL_CRITIC and not learner.normalise.observation:
                 raise RecipeError(f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true")
+            learner.check_demonstrations(recipe.run.steps)
         except RecipeError as error:
             mistakes.append(f"{where}.{error}")
     if mistakes:

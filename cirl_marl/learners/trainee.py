@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cirl_marl.errors import RecipeError, RunError
 from cirl_marl.learners.algorithms import algorithm_class, build
+from cirl_marl.learners.demonstrations import Demonstrator, demonstrate
 from cirl_marl.learners.recipe import Learner
 from cirl_marl.learners.run import write_atomically
 from cirl_marl.learners.seat import Seat
@@ -45,10 +46,12 @@ class Trainee:
         env: the seat, behind ``VecNormalize`` if the recipe normalises.
         streams: its random streams.
         model: the algorithm, as Stable-Baselines3 made it.
+        demonstrator: whom it follows before it acts itself; None if it needs nobody.
     """
 
     model: BaseAlgorithm
     env: VecEnv
+    demonstrator: Demonstrator | None = None
 
     def __init__(self, seat: Seat, spec: Learner, seed: int) -> None:
         """Give the learner its streams; ``build`` or ``load`` makes the algorithm."""
@@ -94,11 +97,31 @@ class Trainee:
             return math.ceil(steps * self.spec.share_of_steps / self.seat.copies)
         return 2**62
 
+    @property
+    def demonstrations(self) -> int:
+        """Number of the learner's own steps by which its demonstrations are over; 0 if it needs none, or no more."""
+        asked = self.spec.demonstrations
+        steps = 0 if asked is None else asked.steps * (self.seat.num_envs // self.seat.copies)
+        return steps if steps > self.model.num_timesteps else 0
+
+    def follow(self, demonstrator: Demonstrator) -> None:
+        """Let ``demonstrator`` act first.
+
+        Raises:
+            RecipeError: if it cannot act for this learner.
+        """
+        demonstrator.check(self.seat.view.agents, self.seat.title)
+        self.demonstrator = demonstrator
+
     def learn(self, steps: int, callback: BaseCallback | None) -> None:
         """Run the algorithm's own ``learn()`` up to its share of ``steps``, counting what it had learnt before.
 
-        A shared policy makes one step of its own for each of its agents.
+        A shared policy makes one step of its own for each of its agents. Demonstrations come first, and count.
         """
+        if self.demonstrator is not None:
+            leader, view = self.demonstrator, self.seat.view
+            assert isinstance(self.model, OffPolicyAlgorithm)
+            demonstrate(self.model, self.demonstrations, lambda: view.join(leader.act()))
         done = self.model.num_timesteps
         rows = self.seat.num_envs // self.seat.copies
         total = 10**15 if isinstance(self.model, ARS) else math.ceil(steps * self.spec.share_of_steps) * rows - done

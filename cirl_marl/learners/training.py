@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl.catalogue import load_network
 from cirl_marl.definition import write_network
 from cirl_marl.errors import CirlError, LearnerError, RunError, unknown
+from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.lockstep import Interrupted, Lockstep
 from cirl_marl.learners.recipe import OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
@@ -82,6 +83,7 @@ class Training:
         for name, seat in self.lockstep.seats.items():
             trainee = Trainee(seat, groups[name].spec, config.seed + self.done)
             self.trainees[name] = trainee.load(checkpoint) if checkpoint else trainee.build()
+        self._appoint_demonstrators()
         self._log()
 
     def keep_in(self, run: RunDirectory) -> None:
@@ -89,6 +91,16 @@ class Training:
         self.run = run
         self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
         self._log()
+
+    def _appoint_demonstrators(self) -> None:
+        """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
+        known: dict[str, Demonstrator] = {}
+        for trainee in self.trainees.values():
+            asked = trainee.spec.demonstrations
+            if asked is not None and trainee.demonstrations:
+                seed = derived_seed(self.config.seed + self.done, "demonstrations", asked.controller)
+                known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
+                trainee.follow(known[asked.controller])
 
     def _log(self) -> None:
         log = self.run.path / "tensorboard" if self.run is not None else None
@@ -284,6 +296,7 @@ def train(
         envs=copies,
         options=settings,
     )
+    found.check_demonstrations(config.steps)
     training = Training(config, env)
     if directory is not None:
         training.keep_in(_create(Path(directory), config, env.network))
@@ -293,6 +306,9 @@ def train(
 
 def resume(directory: str | Path, *, report: Callable[[Progress], None] | None = None) -> Training:
     """Go on with an interrupted run from its last checkpoint, with fresh episodes and fresh random streams.
+
+    Checkpoints of unfinished runs hold the replay buffers, so that demonstrations are not lost; a learner that was in
+    the middle of them gets the rest.
 
     Raises:
         RunError: if the run is complete, or its directory is not.

@@ -47,6 +47,10 @@ class View(ABC):
         """Split the actions of all rows into agent → (B, entries)."""
 
     @abstractmethod
+    def join(self, actions: Arrays) -> NDArray[np.float32]:
+        """Join the actions of agents to rows of their own: the inverse of ``act``; what ``act`` ignores is zero."""
+
+    @abstractmethod
     def score(self, rewards: Arrays) -> Floats:
         """Return the reward of each row."""
 
@@ -67,6 +71,10 @@ class OneAgent(View):
     def act(self, actions: NDArray[np.floating]) -> Arrays:
         """Return the actions, shape (B, m), as the agent's."""
         return {self.agents[0]: actions}
+
+    def join(self, actions: Arrays) -> NDArray[np.float32]:
+        """Return the agent's actions, shape (B, m)."""
+        return np.array(actions[self.agents[0]], dtype=np.float32)
 
     def score(self, rewards: Arrays) -> Floats:
         """Return the agent's reward, shape (B,)."""
@@ -109,6 +117,13 @@ class SharedPolicy(View):
         by_agent = actions.reshape(len(self.agents), -1, max(self._actions.values()))
         return {agent: by_agent[a, :, :n] for a, (agent, n) in enumerate(self._actions.items())}
 
+    def join(self, actions: Arrays) -> NDArray[np.float32]:
+        """Return the padded actions, shape (N·B, longest)."""
+        rows = np.zeros((len(self.agents), len(actions[self.agents[0]]), max(self._actions.values())), np.float32)
+        for a, (agent, n) in enumerate(self._actions.items()):
+            rows[a, :, :n] = actions[agent]
+        return rows.reshape(-1, rows.shape[2])
+
     def score(self, rewards: Arrays) -> Floats:
         """Return each agent's reward, shape (N·B,)."""
         return np.concatenate([rewards[agent] for agent in self.agents])
@@ -135,6 +150,10 @@ class AllAtOnce(View):
     def act(self, actions: NDArray[np.floating]) -> Arrays:
         """Return each agent's columns."""
         return dict(zip(self.agents, np.split(actions, self._ends[:-1], axis=1), strict=True))
+
+    def join(self, actions: Arrays) -> NDArray[np.float32]:
+        """Return the actions side by side, shape (B, Σ m)."""
+        return np.concatenate([actions[agent] for agent in self.agents], axis=1, dtype=np.float32, casting="same_kind")
 
     def score(self, rewards: Arrays) -> Floats:
         """Return the mean of the agents' rewards, shape (B,): λ itself if every agent is paid λ."""
@@ -165,6 +184,10 @@ class WithState(View):
     def act(self, actions: NDArray[np.floating]) -> Arrays:
         """Act as the view does."""
         return self._view.act(actions)
+
+    def join(self, actions: Arrays) -> NDArray[np.float32]:
+        """Join as the view does."""
+        return self._view.join(actions)
 
     def score(self, rewards: Arrays) -> Floats:
         """Score as the view does."""

@@ -10,11 +10,14 @@ import gymnasium
 import numpy as np
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from cirl_marl.errors import CirlError, RecipeError
 from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build
+from cirl_marl.learners.demonstrations import demonstrate, in_copies
+from cirl_marl.learners.trainee import derived_seed
 from cirl_marl.paper.plan import tuned_recipe
 from cirl_marl.paper.published import PaperEnvironment
 from cirl_marl.paper.results import Row
@@ -51,6 +54,7 @@ def train_tuned(environment: PaperEnvironment, row: Row, report: Report, recipe:
     if recipe.learner.algorithm != row.algorithm:
         raise RecipeError(f"recipe '{recipe.name}' uses {recipe.learner.algorithm}, but the row says {row.algorithm}")
     _check_comparable(recipe)
+    recipe.check_demonstrations(row.steps)
     run = _train_network if _is_plain_network(environment) else _train_copies
     return run(environment, recipe, row, report)
 
@@ -137,7 +141,13 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, repor
     policy = learner.policy.replace("Mlp", "MultiInput") if goal else learner.policy
     model = build(learner.algorithm, policy, env, parameters, seed=row.seed, device="cpu")
     elapsed = stopwatch()
-    model.learn(row.steps, callback=Watch(report, row.steps))
+    if learner.demonstrations is not None:
+        assert isinstance(model, OffPolicyAlgorithm)
+        seeds = [derived_seed(row.seed, "demonstrations", i) for i in range(copies)]
+        act = in_copies(learner.demonstrations.controller, monitors, seeds)
+        demonstrate(model, learner.demonstrations.steps, act)
+    left, fresh = row.steps - model.num_timesteps, model.num_timesteps == 0
+    model.learn(left, callback=Watch(report, row.steps), reset_num_timesteps=fresh)
     seconds, cpu_seconds = elapsed()
     ends, returns = episodes_of(monitors)
     settings = _settings(environment, recipe, copies)
