@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import sys
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
+import highspy
 import pytest
+from scipy import optimize
 
 from cirl_marl import cli
 from cirl_marl.catalogue import folder
+from cirl_marl.learners import train
 
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run every test in an empty folder."""
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a short training run in the small network of the guide."""
+    folder_ = tmp_path_factory.mktemp("trained")
+    (folder_ / "bottles.toml").write_text(guide())
+    train(folder_ / "bottles.toml", "independent_a2c", directory=folder_ / "run", steps=320, envs=8)
+    return folder_ / "run"
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -120,10 +135,15 @@ def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 def bottles(**changes: str) -> None:
     """Write the small network of the guide as ``bottles.toml``, with some texts replaced."""
+    Path("bottles.toml").write_text(guide(changes))
+
+
+def guide(changes: Mapping[str, str] | None = None, days: int = 7) -> str:
+    """Return the definition of the small network of the guide, with some texts replaced."""
     text = (folder("envs") / "README.md").read_text().split("```toml\n")[1].split("```")[0]
-    for old, new in {"value = 60": "value = 7", **changes}.items():
+    for old, new in {"value = 60": f"value = {days}", **(changes or {})}.items():
         text = text.replace(old, new)
-    Path("bottles.toml").write_text(text)
+    return text
 
 
 def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -168,6 +188,76 @@ def test_infeasible_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     asked = ("plan", "bottles.toml", "--control", "optimum", "--min-service", "0.9", "--out", "p.csv")
     assert run(monkeypatch, *asked) == 2
     assert "no actions reach a mean service level of 0.9; at most 0." in capsys.readouterr().err
+    assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Return what makes HiGHS run out of time once it has been asked so many times."""
+
+    def fail(after: int) -> None:
+        left = after
+
+        class Hurried(highspy.Highs):
+            def __init__(self) -> None:
+                nonlocal left
+                super().__init__()  # type: ignore[no-untyped-call]
+                left -= 1
+                if left < 0:
+                    self.setOptionValue("time_limit", 0.0)
+
+        monkeypatch.setattr("cirl_marl.optimum.solver.highspy.Highs", Hurried)
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("arguments", "solved", "what"),
+    [
+        (["evaluate", "run", "--episodes", "2"], 0, "the program of the bound with a mean service level of 0."),
+        (["evaluate", "run", "--episodes", "2"], 3, "the program of the bound with a mean service level of 0."),
+        (["compare", "run", "--episodes", "2", "--out", "new"], 1, "the program of the bound with a mean service"),
+        (["compare", "run", "--controllers", "mpc", "--episodes", "2", "--out", "new"], 1, "the program of MPC for"),
+        (["compare", "run", "--controllers", "optimum", "--episodes", "2", "--out", "new"], 1, "a service weight of"),
+        (["plan", "bottles.toml", "--control", "optimum", "--out", "p.csv"], 0, "with a service weight of 1000"),
+        (
+            ["plan", "bottles.toml", "--control", "mpc", "--out", "p.csv"],
+            4,
+            "the program of MPC for decisions 16 to 59",
+        ),
+        (["pareto", "bottles.toml", "--out", "new"], 4, "the program of the bound with a mean service level of"),
+        (["pareto", "bottles.toml", "--agents", "independent_a2c", "--out", "new"], 0, "with a service weight of"),
+    ],
+)
+def test_solver_that_fails(
+    arguments: list[str],
+    solved: int,
+    what: str,
+    failing: Callable[[int], None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    trained: Path,
+) -> None:
+    """Network, program and the solver's status are named; nothing is written, however much was solved before."""
+    Path("bottles.toml").write_text(guide(days=60))
+    shutil.copytree(trained, "run")
+    before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
+    failing(solved)
+    assert run(monkeypatch, *arguments) == 2
+    said = capsys.readouterr().err
+    assert "error: network 'bottles': HiGHS did not solve" in said
+    assert what in said and said.strip().endswith(": Time limit reached")
+    assert {path: path.stat().st_mtime_ns for path in Path().rglob("*")} == before
+
+
+def test_improvement_that_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The linear programs that improve a plan are scipy's; their failure is no plan either."""
+    Path("bottles.toml").write_text(guide(days=60))
+    slow = partial(optimize.linprog, options={"maxiter": 0, "presolve": False})
+    monkeypatch.setattr("cirl_marl.optimum.improve.optimize.linprog", slow)
+    assert run(monkeypatch, "plan", "bottles.toml", "--control", "optimum", "--out", "p.csv") == 2
+    said = capsys.readouterr().err
+    assert "error: network 'bottles': HiGHS did not solve the improvement of a plan: Iteration limit reached" in said
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
 
 

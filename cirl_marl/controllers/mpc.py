@@ -188,16 +188,17 @@ class MPC:
             prices: of the stocks at the end, shape (nodes,), in the objective of the episode per mass.
         """
         demanded = None if missing is None else max(0.0, missing / len(intervals))
+        what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
             problem = self._priced(self._programs, stock, intervals, demanded, prices)
-            solution = solve(problem, basis)
+            solution = solve(problem, basis, what=what)
         except Infeasible:
             if demanded is None:
                 raise
             scale = self._env.network.objective.circularity_scale
             prices = None if prices is None else prices / scale
             problem = self._priced(self._urgent, stock, intervals, 0.0, prices)
-            solution = solve(problem, basis)
+            solution = solve(problem, basis, what=what)
         planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
         base = self._admissible.base[intervals.start : intervals.stop][: self._replan]
         actions = normalised_actions(replace(self._admissible, base=base), problem.layout, planned)

@@ -38,6 +38,9 @@ def improved(bound: Bound, *, rounds: int = 20) -> Bound:
     Args:
         bound: with the actions to start from.
         rounds: most linear programs to solve.
+
+    Raises:
+        CirlError: if the solver fails.
     """
     price = _price(bound)
     best, run = bound, achieved(bound)
@@ -149,7 +152,7 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats:
         method="highs-ipm",
     )
     if found.status != 0:
-        raise CirlError(f"network '{network.name}': HiGHS found no better actions: {found.message}")
+        raise CirlError(f"network '{network.name}': HiGHS did not solve the improvement of a plan: {found.message}")
     step: Floats = found.x[:-1].reshape(steps, size)[:, outputs:level]
     return step
 

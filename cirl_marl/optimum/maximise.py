@@ -189,7 +189,7 @@ def _bounded(
     admissible, layout = programs.admissible, programs.layout
     problem = programs.program(start, min_service)
     try:
-        solution = _solved(problem, basis)
+        solution = _solved(problem, basis, "the program of the bound" + _asked(service_weight, min_service))
     except Infeasible:
         raise CirlError(_unreachable(problem, min_service)) from None
     proof = verified(problem, solution.certificate, solution.plan)
@@ -217,12 +217,18 @@ def _bounded(
     )
 
 
-def _solved(problem: Program, basis: Basis | None) -> Solution:
+def _asked(service_weight: float | None, min_service: float | None) -> str:
+    if min_service is not None:
+        return f" with a mean service level of {min_service:.6g}"
+    return "" if service_weight is None else f" with a service weight of {service_weight:.6g}"
+
+
+def _solved(problem: Program, basis: Basis | None, what: str) -> Solution:
     """Solve from ``basis`` if there is one; that there is no solution is for the steadier methods to say."""
     if basis is not None:
         with suppress(Infeasible):
-            return solve(problem, basis)
-    return solve(problem)
+            return solve(problem, basis, what=what)
+    return solve(problem, what=what)
 
 
 def _unreachable(problem: Program, min_service: float | None) -> str:
@@ -237,6 +243,6 @@ def _unreachable(problem: Program, min_service: float | None) -> str:
     most = replace(
         problem, cost=cost.ravel(), constant=0.0, under=problem.under[:rows], under_to=problem.under_to[:rows]
     )
-    solution = solve(most)
+    solution = solve(most, what="the program of the highest mean service level")
     highest = verified(most, solution.certificate, solution.plan).bound
     return f"network '{network.name}': no actions reach a mean service level of {min_service}; at most {highest:.6g}"

@@ -22,10 +22,12 @@ STATUS = tuple(highspy.HighsBasisStatus(i) for i in range(len(highspy.HighsBasis
 
 WARM_ITERATIONS = 2000
 """Simplex iterations from a given basis after which interior points, which need none, are the faster way."""
+NO_PLAN = (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible)
+"""As every variable is bounded, the latter means the former."""
 
 
 class Infeasible(CirlError):
-    """A program without solution; as every variable is bounded, HiGHS's 'unbounded or infeasible' means the same."""
+    """A program without solution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +63,19 @@ class Solution:
     basis: Basis
 
 
-def solve(problem: Program, basis: Basis | None = None) -> Solution:
+def solve(problem: Program, basis: Basis | None = None, *, what: str = "the program") -> Solution:
     """Minimise cᵀv over the program.
 
     Without a basis interior points and crossover find one; from a basis the dual simplex method goes on.
 
+    Args:
+        problem: the program.
+        basis: from which to start.
+        what: is solved, for the message of an error.
+
     Raises:
         Infeasible: if there is no solution.
-        CirlError: if HiGHS fails for another reason.
+        CirlError: if HiGHS fails for another reason; names the network, what was not solved, and HiGHS's status.
     """
     scale = float(np.abs(problem.cost).max(initial=0.0)) or 1.0  # the solver's tolerances are absolute
     highs = highspy.Highs()  # type: ignore[no-untyped-call]
@@ -79,8 +86,8 @@ def solve(problem: Program, basis: Basis | None = None) -> Solution:
         highs.setBasis(_highs_basis(basis))
         highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
     highs.run()
-    if basis is not None and highs.getModelStatus() == highspy.HighsModelStatus.kIterationLimit:
-        return solve(problem)
+    if basis is not None and highs.getModelStatus() not in (highspy.HighsModelStatus.kOptimal, *NO_PLAN):
+        return solve(problem, what=what)
     if basis is None and highs.getModelStatus() != highspy.HighsModelStatus.kOptimal:
         highs.setOptionValue("solver", "simplex")  # slower and steadier
         highs.setOptionValue("presolve", "off")  # its own tolerance is too small for rows that fix a stock twice over
@@ -88,10 +95,10 @@ def solve(problem: Program, basis: Basis | None = None) -> Solution:
         highs.run()
     status = highs.getModelStatus()
     name = problem.layout.network.name
-    if status in (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible):
-        raise Infeasible(f"network '{name}': HiGHS finds that no plan satisfies the program")
+    if status in NO_PLAN:
+        raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {what}")
     if status != highspy.HighsModelStatus.kOptimal:
-        raise CirlError(f"network '{name}': HiGHS found no optimum: {highs.modelStatusToString(status)}")
+        raise CirlError(f"network '{name}': HiGHS did not solve {what}: {highs.modelStatusToString(status)}")
     found, final = highs.getSolution(), highs.getBasis()
     rows = np.array(found.row_dual) * scale
     equal = len(problem.equal_to)
