@@ -80,6 +80,8 @@ def test_views_lose_nothing(network: Network, copies: int, seed: int) -> None:
         actions = rng.uniform(-1, 1, (len(rows), *(view.action_space.shape or ())))
         done = view.act(actions)
         assert set(done) == set(view.agents)
+        for agent, again in view.act(view.join(done)).items():
+            np.testing.assert_array_equal(again, done[agent].astype(np.float32))
         column = 0
         for a, agent in enumerate(view.agents):
             entries = env.action_spaces[agent].shape[0]

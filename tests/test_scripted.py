@@ -38,7 +38,7 @@ def test_agents_without_a_script_are_neutral(name: str, scenario: str) -> None:
     assert list(found) == list(env.agents)
     for agent, action in neutral.act(observations).items():
         model = env.network.compartments[agent].model
-        assert (found[agent] != action).any() == script_of(model), agent
+        assert (found[agent] != action).any() == (agent in controller.scripted) == script_of(model), agent
         assert found[agent].shape == action.shape
 
 

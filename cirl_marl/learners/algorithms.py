@@ -59,11 +59,6 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     return known[name]
 
 
-def off_policy() -> list[str]:
-    """Return the algorithms that learn from a replay buffer."""
-    return [name for name, found in algorithms().items() if issubclass(found, OffPolicyAlgorithm)]
-
-
 def parameters_of(name: str) -> list[str]:
     """Return the constructor parameters that a recipe may set."""
     signature = inspect.signature(algorithm_class(name).__init__)
@@ -103,6 +98,17 @@ def checked_policy(name: str, policy: str) -> None:
         known.append(CENTRAL_CRITIC)
     if policy not in known:
         raise RecipeError(f"policy: {unknown(f'policy of {name} for vectors', policy, known)}")
+
+
+def checked_off_policy(name: str) -> None:
+    """Refuse an algorithm that has no replay buffer to keep demonstrations in.
+
+    Raises:
+        RecipeError: naming those that have one.
+    """
+    if not issubclass(algorithm_class(name), OffPolicyAlgorithm):
+        fit = [other for other, found in algorithms().items() if issubclass(found, OffPolicyAlgorithm)]
+        raise RecipeError(f"demonstrations: {name} has no replay buffer to keep them in; use one of {', '.join(fit)}")
 
 
 def _are_numbers(values: Iterable[object]) -> bool:

@@ -61,17 +61,23 @@ class Demonstrator:
 
     Attributes:
         name: of the controller.
+        env: where it acts, for all agents.
     """
 
     def __init__(self, name: str, env: VectorEnv, seed: int) -> None:
         """Make the controller ``name``; a random one draws from ``seed`` and the number of the episode."""
         self.name = name
+        self.env = env
         self._controller = named_controller(name)
-        self._env = env
         self._seed = seed
         self._began: State | None = None
         self._state: State | None = None
         self._actions: Arrays = {}
+
+    @property
+    def idle(self) -> bool:
+        """Whether it has not started yet, for which the environment needs a state."""
+        return self._began is None
 
     def check(self, agents: Sequence[str], title: str) -> None:
         """Start in the current state and refuse a controller that cannot act for ``agents``.
@@ -93,17 +99,17 @@ class Demonstrator:
 
     def act(self) -> Arrays:
         """Return the actions of all agents in the current state of the environment."""
-        state = self._env.physical
+        state = self.env.physical
         if state is not self._state:
-            if self._began is None or (state is not self._began and not state.step.any()):
+            if self.idle or not state.step.any():
                 self._begin()
-            self._state, self._actions = state, self._controller.act(self._env.observations())
+            self._state, self._actions = state, self._controller.act(self.env.observations())
         return self._actions
 
     def _begin(self) -> None:
-        if self._env.physical is not self._began:
-            self._controller.start(self._env, self._seed)
-            self._began = self._env.physical
+        if self.env.physical is not self._began:
+            self._controller.start(self.env, self._seed)
+            self._began = self.env.physical
             self._seed += 1
 
 
@@ -118,19 +124,15 @@ def in_copies(name: str, envs: Sequence[gymnasium.Env[Any, Any]], seeds: Sequenc
     Raises:
         RecipeError: if an environment is not of a network, or the controller cannot act in it.
     """
-    batches = [_batch_of(env) for env in envs]
-    followed = [Demonstrator(name, batch, seed) for batch, seed in zip(batches, seeds, strict=True)]
-    started: list[Demonstrator] = []
+    followed = [Demonstrator(name, _batch_of(env), seed) for env, seed in zip(envs, seeds, strict=True)]
 
-    def act() -> NDArray[np.float32]:
-        if not started:  # a controller can start when the environment has a state
-            for demonstrator, batch in zip(followed, batches, strict=True):
-                demonstrator.check(batch.agents, f"agent '{batch.agents[0]}'")
-            started.extend(followed)
-        actions = [demonstrator.act()[batch.agents[0]] for demonstrator, batch in zip(followed, batches, strict=True)]
-        return np.concatenate(actions, dtype=np.float32, casting="same_kind")
+    def row(demonstrator: Demonstrator) -> NDArray[np.floating]:
+        (agent,) = demonstrator.env.agents
+        if demonstrator.idle:
+            demonstrator.check([agent], f"agent '{agent}'")
+        return demonstrator.act()[agent]
 
-    return act
+    return lambda: np.concatenate([row(each) for each in followed], dtype=np.float32, casting="same_kind")
 
 
 def _batch_of(env: gymnasium.Env[Any, Any]) -> VectorEnv:

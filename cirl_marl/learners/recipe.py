@@ -17,9 +17,9 @@ from cirl_marl.learners.algorithms import (
     CENTRAL_CRITIC,
     algorithm_class,
     algorithms,
+    checked_off_policy,
     checked_parameters,
     checked_policy,
-    off_policy,
 )
 from cirl_marl.learners.views import Scheme, View, view_of
 from cirl_marl.mistakes import mistakes_of
@@ -84,11 +84,7 @@ class Learner(_Table):
         """
         if self.demonstrations is None:
             return
-        if self.algorithm not in off_policy():
-            raise RecipeError(
-                f"demonstrations: {self.algorithm} has no replay buffer to keep them in; "
-                f"use one of {', '.join(off_policy())}"
-            )
+        checked_off_policy(self.algorithm)
         if self.demonstrations.steps > steps * self.share_of_steps:
             share = "" if self.share_of_steps == 1 else f" times share_of_steps {self.share_of_steps}"
             raise RecipeError(

@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -145,7 +146,12 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, repor
         assert isinstance(model, OffPolicyAlgorithm)
         seeds = [derived_seed(row.seed, "demonstrations", i) for i in range(copies)]
         act = in_copies(learner.demonstrations.controller, monitors, seeds)
-        demonstrate(model, learner.demonstrations.steps, act)
+
+        def act_and_report() -> NDArray[np.float32]:
+            report("training", model.num_timesteps, row.steps)
+            return act()
+
+        demonstrate(model, learner.demonstrations.steps, act_and_report)
     left, fresh = row.steps - model.num_timesteps, model.num_timesteps == 0
     model.learn(left, callback=Watch(report, row.steps), reset_num_timesteps=fresh)
     seconds, cpu_seconds = elapsed()
