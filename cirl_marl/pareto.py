@@ -236,18 +236,22 @@ def _possible(network: Network, points: int, progress: Progress) -> tuple[tuple[
     """Return bounds by demanded service, what their improved plans do in the simulator, and the front they prove."""
     found: list[Point] = []
     bounds: list[Bound] = []
-    progress("bounds", 0.0)
+    progress("bounds and plans", 0.0)
     least, most = (bound(network, service_weight=weight).service for weight in (1 / SERVICE_FIRST, SERVICE_FIRST))
     for place, level in enumerate(_levels(least, most, points)):
-        solved = bound(network, min_service=level)
+        solved = bound(network, min_service=level, near=bounds[-1] if bounds else None)
         bounds.append(solved)
         found.append(Point(kind="bound", service=level, circularity=solved.objective))
-        episode = achieved(improved(solved))
+        episode = achieved(improved(solved, progress=_planned(progress, place / points, 1 / points)))
         service, circularity = float(episode.episode_service[0]), float(episode.episode_circularity[0])
         found.append(Point(kind="plan", service=service, circularity=circularity))
         progress("bounds and plans", (place + 1) / points)
     levels = np.linspace(least, most, FRONT)
     return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels)], axis=1)
+
+
+def _planned(progress: Progress, done: float, each: float) -> Callable[[float], None]:
+    return lambda share: progress("bounds and plans", done + each * share)
 
 
 def _levels(least: float, most: float, points: int) -> list[float]:

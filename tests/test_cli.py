@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from scipy import optimize
 from cirl_marl import cli
 from cirl_marl.catalogue import folder
 from cirl_marl.learners import train
+from cirl_marl.optimum import search_each
 
 
 @pytest.fixture(autouse=True)
@@ -189,6 +191,21 @@ def test_infeasible_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     assert run(monkeypatch, *asked) == 2
     assert "no actions reach a mean service level of 0.9; at most 0." in capsys.readouterr().err
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
+
+
+def test_plan_shows_how_far_the_search_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bar of ``cirl plan`` moves while the best plan is searched for, not only while it is carried out."""
+    shares: list[float] = []
+
+    @contextmanager
+    def bar(what: str) -> Iterator[Callable[[float], None]]:
+        yield shares.append
+
+    monkeypatch.setattr("cirl_marl.cli.networks.bar", bar)
+    monkeypatch.setattr("cirl_marl.controllers.optimum.search_each", partial(search_each, population=8, iterations=2))
+    assert run(monkeypatch, "plan", "net_zero", "--control", "optimum", "--out", "p.csv") == 0
+    searching = [share for share in shares if share < 0.99]
+    assert len(searching) > 3 * 100 and shares == sorted(shares) and shares[-1] == 1.0
 
 
 @pytest.fixture

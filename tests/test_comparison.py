@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from cirl_marl.catalogue import load_network
 from cirl_marl.comparison import compare
 from cirl_marl.comparison.files import FILES, write_comparison
 from cirl_marl.definition import read_network
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.learners import train
+from cirl_marl.learners import RunDirectory, train
 from cirl_marl.network import Network
+from cirl_marl.optimum import search_each
+from cirl_marl.pareto import pareto
 from cirl_marl.report.run import evaluate_run
 from cirl_marl.results import published
 from cirl_marl.statistics import interquartile_mean
@@ -89,6 +94,39 @@ def test_network_without_certificate() -> None:
     assert "no bound is proved" in found.yardstick.reason
 
 
+def reported(run: Callable[[Callable[[str, float], None]], object]) -> list[tuple[str, float]]:
+    """Return what ``run`` tells about its progress, which never goes back and ends at 1."""
+    told: list[tuple[str, float]] = []
+    run(lambda what, share: told.append((what, share)))
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1.0)
+    return told
+
+
+def test_plans_tell_how_far_they_are(bottles: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that takes hours, programs and improvements show in the progress, and so do the bounds."""
+    monkeypatch.setattr("cirl_marl.controllers.optimum.search_each", partial(search_each, population=8, iterations=2))
+    short = load_network("net_zero").with_options(episode={"horizon": 16})
+    told = reported(lambda progress: compare([], ["optimum"], network=short, episodes=2, progress=progress))
+    begun = next(share for what, share in told if what == "optimum")
+    searching = {share for what, share in told if what == "optimum" and share - begun < 0.99 / 3}
+    assert len(searching) > 3 * 16  # every interval of the candidates and of both iterations
+    everyone = ["neutral", "optimum", "mpc"]
+    told = reported(lambda progress: compare([], everyone, network=bottles, episodes=2, progress=progress))
+    seen = {what: len({share for each, share in told if each == what}) for what in [*everyone, "bounds"]}
+    assert seen["neutral"] == 1 + 14 and seen["mpc"] == 1 + 2 + 14 and seen["bounds"] >= 3 * 2 + 3
+    assert seen["optimum"] > 2 * (1 + 1) + 14  # the bound and some rounds of improvement for both episodes
+
+
+def test_evaluation_and_sweep_tell_how_far_they_are(bottles: Network, runs: list[Path], tmp_path: Path) -> None:
+    """Bounds of an evaluation and plans of a sweep are several steps each."""
+    told = reported(lambda progress: evaluate_run(RunDirectory(runs[1]), episodes=2, progress=progress))
+    assert len({share for what, share in told if what == "bounds"}) >= 3 * 2 + 3
+    told = reported(lambda progress: pareto(bottles, directory=tmp_path, points=3, progress=progress))
+    assert len(set(told)) > 3 * 2
+
+
 def test_files_are_whole_and_say_where_they_come_from(runs: list[Path], tmp_path: Path) -> None:
     """Every episode of every policy is a row; the provenance holds hashes of all that was read."""
     found = compare(runs, ["neutral"], episodes=3)
@@ -153,8 +191,6 @@ def test_bad_input(bottles: Network, runs: list[Path]) -> None:
 
 def test_evaluation_has_the_gap(runs: list[Path]) -> None:
     """``evaluate_run`` is the comparison of one run with neutral and random control."""
-    from cirl_marl.learners import RunDirectory
-
     figures, rollouts, _ = evaluate_run(RunDirectory(runs[1]), episodes=3)
     assert list(rollouts) == ["trained", "neutral", "random"]
     same = compare([runs[1]], ["neutral", "random"], episodes=3)

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cirl_marl import Arc, CirlError, ControlError, Network, Node, Role, VectorEnv, load_network, networks
 from cirl_marl.controllers import Neutral, Random
@@ -49,16 +50,23 @@ def test_comes_close_to_the_bound(name: str, gap: float) -> None:
 
 def test_demanded_service_is_charged() -> None:
     """With a demanded level the merit is λ̄/scale less the stated price of what is missing, and the plan serves it."""
+    shares: list[float] = []
     best: list[float] = []
+
+    def progress(share: float, merit: NDArray[np.float64]) -> None:
+        shares.append(share)
+        best.append(float(merit[0]))
+
     found = search(
         "carbo_net",
         min_service=0.9,
         horizon=20,
         knots=4,
         iterations=20,
-        progress=lambda iteration, merit: best.append(float(merit[0])),
+        progress=progress,
     )
-    assert len(best) == 21
+    assert len(best) == 21 * 20 + 1  # intervals of the candidates and of each iteration
+    assert shares == sorted(shares) and shares[-1] == 1.0 and best[0] == -np.inf
     assert best == sorted(best)
     missing = max(0.0, 0.9 - found.service)
     assert best[-1] == pytest.approx(found.circularity / 1420.0 - SHORTFALL_PRICE * missing)

@@ -57,14 +57,13 @@ def folder_for(path: Path, option: str) -> Path:
 
 
 @contextmanager
-def bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Progress bar; the yielded function takes the steps done so far."""
+def bar(what: str) -> Iterator[Callable[[float], None]]:
+    """Progress bar; the yielded function takes the share that is done."""
     with Progress(
         TextColumn(what), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=console, transient=True
     ) as progress:
-        task = progress.add_task(what, total=total)
-
-        yield lambda done: progress.update(task, completed=done)
+        task = progress.add_task(what, total=1.0)
+        yield lambda share: progress.update(task, completed=share)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from cirl_marl.catalogue import load_network, networks, recipes
 from cirl_marl.cli.common import MinService, NetworkName, Scenario, Seed, app, bar, console, errors, plain, say
 from cirl_marl.controllers import Controller
 from cirl_marl.controllers.named import CONTROLLERS, SETTABLE, named_controller
+from cirl_marl.controllers.planner import Watched
 from cirl_marl.errors import CirlError, DefinitionError
 from cirl_marl.evaluate import Rollout, interval_ends, rollout
 from cirl_marl.network import Network
@@ -103,8 +104,9 @@ def simulate(
     controller = named_controller(control, held=_held(control, set_ or []))
     env = VectorEnv(network, num_envs=1, scenario=scenario, horizon=steps)
     found = env.network
-    with bar("simulating", found.episode.horizon) as progress:
-        run = rollout(env, controller, seed=seed, progress=progress)
+    with bar("simulating") as progress:
+        watched = Watched(controller, progress)
+        run = rollout(env, watched, seed=seed, progress=watched.acted)
     folder = out or Path()
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{found.name}_{control}"
@@ -141,8 +143,9 @@ def plan(
     if out.suffix != ".csv" or not out.parent.is_dir():
         raise CirlError(f"--out {out}: needs the name of a .csv file in a folder that exists")
     env, controller = _actor(source, control, scenario, min_service)
-    with bar("planning", env.network.episode.horizon) as progress:
-        found = schedule(env, controller, seed=seed, progress=progress)
+    with bar("planning") as progress:
+        watched = Watched(controller, progress)
+        found = schedule(env, watched, seed=seed, progress=watched.acted)
     found.write(out)
     _say_figures(found.rollout, env.network)
     if isinstance(controller, Optimum) and controller.note:

@@ -11,6 +11,7 @@ import numpy as np
 from cirl_marl.catalogue import load_network
 from cirl_marl.comparison.contenders import contenders
 from cirl_marl.comparison.yardstick import Yardstick, yardstick
+from cirl_marl.controllers.planner import Watched
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluate import Rollout, first_seed, gain, relative, rollout
 from cirl_marl.learners.run import RunDirectory
@@ -168,15 +169,10 @@ def compare(
     entered, env = contenders(asked, everyone, None if found is None else found.scenario(scenario), min_service)
     first = first_seed(seed)
     share = 1 / (len(entered) + (len({each.name for each in entered}) if bounds else 0))
-    rollouts = [
-        rollout(
-            contender.env(episodes),
-            contender.controller(),
-            seed=first,
-            progress=_told(progress, contender.name, place * share, share / env.network.episode.horizon),
-        )
-        for place, contender in enumerate(entered)
-    ]
+    rollouts = []
+    for place, contender in enumerate(entered):
+        watched = Watched(contender.controller(), _told(progress, contender.name, place * share, share))
+        rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.acted))
     measure, proved = _unproved(len(entered), "")
     if bounds:
         starts = starting_stocks(entered[0].env(episodes), first)
@@ -224,6 +220,7 @@ def _measured(
             progress(SOLVING + (1 - SOLVING) * (place + 1) / len(rollouts))
         return measure, proved
     except NoCertificate as missing:
+        progress(1.0)
         return _unproved(len(rollouts), str(missing))
 
 
@@ -231,5 +228,6 @@ def _unproved(entries: int, reason: str) -> tuple[Yardstick, list[Floats | None]
     return Yardstick(None, np.empty((0, 2)), reason), [None] * entries
 
 
-def _told(progress: Progress, what: str, done: float, each: float) -> Callable[[int], None]:
-    return lambda steps: progress(what, done + each * steps)
+def _told(progress: Progress, what: str, done: float, each: float) -> Callable[[float], None]:
+    progress(what, done)
+    return lambda share: progress(what, done + each * share)

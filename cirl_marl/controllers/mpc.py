@@ -14,6 +14,7 @@ window ends. With ``horizon=None`` the window shrinks with what is left of the e
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,7 +90,12 @@ class MPC:
     the mean level over the whole episode is held at the demanded level or above: what the past intervals lacked the
     planned ones have to make up for. If that is out of reach, w = SERVICE_FIRST takes the place of the demand in that
     plan, which then comes as close as it can.
+
+    Attributes:
+        ahead: see ``Planner``.
     """
+
+    ahead = 0.1  # a first plan takes longer than the later ones, which start from it
 
     def __init__(
         self,
@@ -122,6 +128,10 @@ class MPC:
         self._demanded, self._weight, self._degree = min_service, service_weight, degree
 
     def start(self, env: VectorEnv, seed: int) -> None:
+        """Make the first plan of every copy; see ``plan``."""
+        self.plan(env, seed, lambda share: None)
+
+    def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Make the first plan of every copy; ``seed`` has no effect.
 
         Raises:
@@ -134,7 +144,10 @@ class MPC:
         self._programs = Programs(self._admissible, self._degree, self._weight, held=True)
         self._urgent = Programs(self._admissible, self._degree, SERVICE_FIRST, held=True)
         self._outlooks: dict[int, _Plan] = {}
-        self._plans = [self._next(copy, None) for copy in range(env.num_envs)]
+        self._plans = []
+        for copy in range(env.num_envs):
+            self._plans.append(self._next(copy, None))
+            progress((copy + 1) / env.num_envs)
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the next actions, from the current state of the environment that was started.

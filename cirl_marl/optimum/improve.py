@@ -7,6 +7,7 @@ a linear program. Steps are accepted by simulation alone, so the result is an ep
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +30,7 @@ TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions."""
 
 
-def improved(bound: Bound, *, rounds: int = 20) -> Bound:
+def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None] = lambda share: None) -> Bound:
     """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
 
     The merit is the objective of the bound; service below ``min_service`` is charged PENALTY times what the bound says
@@ -38,6 +39,7 @@ def improved(bound: Bound, *, rounds: int = 20) -> Bound:
     Args:
         bound: with the actions to start from.
         rounds: most linear programs to solve.
+        progress: called with the share of them that is solved; 1 when no more are needed.
 
     Raises:
         CirlError: if the solver fails.
@@ -45,10 +47,11 @@ def improved(bound: Bound, *, rounds: int = 20) -> Bound:
     price = _price(bound)
     best, run = bound, achieved(bound)
     merit, trust = _merit(bound, run, price), TRUST
-    for _ in range(rounds):
+    for done in range(rounds):
         step = _step(best, run, price, trust)
         candidate = replace(best, actions=np.clip(best.actions + step, -1.0, 1.0))
         tried = achieved(candidate)
+        progress((done + 1) / rounds)
         gained = _merit(bound, tried, price) - merit
         if gained > 0:
             best, run, merit, trust = candidate, tried, merit + gained, min(1.0, 2 * trust)
@@ -56,6 +59,7 @@ def improved(bound: Bound, *, rounds: int = 20) -> Bound:
             trust /= 4
         if trust < SMALLEST:
             break
+    progress(1.0)
     return best
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,13 +60,20 @@ class Population:
         """Entries of a stacked action."""
         return sum(len(neutral) for neutral in self._env.neutral_action.values())
 
-    def run(self, controllers: Sequence[Controller], which: Integers, deviation: Floats) -> Episodes:
+    def run(
+        self,
+        controllers: Sequence[Controller],
+        which: Integers,
+        deviation: Floats,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> Episodes:
         """Run an episode in every copy.
 
         Args:
             controllers: each has to act for all copies.
             which: whose actions each copy takes, shape (starts, copies).
             deviation: what is added to them between knots, shape (starts, copies, knots, entries).
+            progress: called with the share of the episode that is done.
         """
         env, shape = self._env, self._shape
         observations = env.restore(self._start)
@@ -87,6 +94,7 @@ class Population:
             realised[knot] += clipped - unchanged
             actions[t] = clipped
             observations = env.by_agent(env.advance(clipped).observation)
+            progress((t + 1) / steps)
         realised /= counts[:, None, None]
         state = env.physical
         return Episodes(

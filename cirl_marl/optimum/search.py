@@ -37,8 +37,8 @@ exact where more service costs less than that; a steeper one lets the draws hug 
 KNOTS = 16
 """Stretches of an episode with deviations of their own, unless another number is asked for."""
 
-Progress = Callable[[int, Floats], None]
-"""Takes the number of iterations done and the best merit from each start so far, shape (starts,)."""
+Progress = Callable[[float, Floats], None]
+"""Takes the share of all episodes that is simulated and the best merit from each start so far, shape (starts,)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +89,7 @@ def search(
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = lambda share, merit: None,
 ) -> Incumbent:
     """Look for the actions that do best over one episode, for any network; nothing is proved about the result.
 
@@ -112,7 +112,7 @@ def search(
         population: plans tried in an iteration.
         iterations: of the method; 0 takes the best candidate.
         seed: of the draws; the same seed finds the same plan.
-        progress: called after the candidates and after each iteration.
+        progress: called after each interval of the episodes that are simulated side by side.
 
     Raises:
         CirlError: for input that cannot be used.
@@ -151,7 +151,7 @@ def search_each(
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = lambda share, merit: None,
 ) -> list[Incumbent]:
     """Look for the best actions from several starts at once, which costs less than one after the other.
 
@@ -185,23 +185,30 @@ def search_each(
     known = standard_candidates(copies.agents) if candidates is None else dict(candidates)
     if not known:
         raise CirlError("candidates: give at least one controller to begin with")
+    evaluations = len(known) + population * iterations
+    highest = np.full(len(starts), -np.inf)
+    simulated = 0
+
+    def told(episodes: int) -> Callable[[float], None]:
+        return lambda share: progress((simulated + episodes * share) / evaluations, highest)
+
     controllers = list(known.values())
     entrants = np.tile(np.arange(len(known)), (len(starts), 1))
     first = Population(network, copies.agents, starts, len(known)).run(
-        controllers, entrants, np.zeros((*entrants.shape, 1, copies.entries))
+        controllers, entrants, np.zeros((*entrants.shape, 1, copies.entries)), told(len(known))
     )
     best = _Best.among(first, merit.of(first))
     origin = best.copy
     gaussians = Gaussians(best.merit, population, copies.entries, seed)
-    if progress is not None:
-        progress(0, best.merit)
-    for iteration, count in enumerate(stages(knots, iterations)):
+    simulated, highest = len(known), best.merit
+    for count in stages(knots, iterations):
         gaussians.refine(count)
-        tried = copies.run(controllers, np.repeat(origin[:, None], population, axis=1), gaussians.draw())
+        which = np.repeat(origin[:, None], population, axis=1)
+        tried = copies.run(controllers, which, gaussians.draw(), told(population))
         gaussians.learn(merit.of(tried), tried.deviation)
         best = best.or_better(_Best.among(tried, merit.of(tried)))
-        if progress is not None:
-            progress(iteration + 1, best.merit)
+        simulated, highest = simulated + population, best.merit
+    progress(1.0, best.merit)
     return [
         Incumbent(
             network=network,
@@ -214,7 +221,7 @@ def search_each(
                 zip(known, zip(first.circularity[i].tolist(), first.service[i].tolist(), strict=True), strict=True)
             ),
             origin=list(known)[origin[i]],
-            evaluations=len(known) + population * iterations,
+            evaluations=evaluations,
         )
         for i in range(len(starts))
     ]
