@@ -80,13 +80,13 @@ class Demonstrator:
         return self._began is None
 
     def check(self, agents: Sequence[str], title: str) -> None:
-        """Start in the current state and refuse a controller that cannot act for ``agents``.
+        """Start and act in the current state; refuse a controller that cannot do so, or not for ``agents``.
 
         Raises:
             RecipeError: naming the learner ``title`` and what the controller lacks.
         """
         try:
-            self._begin()
+            self.act()
         except CirlError as error:
             raise RecipeError(f"{title}: demonstrations by {self.name} control: {error}") from error
         if isinstance(self._controller, Scripted):
