@@ -72,7 +72,9 @@ LARGE = {
 SMALL = dict.fromkeys(RECIPES, 10_240) | {"joint_sac": 7_680}
 CASES = {
     "copper_net": Case(LARGE, ("random", "neutral", "mpc", "optimum")),
-    "carbo_net": Case(LARGE | {"joint_ppo": 3_000_000, "joint_linear_ppo": 5_000_000}, ("random", "neutral", "mpc", "optimum")),
+    "carbo_net": Case(
+        LARGE | {"joint_ppo": 3_000_000, "joint_linear_ppo": 5_000_000}, ("random", "neutral", "mpc", "optimum")
+    ),
     "net_zero": Case(SMALL),
     "solids_net": Case(SMALL, ("random", "neutral", "scripted"), {"reward": "mixed"}),
 }
