@@ -196,11 +196,14 @@ def test_curves_are_thinned_to_means() -> None:
 def test_table_shows_both_and_what_was_not_run() -> None:
     """The paper's figures, ours over the seeds with all steps, shorter runs as such, and what is missing."""
     runs = [result(end=-5e7), result(seed=1, end=-4e7), result(steps=500, end=-1.0), result("PPO", 50_000)]
+    shown = {"recipe": {"learner": {"demonstrations": {"controller": "scripted", "steps": 7_500}}}}
+    runs.append(result("ARS", settings=shown))
     rows = {(row[0], row[1]): row for row in table_rows(COPPER, runs)}
     assert rows["A2C", "paper"][3:7] == ("-1.34e8", "-5.30e7", "8.10e7", "405")
     assert rows["A2C", "ours"][2:5] == ("0, 1", "-1.50e8 ± 0.00e8", "-4.50e7 ± 0.71e7")
     assert rows["A2C", "ours"][-3:] == ("1.5", "1.0", "")
     assert rows["PPO", "ours"][-1] == "50,000 of 200,000 steps"
+    assert rows["ARS", "ours"][-1].startswith("the first 7,500 steps, and r_s with them, are demonstrations")
     assert rows["SAC", "ours"][-1] == rows["", "tuned"][-1] == "not run"
     text = markdown(runs)
     assert "| DDPG | paper |  | -60.2 | -5.5 | 54.7 | 5.47e-4 | 72.3 |  | 13.7 |  |  |" in text

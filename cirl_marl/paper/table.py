@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 from rich.table import Table
@@ -149,8 +149,17 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
         cell(lambda result: result.evaluation.mean),
         f"{np.mean([result.seconds for result in seeds]) / 60:.1f}",
         f"{np.mean(cpu) / 60:.1f}" if cpu else "",
-        "" if steps == environment.steps else f"{steps:,} of {environment.steps:,} steps",
+        "; ".join(_remarks(environment, seeds[0])),
     )
+
+
+def _remarks(environment: PaperEnvironment, result: Result) -> Iterator[str]:
+    """Say what sets a row apart from the paper's: fewer steps, or a start that the learner was shown."""
+    if result.row.steps != environment.steps:
+        yield f"{result.row.steps:,} of {environment.steps:,} steps"
+    shown = result.settings.get("recipe", {}).get("learner", {}).get("demonstrations")
+    if shown:
+        yield f"the first {shown['steps']:,} steps, and r_s with them, are demonstrations ({shown['controller']} control)"
 
 
 def _notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
