@@ -203,7 +203,7 @@ def test_table_shows_both_and_what_was_not_run() -> None:
     assert rows["A2C", "ours"][2:5] == ("0, 1", "-1.50e8 ± 0.00e8", "-4.50e7 ± 0.71e7")
     assert rows["A2C", "ours"][-3:] == ("1.5", "1.0", "")
     assert rows["PPO", "ours"][-1] == "50,000 of 200,000 steps"
-    assert rows["ARS", "ours"][-1].startswith("the first 7,500 steps, and r_s with them, are demonstrations")
+    assert rows["ARS", "ours"][-1] == "the first 7,500 steps, and r_s with them, are shown by scripted control"
     assert rows["SAC", "ours"][-1] == rows["", "tuned"][-1] == "not run"
     text = markdown(runs)
     assert "| DDPG | paper |  | -60.2 | -5.5 | 54.7 | 5.47e-4 | 72.3 |  | 13.7 |  |  |" in text

@@ -159,7 +159,7 @@ def _remarks(environment: PaperEnvironment, result: Result) -> Iterator[str]:
         yield f"{result.row.steps:,} of {environment.steps:,} steps"
     shown = result.settings.get("recipe", {}).get("learner", {}).get("demonstrations")
     if shown:
-        yield f"the first {shown['steps']:,} steps, and r_s with them, are demonstrations ({shown['controller']} control)"
+        yield f"the first {shown['steps']:,} steps, and r_s with them, are shown by {shown['controller']} control"
 
 
 def _notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
