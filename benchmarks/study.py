@@ -69,13 +69,14 @@ LARGE = {
     "joint_linear_ppo": 3_000_000,
     "joint_sac": 30_000,
 }
+MIDDLE = dict.fromkeys(RECIPES, 40_960) | {"joint_ppo": 102_400, "joint_linear_ppo": 102_400, "joint_sac": 15_360}
 SMALL = dict.fromkeys(RECIPES, 10_240) | {"joint_sac": 7_680}
 CASES = {
     "copper_net": Case(LARGE, ("random", "neutral", "mpc", "optimum")),
     "carbo_net": Case(
         LARGE | {"joint_ppo": 3_000_000, "joint_linear_ppo": 5_000_000}, ("random", "neutral", "mpc", "optimum")
     ),
-    "net_zero": Case(SMALL),
+    "net_zero": Case(MIDDLE),
     "solids_net": Case(SMALL, ("random", "neutral", "scripted"), {"reward": "mixed"}),
 }
 LQR_CASES: tuple[tuple[str, str, dict[str, float] | None], ...] = (
@@ -99,10 +100,22 @@ class Job:
     options: tuple[tuple[str, Any], ...]
     directory: Path
 
+    def is_done(self) -> bool:
+        """Return whether a complete run is there, of as many steps and by the recipe as it is now."""
+        if not self._note.is_file():
+            return False
+        config, now = RunDirectory(self.directory).config, load_recipe(self.recipe)
+        found = (config.steps, config.recipe.learner, config.recipe.environment)
+        return found == (self.steps, now.learner, now.environment)
+
+    @property
+    def _note(self) -> Path:
+        """What is written when the run is complete."""
+        return self.directory / "study.json"
+
     def run(self) -> float:
         """Train, unless it is done; return the minutes that it took."""
-        note = self.directory / "study.json"
-        if note.is_file():
+        if self.is_done():
             return 0.0
         shutil.rmtree(self.directory, ignore_errors=True)
         began, spent = time.perf_counter(), time.process_time()
@@ -115,7 +128,7 @@ class Job:
             **dict(self.options),
         )
         minutes = (time.perf_counter() - began) / 60
-        write_json(note, {"minutes": minutes, "cpu_minutes": (time.process_time() - spent) / 60})
+        write_json(self._note, {"minutes": minutes, "cpu_minutes": (time.process_time() - spent) / 60})
         return minutes
 
 
@@ -142,15 +155,15 @@ def main(
         _train([*planned, *credit], jobs)
     sections = {}
     for name in names:
-        runs = [job.directory for job in planned if job.network == name and (job.directory / "study.json").is_file()]
+        runs = [job.directory for job in planned if job.network == name and job.is_done()]
         comparison = _compare(name, runs, episodes)
         write_comparison(comparison, RESULTS / name, seeds=seeds, recipes=chosen)
         shutil.copyfile(RESULTS / name / "comparison.png", PICTURES / f"study_{name}.png")
         sections[name] = "\n".join(_table(comparison, runs))
-    done = [job for job in credit if (job.directory / "study.json").is_file()]
+    done = [job for job in credit if job.is_done()]
     if {dict(job.options)["reward"] for job in done} == set(CREDIT):
         sections["difference"] = "\n".join(_credit_table(done))
-    if not only:
+    if {network for network, *_ in LQR_CASES} <= set(names):
         sections["lqr"] = "\n".join(_lqr_table(episodes))
     sections["made"] = made_with()
     write_sections(document, sections)
@@ -175,7 +188,7 @@ def _credit_jobs(out: Path, seeds: int, steps: int | None) -> Iterator[Job]:
 
 def _train(jobs: Sequence[Job], workers: int) -> None:
     """Run what is missing, several at a time."""
-    missing = [job for job in jobs if not (job.directory / "study.json").is_file()]
+    missing = [job for job in jobs if not job.is_done()]
     with Progress(console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("training", total=len(missing))
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
