@@ -25,6 +25,16 @@ def test_links_lead_somewhere(document: Path) -> None:
     assert missing == []
 
 
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_measured_sections_have_content(document: Path) -> None:
+    """Every mark ``<!-- name -->`` has its end, and between them stands what was measured."""
+    text = document.read_text()
+    marks = re.findall(r"^<!-- (/?\w+) -->$", text, re.MULTILINE)
+    assert [f"/{name}" for name in marks[::2]] == marks[1::2]
+    for name in marks[::2]:
+        assert text.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0].strip(), name
+
+
 def test_readme_lists_the_catalogue_and_the_commands() -> None:
     """Tables of the README name exactly the networks, recipes and commands that there are."""
     text = (ROOT / "README.md").read_text()
