@@ -35,7 +35,7 @@ from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
 
 PACKAGES = (
-    "cirl-marl", "gymnasium", "greenlet", "networkx", "numpy", "pettingzoo", "sb3-contrib", "scipy",
+    "cirl-marl", "gymnasium", "greenlet", "highspy", "networkx", "numpy", "pettingzoo", "sb3-contrib", "scipy",
     "stable-baselines3", "torch",
 )  # fmt: skip
 STATES = ("running", "complete", "interrupted", "failed")
