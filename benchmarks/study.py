@@ -59,24 +59,20 @@ class Case:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-RECIPES = ("independent_ppo", "difference_ppo", "shared_ppo", "mappo", "joint_ppo", "joint_linear_ppo", "joint_sac")
+RECIPES = ("independent_ppo", "difference_ppo", "shared_ppo", "mappo", "joint_ppo", "joint_sac")
 LARGE = {
-    "independent_ppo": 200_000,
-    "difference_ppo": 200_000,
+    "independent_ppo": 60_000,
+    "difference_ppo": 60_000,
     "shared_ppo": 200_000,
     "mappo": 200_000,
     "joint_ppo": 6_000_000,
-    "joint_linear_ppo": 3_000_000,
     "joint_sac": 30_000,
 }
-MIDDLE = dict.fromkeys(RECIPES, 40_960) | {"joint_ppo": 102_400, "joint_linear_ppo": 102_400, "joint_sac": 15_360}
 SMALL = dict.fromkeys(RECIPES, 10_240) | {"joint_sac": 7_680}
 CASES = {
     "copper_net": Case(LARGE, ("random", "neutral", "mpc", "optimum")),
-    "carbo_net": Case(
-        LARGE | {"joint_ppo": 3_000_000, "joint_linear_ppo": 5_000_000}, ("random", "neutral", "mpc", "optimum")
-    ),
-    "net_zero": Case(MIDDLE),
+    "carbo_net": Case(LARGE | {"mappo": 1_000_000, "joint_ppo": 1_500_000}, ("random", "neutral", "mpc", "optimum")),
+    "net_zero": Case(SMALL),
     "solids_net": Case(SMALL, ("random", "neutral", "scripted"), {"reward": "mixed"}),
 }
 LQR_CASES: tuple[tuple[str, str, dict[str, float] | None], ...] = (
