@@ -127,6 +127,7 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, repor
     learner, copies = recipe.learner, recipe.run.envs
     monitors: list[Monitor[Any, Any]] = [Monitor(gymnasium.make(environment.id)) for _ in range(copies)]
     env: VecEnv = DummyVecEnv([lambda monitor=monitor: monitor for monitor in monitors])  # type: ignore[misc]
+    goal = isinstance(env.observation_space, gymnasium.spaces.Dict)
     normalise = learner.normalise
     if normalise.any:
         env = VecNormalize(
@@ -136,8 +137,8 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, repor
             clip_obs=normalise.clip_observation,
             clip_reward=normalise.clip_reward,
             gamma=learner.parameters.get("gamma", 0.99),
+            norm_obs_keys=["observation"] if goal else None,  # hindsight swaps goals, so they keep one scale
         )
-    goal = isinstance(env.observation_space, gymnasium.spaces.Dict)
     parameters = learner.parameters | ({"replay_buffer_class": HerReplayBuffer} if goal else {})
     policy = learner.policy.replace("Mlp", "MultiInput") if goal else learner.policy
     model = build(learner.algorithm, policy, env, parameters, seed=row.seed, device="cpu")
