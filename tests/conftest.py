@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,7 @@ from cirl_marl import (
 )
 
 if TYPE_CHECKING:
+    from cirl_marl.learners import Progress
     from cirl_marl.learners.recipe import Recipe
 
 settings.register_profile(
@@ -46,6 +48,20 @@ LAWS = [law for law in Law if law is not Law.COMPARTMENT]
 def make_network() -> Callable[[int, int, int], Network]:
     """``random_network``, for tests of one that once failed."""
     return random_network
+
+
+@pytest.fixture
+def ctrl_c_after() -> Callable[[int], Callable[[Progress], None]]:
+    """Return ``ctrl_c_after(env_steps)``, which is to be reported to by ``train`` and then interrupts it."""
+
+    def reports_to(env_steps: int) -> Callable[[Progress], None]:
+        def report(progress: Progress) -> None:
+            if progress.env_steps == env_steps:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        return report
+
+    return reports_to
 
 
 @pytest.fixture

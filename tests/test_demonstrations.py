@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -152,16 +150,11 @@ def test_same_seed_gives_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize("stop", [6, 14])
-def test_resumed_run_gets_the_rest(stop: int, tmp_path: Path) -> None:
+def test_resumed_run_gets_the_rest(stop: int, tmp_path: Path, ctrl_c_after: Any) -> None:
     """Stopped in the middle of the demonstrations it gets the others, stopped after them none; none are lost."""
-
-    def interrupt(progress: Any) -> None:
-        if progress.env_steps == COPIES * stop:
-            os.kill(os.getpid(), signal.SIGINT)
-
     asked = recipe({"controller": "neutral", "steps": 20})
     with pytest.raises(KeyboardInterrupt):
-        trained(asked, directory=tmp_path / "run", report=interrupt)
+        trained(asked, directory=tmp_path / "run", report=ctrl_c_after(COPIES * stop))
     training = resume(tmp_path / "run")
     for name in AGENTS:
         buffer, neutral = buffer_of(training, name), training.env.neutral_action[name].astype(np.float32)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -111,16 +109,11 @@ def test_files_that_say_something_else_are_refused(tmp_path: Path, name: str, te
         Trained(tmp_path / "run")
 
 
-def test_metrics_survive_a_crash(tmp_path: Path, ppo_recipe: Recipe) -> None:
+def test_metrics_survive_a_crash(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:
     """A row that a crash cut short is left out, and rows past the checkpoint are not repeated on resumption."""
     directory = tmp_path / "run"
-
-    def stop(progress: Any) -> None:
-        if progress.env_steps == 60:
-            os.kill(os.getpid(), signal.SIGINT)
-
     with pytest.raises(KeyboardInterrupt):
-        train("copper_net", ppo_recipe, directory=directory, horizon=5, report=stop)
+        train("copper_net", ppo_recipe, directory=directory, horizon=5, report=ctrl_c_after(60))
     metrics = directory / "metrics.csv"
     before = RunDirectory(directory).metrics()["joint_step"]
     metrics.write_text(metrics.read_text() + "35,70,1.0,-9")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -235,16 +233,11 @@ def test_failure_names_the_agent_and_keeps_what_was_learnt(tmp_path: Path, ppo_r
     assert set(controller.act(env.reset(seed=0))) == set(env.agents)
 
 
-def test_interruption_saves_and_resumption_finishes(tmp_path: Path, mixed_recipe: Recipe) -> None:
+def test_interruption_saves_and_resumption_finishes(tmp_path: Path, mixed_recipe: Recipe, ctrl_c_after: Any) -> None:
     """Ctrl-C saves everything; the run goes on from there, and a finished run is not run again."""
     directory = tmp_path / "run"
-
-    def interrupt(progress: Any) -> None:
-        if progress.env_steps == 30:
-            os.kill(os.getpid(), signal.SIGINT)
-
     with pytest.raises(KeyboardInterrupt):
-        train("copper_net", mixed_recipe, directory=directory, horizon=5, report=interrupt)
+        train("copper_net", mixed_recipe, directory=directory, horizon=5, report=ctrl_c_after(30))
     status = RunDirectory(directory).status
     assert (status["state"], status["joint_steps"]) == ("interrupted", 15)
     assert not list(directory.rglob("*.partial*"))
