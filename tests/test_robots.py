@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from cirl_marl.compartments import model_class, models
 from cirl_marl.compartments.robots import sorting_station
-from cirl_marl.compartments.robots.fetch import BIN, Fetch, WasteSorting
+from cirl_marl.compartments.robots.fetch import BIN, Fetch, WasteSorting, engine
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.compartments.robots.sorting_station import BOOKS, SortingStation
 from cirl_marl.controllers.scripted import Seen, fetch, reacher
@@ -175,10 +175,12 @@ class TestTasks:
         """The target is out of the range in which objects appear, so nothing is sorted by doing nothing."""
         state = starts(Fetch(), 40)
         assert not Fetch().success(state, np.zeros((4, 40))).any()
-        offset = np.abs(state[3:5] - state[0:2])
-        assert 0.12 < offset.max() <= 0.16
-        gap = np.maximum(np.abs(np.array(BIN)[:2, None] - state[0:2]) - 0.16, 0.0)
-        assert np.linalg.norm(gap, axis=0).min() > 0.05, "an object could appear within the threshold of the target"
+        robot = engine().env
+        centre, reach = robot.initial_gripper_xpos[:2, None], robot.obj_range
+        offset = np.abs(state[3:5] - centre)
+        assert 0.8 * reach < offset.max() <= reach
+        gap = np.maximum(np.abs(np.array(BIN)[:2, None] - centre) - reach, 0.0)
+        assert np.linalg.norm(gap) > robot.distance_threshold, "an object could appear within a success of the target"
         assert 1.05 + 0.05 < BIN[0] < 1.55 - 0.05
         assert 0.4 + 0.05 < BIN[1] < 1.1 - 0.05
 

@@ -23,9 +23,11 @@ OPEN, CLOSED = 1.0, -1.0
 MOVE_M = 0.05
 """Displacement of the gripper that an input of 1 asks for."""
 HOVER_M = 0.08
-"""Height above an object at which the gripper moves sideways."""
-CARRY_M = 0.06
-"""Height above the target at which the object is carried."""
+"""Height above an object at which the gripper arrives from afar, so that it does not push the object away."""
+SLOPE, STRADDLE_M = 1.2, 0.012
+"""Descent of the way to an object, and how far in y the gripper may be off while its open fingers straddle it."""
+CARRY_M, PLACE_M, NEAR_M = 0.03, 0.02, 0.06
+"""Heights above the target at which the object is carried and set down, and the distance at which that begins."""
 HOLDING_M = 0.03
 """Opening of each finger below which the gripper holds something; an object of 5 cm leaves them at 0.025."""
 
@@ -33,23 +35,25 @@ HOLDING_M = 0.03
 def fetch(seen: Seen) -> Floats:
     """Return the inputs of the Fetch robot that reach, grasp, lift, carry and place, shape (4, B).
 
-    A function of the observation alone. Away from the object the gripper is open and goes above it, then down; around
-    it the fingers close; once they hold, it is lifted, carried and set down; at the target it is let go.
+    A function of the observation alone. Away from the object the gripper is open and comes down to it on a slope, or at
+    its height where the fingers, which open in y, pass on both sides of it; around the object they close; once they
+    hold, it is lifted, carried and set down; at the target it is let go.
     """
     grip, item, target = (
         np.stack([seen[f"{what}_{axis}"] for axis in "xyz"]) for what in ("grip", "object", "desired")
     )
-    aside = np.hypot(*(item - grip)[:2])
-    around = (aside < 0.02) & (np.abs(item[2] - grip[2]) < 0.015)
+    away = grip - item
+    aside = np.hypot(*away[:2])
+    around = (aside < 0.02) & (np.abs(away[2]) < 0.02)
     held = around & (0.5 * (seen["finger_r"] + seen["finger_l"]) < HOLDING_M)
     left = np.hypot(*(target - item)[:2])
-    placed = (left < 0.02) & (item[2] < target[2] + 0.03)
+    placed = (left < 0.03) & (item[2] < target[2] + 0.03)
     reach, carry = item.copy(), target.copy()
-    reach[2] += np.where(aside < 0.015, 0.0, HOVER_M)
-    carry[2] += np.where(left > 0.03, CARRY_M, 0.02)
+    reach[2] += np.where(np.abs(away[1]) < STRADDLE_M, 0.0, np.clip(SLOPE * (aside - 0.015), 0.0, HOVER_M))
+    carry[2] += np.where(left > NEAR_M, CARRY_M, PLACE_M)
     towards = np.where(held, carry, np.where(around, item, reach))
     towards = np.where(placed, np.stack([grip[0], grip[1], target[2] + HOVER_M]), towards)
-    move = np.clip((towards - grip) / MOVE_M * np.where(held, 1.0, 1.5), -1.0, 1.0)
+    move = np.clip(1.5 * (towards - grip) / MOVE_M, -1.0, 1.0)
     fingers = np.where(around & ~placed, CLOSED, OPEN)
     return np.concatenate([move, fingers[None]])
 

@@ -18,9 +18,9 @@ from cirl_marl.rowsum import Floats
 with redirect_stderr(StringIO()):  # the package prints a notice about its robot hands, which are not used here
     from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv
 
-BIN = (1.34, 1.0, 0.4)
+BIN = (1.34, 0.95, 0.4)
 """Where the target lies, m: on the table (z = 0.4, published). Its x, y are chosen: beside the objects, which lie
-within 0.15 m of (1.34, 0.75), and well within the table, x 1.05 to 1.55, y 0.4 to 1.1."""
+within 0.15 m of (1.34, 0.75), as near as it can be without an object in it at the start, 5 cm from where they end."""
 
 
 def _names(*groups: tuple[str, str]) -> tuple[str, ...]:
