@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,7 @@ from cirl_marl import (
     Role,
     Service,
 )
+from cirl_marl.rowsum import Floats
 
 if TYPE_CHECKING:
     from cirl_marl.learners import Progress
@@ -40,8 +42,20 @@ settings.register_profile(
 settings.register_profile("thorough", settings.get_profile("cirl_marl"), max_examples=1000, derandomize=False)
 settings.load_profile("cirl_marl")
 
+REFERENCE = Path(__file__).parent / "reference"
 ROLES = list(Role)
 LAWS = [law for law in Law if law is not Law.COMPARTMENT]
+
+
+@pytest.fixture(scope="session")
+def published() -> Callable[[str], tuple[Floats, Floats, Floats]]:
+    """Return ``published(name)``: normalised actions (n,), states (n + 1, k), rewards (n,) of a class of the paper."""
+
+    def read(name: str) -> tuple[Floats, Floats, Floats]:
+        table = np.loadtxt(REFERENCE / f"{name}.csv", delimiter=",", skiprows=1)
+        return table[:-1, 0], table[:, 1:-1], table[:-1, -1]
+
+    return read
 
 
 @pytest.fixture

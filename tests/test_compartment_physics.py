@@ -170,7 +170,7 @@ class TestAnswers:
         ],
     )
     def test_wastebed_after_three_hours(self, model: Incinerator, temperature: float) -> None:
-        """T_w at 180 min (PHYSICS §6): the published feed term heats the bed without end."""
+        """T_w at 180 min: the published feed term heats the bed without end."""
         start = np.array(Incinerator.paper.initial_state)
         assert solve(model, start, np.array([40.0]), [180.0])[2, -1] == pytest.approx(temperature, abs=0.05)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,9 @@ from cirl_marl.network import Floats
 from cirl_marl.single_env import SingleAgentEnv
 from cirl_marl.testing import check_parallel_env, check_vector_env
 
-REFERENCE = Path(__file__).parent / "reference"
+Published = Callable[[str], tuple[Floats, Floats, Floats]]
+"""Actions (n,), states (n + 1, k) and rewards (n,) of a class of the paper, by its name."""
+
 LITRES = 1000.0
 KG_PER_MMOL = 44.01e-6
 
@@ -78,17 +81,16 @@ def paper_network(kind: str) -> Network:
         ("microalgae_droop", "CO2MicroalgaeDroop"),
     ],
 )
-def test_published_environments_as_the_one_agent_case(kind: str, name: str) -> None:
+def test_published_environments_as_the_one_agent_case(kind: str, name: str, published: Published) -> None:
     """The general machinery, given the published model, bounds and Euler step, reproduces the published trajectory."""
-    table = np.genfromtxt(REFERENCE / f"{name}.csv", delimiter=",", names=True)
-    states = np.stack([table[column] for column in table.dtype.names or () if column.startswith("x")], axis=1)
+    actions, states, rewards = published(name)
     env = SingleAgentEnv(paper_network(kind))
     env.reset(seed=0)
-    steps = min(len(table) - 1, env.network.episode.horizon)
+    steps = min(len(actions), env.network.episode.horizon)
     for t in range(steps):
-        _, reward, terminated, truncated, info = env.step(np.array([table["action_normalised"][t]]))
+        _, reward, terminated, truncated, info = env.step(np.array([actions[t]]))
         np.testing.assert_allclose(info["state"], states[t + 1], rtol=1e-9, atol=1e-9)
-        assert reward == pytest.approx(table["reward"][t], rel=1e-9, abs=1e-8)
+        assert reward == pytest.approx(rewards[t], rel=1e-9, abs=1e-8)
         assert not terminated
         assert truncated == (t + 1 == env.network.episode.horizon)
 

@@ -263,7 +263,7 @@ class TestDrawDown:
 
 @pytest.mark.parametrize(("action", "figure"), [(-1.0, 143.8), (0.0, 114.7), (1.0, 95.4)])
 def test_start_that_the_returns_of_the_paper_need(action: float, figure: float) -> None:
-    """PHYSICS §3: darkness, I = 75 and I = 150 from S in the inferred range; from S = 0 even darkness returns 103.4."""
+    """Darkness, I = 75 and I = 150 from S in the inferred range; from S = 0 even darkness returns 103.4."""
     model = MicroalgaeMonod(form="published")
     paper, inputs = model.paper, model.paper.inputs(np.full((1, 3), action))
     low, high = paper.inferred_initial[1]

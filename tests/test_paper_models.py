@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -14,7 +14,9 @@ from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.rowsum import Floats
 
-REFERENCE = Path(__file__).parent / "reference"
+Published = Callable[[str], tuple[Floats, Floats, Floats]]
+"""Actions (n,), states (n + 1, k) and rewards (n,) of a class of the paper, by its name."""
+
 
 PAPER: dict[str, tuple[ContinuousModel, PaperScenario, tuple[int, ...]]] = {
     "TransportTruck": (TransportTruck(form="published"), TransportTruck.paper, (0,)),
@@ -37,47 +39,41 @@ def euler(model: ContinuousModel, paper: PaperScenario, start: Floats, actions: 
     return np.concatenate(states, axis=1), np.array(rewards)
 
 
-def reference(name: str) -> tuple[Floats, Floats, Floats]:
-    """Return actions (n,), states (k, n + 1) and rewards (n,) of a published class; its last row has only a state."""
-    table = np.loadtxt(REFERENCE / f"{name}.csv", delimiter=",", skiprows=1)
-    return table[:-1, 0], table[:, 1:-1].T, table[:-1, -1]
-
-
 class TestReference:
     """The trajectories of the published classes."""
 
     @pytest.mark.parametrize("name", PAPER)
-    def test_every_row(self, name: str) -> None:
+    def test_every_row(self, name: str, published: Published) -> None:
         """From the start that stands for the float32 first step, every later state and every reward to 1e-9."""
         model, paper, _ = PAPER[name]
-        actions, published, earned = reference(name)
+        actions, expected, earned = published(name)
         states, rewards = euler(model, paper, np.array(paper.reference_start)[:, None], actions)
-        np.testing.assert_allclose(states[:, 1:], published[:, 1:], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(states[:, 1:], expected[1:].T, rtol=1e-9, atol=1e-12)
         # Droop's first reward is K_CO2·ρ at S = 0; the start that stands for it is −1.1e-10
         np.testing.assert_allclose(rewards, earned, rtol=1e-9, atol=4e-9 if name == "CO2MicroalgaeDroop" else 1e-12)
 
     @pytest.mark.parametrize("name", PAPER)
-    def test_from_the_second_row_to_the_last_digit(self, name: str) -> None:
+    def test_from_the_second_row_to_the_last_digit(self, name: str, published: Published) -> None:
         """The published step works in float64 from its second step on; there nothing is left to explain."""
         model, paper, _ = PAPER[name]
-        actions, published, earned = reference(name)
-        states, rewards = euler(model, paper, published[:, 1:2], actions[1:])
-        np.testing.assert_allclose(states, published[:, 1:], rtol=2e-14)
+        actions, expected, earned = published(name)
+        states, rewards = euler(model, paper, expected[1:2].T, actions[1:])
+        np.testing.assert_allclose(states, expected[1:].T, rtol=2e-14)
         np.testing.assert_allclose(rewards, earned[1:], rtol=2e-14)
 
     @pytest.mark.parametrize("name", PAPER)
-    def test_first_step_rounds_to_float32(self, name: str) -> None:
+    def test_first_step_rounds_to_float32(self, name: str, published: Published) -> None:
         """NumPy 2 keeps float32 where a float32 state meets Python floats: that is the whole of the first step."""
         model, paper, rounded = PAPER[name]
-        actions, published, earned = reference(name)
+        actions, expected, earned = published(name)
         start = np.array(paper.initial_state, dtype=np.float32)[:, None]
-        np.testing.assert_array_equal(start[:, 0], published[:, 0])
+        np.testing.assert_array_equal(start[:, 0], expected[0])
         inputs = paper.inputs(actions[:1][None])
         rate = model.derivative(start, inputs)  # type: ignore[arg-type]
         state = start + paper.dt * rate
         for i in rounded:
             state[i] = start[i] + np.float32(paper.dt * rate[i])
-        np.testing.assert_allclose(state[:, 0], published[:, 1], rtol=1e-15)
+        np.testing.assert_allclose(state[:, 0], expected[1], rtol=1e-15)
         after = state if model.reward_state == "after" else start.astype(np.float64)
         np.testing.assert_allclose(model.reward(after, inputs)[0], earned[0], rtol=1e-10)
 
@@ -96,7 +92,7 @@ class TestReference:
 
     @pytest.mark.parametrize(("action", "total"), [(-1.0, 102.9), (0.0, 101.1), (1.0, 90.4)])
     def test_monod_with_the_reward_of_the_state_before(self, action: float, total: float) -> None:
-        """PHYSICS §3 sums the reward of the state before each step; the published class takes S after it, 0.5 more."""
+        """The published class rewards the state after each step; with the state before it the sums were 0.5 lower."""
         model, paper, _ = PAPER["CO2MicroalgaeMonod"]
         states, _ = euler(model, paper, np.array(paper.initial_state)[:, None], np.full(200, action))
         inputs = paper.inputs(np.full((1, 200), action))

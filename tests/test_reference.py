@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -16,46 +16,43 @@ from scipy.integrate import solve_ivp
 
 from cirl_marl import CirlError, Law, VectorEnv, load_network, parallel_env, single_agent_env
 from cirl_marl.registration import PAPER_ENVIRONMENTS
+from cirl_marl.rowsum import Floats
 from cirl_marl.simulate import Dynamics
 
-REFERENCE = Path(__file__).parent / "reference"
+Published = Callable[[str], tuple[Floats, Floats, Floats]]
+"""Actions (n,), states (n + 1, k) and rewards (n,) of a class of the paper, by its name."""
+
 PAPER = {"CopperNet": ("copper_net", "use_to_collection"), "CarboNet": ("carbo_net", "urban_to_capture")}
 
 
-def reference(name: str) -> dict[str, NDArray[np.float64]]:
-    """Return the published trajectory: normalised actions, states and rewards."""
-    table = np.loadtxt(REFERENCE / f"{name}.csv", delimiter=",", skiprows=1)
-    return {"action": table[:, 0], "state": table[:, 1:-1], "reward": table[:, -1]}
-
-
 @pytest.mark.parametrize("name", PAPER)
-def test_published_trajectory(name: str) -> None:
+def test_published_trajectory(name: str, published: Published) -> None:
     """Through gymnasium.make: row t's action leads to row t+1's state and to row t's reward."""
-    published = reference(name)
+    actions, states, rewards = published(name)
     env = gymnasium.make(f"cirl_marl/{name}-v0", disable_env_checker=True)
     observation, info = env.reset(seed=0)
-    np.testing.assert_allclose(info["state"], published["state"][0], rtol=1e-9)
+    np.testing.assert_allclose(info["state"], states[0], rtol=1e-9)
     for t in range(50):
-        observation, reward, terminated, truncated, info = env.step(published["action"][t : t + 1])
-        assert reward == pytest.approx(published["reward"][t], rel=1e-9)
+        observation, reward, terminated, truncated, info = env.step(actions[t : t + 1])
+        assert reward == pytest.approx(rewards[t], rel=1e-9)
         assert not terminated
         assert truncated == (t == 49)
-        if t + 1 < len(published["state"]):
-            np.testing.assert_allclose(info["state"], published["state"][t + 1], rtol=1e-9)
+        if t + 1 < len(states):
+            np.testing.assert_allclose(info["state"], states[t + 1], rtol=1e-9)
         np.testing.assert_array_equal(observation, info["state"].astype(np.float32))
     env.close()
 
 
 @pytest.mark.parametrize("name", PAPER)
-def test_initial_state_in_the_papers_order(name: str) -> None:
+def test_initial_state_in_the_papers_order(name: str, published: Published) -> None:
     """An array is taken in the paper's order; one step from it is one published step."""
-    published = reference(name)
+    actions, states, _ = published(name)
     network, agent = PAPER[name]
     env: gymnasium.Env[Any, Any] = single_agent_env(network, agent=agent, scenario="paper")
-    _, info = env.reset(seed=0, options={"initial_state": published["state"][7]})
-    np.testing.assert_array_equal(info["state"], published["state"][7])
-    *_, info = env.step(published["action"][7:8])
-    np.testing.assert_allclose(info["state"], published["state"][8], rtol=1e-9)
+    _, info = env.reset(seed=0, options={"initial_state": states[7]})
+    np.testing.assert_array_equal(info["state"], states[7])
+    *_, info = env.step(actions[7:8])
+    np.testing.assert_allclose(info["state"], states[8], rtol=1e-9)
 
 
 @pytest.mark.parametrize("id_", PAPER_ENVIRONMENTS)
@@ -133,14 +130,14 @@ def test_one_agent_is_all_agents_with_the_others_neutral(network: str, agent: st
     np.testing.assert_array_equal(one.parallel.state(), all_.state())
 
 
-def test_local_rewards_sum_to_the_papers() -> None:
+def test_local_rewards_sum_to_the_papers(published: Published) -> None:
     """The local rewards of copper_net's compartments are the paper's reward, split."""
-    published = reference("CopperNet")
+    actions, _, rewards = published("CopperNet")
     env = parallel_env("copper_net", scenario="paper")
     env.reset(seed=0)
     for t in range(20):
-        env.step({"use_to_collection": published["action"][t : t + 1]})
-        assert sum(env.local_rewards().values()) == pytest.approx(published["reward"][t], rel=1e-9)
+        env.step({"use_to_collection": actions[t : t + 1]})
+        assert sum(env.local_rewards().values()) == pytest.approx(rewards[t], rel=1e-9)
 
 
 @pytest.mark.parametrize(

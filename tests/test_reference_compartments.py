@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -13,8 +13,10 @@ from scipy.integrate import solve_ivp
 
 from cirl_marl import SingleAgentEnv
 from cirl_marl.compartments import model_class
+from cirl_marl.rowsum import Floats
 
-REFERENCE = Path(__file__).parent / "reference"
+Published = Callable[[str], tuple[Floats, Floats, Floats]]
+"""Actions (n,), states (n + 1, k) and rewards (n,) of a class of the paper, by its name."""
 
 MODELS = {
     "TransportTruck": ("transport_truck", 200),
@@ -40,16 +42,15 @@ def test_horizon_is_a_truncation(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_published_trajectory_of_one_compartment(name: str) -> None:
+def test_published_trajectory_of_one_compartment(name: str, published: Published) -> None:
     """Through gymnasium.make, started where the published class starts, over every published row."""
     kind, _ = MODELS[name]
-    table = np.genfromtxt(REFERENCE / f"{name}.csv", delimiter=",", names=True)
-    states = np.stack([table[column] for column in table.dtype.names or () if column.startswith("x")], axis=1)
+    actions, states, rewards = published(name)
     paper = model_class(kind).paper
-    env = make(name, horizon=len(table))
+    env = make(name, horizon=len(states))
     _, info = env.reset(seed=0, options={"initial_state": paper.reference_start})
     np.testing.assert_array_equal(info["state"], paper.reference_start)
-    for t, action in enumerate(table["action_normalised"][:-1]):
+    for t, action in enumerate(actions):
         observation, reward, terminated, truncated, info = env.step(np.array([action]))
         assert not (terminated or truncated)
         assert info["state"].dtype == np.float64
@@ -57,7 +58,7 @@ def test_published_trajectory_of_one_compartment(name: str) -> None:
         np.testing.assert_array_equal(observation, info["state"].astype(np.float32))
         np.testing.assert_allclose(info["state"], states[t + 1], rtol=1e-9, atol=1e-12)
         # Droop's first reward is K_CO2·ρ at S = 0; the start that stands for it is −1.1e-10
-        assert reward == pytest.approx(table["reward"][t], rel=1e-9, abs=4e-9 if t == 0 else 1e-12)
+        assert reward == pytest.approx(rewards[t], rel=1e-9, abs=4e-9 if t == 0 else 1e-12)
     assert t == 199
 
 
