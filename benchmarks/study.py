@@ -49,7 +49,7 @@ class Case:
     """What is compared on a network.
 
     Attributes:
-        steps: environment steps by recipe; a joint learner computes least per step.
+        steps: environment steps of the recipes that learn here; a joint learner computes least per step.
         controllers: that need no training and fit the network.
         options: of the environment, for the recipes that would be paid by ``team``.
     """
@@ -59,7 +59,7 @@ class Case:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-RECIPES = ("independent_ppo", "difference_ppo", "shared_ppo", "mappo", "joint_ppo", "joint_sac")
+RECIPES = ("independent_ppo", "difference_ppo", "shared_ppo", "shared_ars", "mappo", "joint_ppo", "joint_sac")
 LARGE = {
     "independent_ppo": 60_000,
     "difference_ppo": 60_000,
@@ -68,10 +68,13 @@ LARGE = {
     "joint_ppo": 6_000_000,
     "joint_sac": 30_000,
 }
-SMALL = dict.fromkeys(RECIPES, 10_240) | {"joint_sac": 7_680}
+SMALL = dict.fromkeys(LARGE, 10_240) | {"joint_sac": 7_680}
 CASES = {
     "copper_net": Case(LARGE, ("random", "neutral", "mpc", "optimum")),
-    "carbo_net": Case(LARGE | {"mappo": 1_000_000, "joint_ppo": 1_500_000}, ("random", "neutral", "mpc", "optimum")),
+    "carbo_net": Case(
+        LARGE | {"mappo": 1_000_000, "joint_ppo": 1_500_000, "shared_ars": 2_000_000},
+        ("random", "neutral", "mpc", "optimum"),
+    ),
     "net_zero": Case(SMALL),
     "solids_net": Case(SMALL, ("random", "neutral", "scripted"), {"reward": "mixed"}),
 }
@@ -167,7 +170,7 @@ def main(
 
 def _jobs(out: Path, network: str, recipes: Sequence[str], seeds: int, steps: int | None) -> Iterator[Job]:
     case = CASES[network]
-    for recipe in recipes:
+    for recipe in (each for each in recipes if each in case.steps):
         found = load_recipe(recipe)
         length = steps or case.steps[recipe]
         options = case.options if found.environment.get("reward") == "team" else {}

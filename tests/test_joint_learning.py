@@ -33,7 +33,7 @@ with warnings.catch_warnings():
 
 SMALL: dict[str, Any] = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
 NOTHING = Normalisation(observation=False, reward=False)
-JOINT_RECIPES = ["shared_ppo", "joint_ppo", "joint_sac", "mappo", "difference_ppo"]
+JOINT_RECIPES = ["shared_ppo", "shared_ars", "joint_ppo", "joint_sac", "mappo", "difference_ppo"]
 
 
 @pytest.mark.parametrize("name", cirl_marl.networks())
@@ -291,16 +291,19 @@ def test_learners_share_by_match(tmp_path: Path) -> None:
     assert np.isfinite(rollout(env, controller).episode_circularity).all()
 
 
+BRIEF = {
+    "PPO": {"n_steps": 4, "batch_size": 8, "n_epochs": 1},
+    "SAC": {"learning_starts": 2, "buffer_size": 50, "gradient_steps": 1, "batch_size": 4},
+    "ARS": {"n_delta": 1, "n_top": 1},
+}
+
+
 def shortened(name: str) -> Recipe:
-    """Return a recipe of the catalogue for two copies and a few gradient steps."""
+    """Return a recipe of the catalogue for two copies and a few updates."""
     recipe = load_recipe(name)
-    parameters = dict(recipe.learner.parameters)
-    if recipe.learner.algorithm == "PPO":
-        parameters |= {"n_steps": 4, "batch_size": 8, "n_epochs": 1}
-    else:
-        parameters |= {"learning_starts": 2, "buffer_size": 50, "gradient_steps": 1, "batch_size": 4}
+    parameters = recipe.learner.parameters | BRIEF[recipe.learner.algorithm]
     learner = recipe.learner.model_copy(update={"parameters": parameters})
-    return recipe.model_copy(update={"learner": learner, "run": Run(steps=8, envs=2)})
+    return recipe.model_copy(update={"learner": learner, "run": Run(steps=16, envs=2)})
 
 
 @pytest.mark.parametrize("network", cirl_marl.networks())
