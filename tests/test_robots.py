@@ -225,7 +225,7 @@ class TestTasks:
         assert done.mean() >= 0.95
 
     def test_the_fetch_script_is_fast(self) -> None:
-        """In its 50 steps it earns about what the paper's best learner earns, −11.45, though that met another target."""
+        """It earns about as much as the best learner of the paper, −11.45, which may have met another target."""
         state, earned = starts(Fetch(), 60, 3000), np.zeros(60)
         for _ in range(50):
             inputs = act(Fetch(), fetch, state)

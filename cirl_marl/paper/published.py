@@ -58,6 +58,7 @@ class PaperEnvironment:
         runs: by algorithm, what the paper reports.
         optima: best known returns.
         success_episodes: evaluation episodes over which successes are counted; 0 if there is no success.
+        remark: in what the environment may differ from the published one; empty if in nothing.
     """
 
     name: str
@@ -65,6 +66,7 @@ class PaperEnvironment:
     runs: Mapping[str, Published]
     optima: tuple[Optimum, ...] = ()
     success_episodes: int = 0
+    remark: str = ""
 
     @property
     def id(self) -> str:
@@ -180,6 +182,8 @@ _ALL = (
             "TQC-HER": Published(end_return=-11.45),
         },
         success_episodes=1_000,
+        remark="Where the target lies on the table is not published; the nearer it is to the objects, the higher are "
+        "all returns. Ours is as near as no object lies in it at the start.",
     ),
 )
 

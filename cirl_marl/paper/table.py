@@ -163,11 +163,11 @@ def _remarks(environment: PaperEnvironment, result: Result) -> Iterator[str]:
 
 
 def _notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
-    """Say how many episodes the final policies played, and what is the best possible."""
+    """Say how many episodes the final policies played, what is the best possible, and what differs."""
     best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
     own = [result.evaluation.episodes for result in results if result.row.environment == environment.name]
     played = f"Final policy: {' or '.join(_distinct(own))} episodes a seed. " if own else ""
-    return f"{played}Optimum: {best}."
+    return f"{played}Optimum: {best}. {environment.remark}".rstrip()
 
 
 def _provenance(results: Sequence[Result]) -> str:
