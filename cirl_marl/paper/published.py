@@ -183,7 +183,7 @@ _ALL = (
         },
         success_episodes=1_000,
         remark="Where the target lies on the table is not published; the nearer it is to the objects, the higher are "
-        "all returns. Ours is as near as no object lies in it at the start.",
+        "all returns. Ours is as near as it can be without an object in it at the start.",
     ),
 )
 
