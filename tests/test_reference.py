@@ -37,8 +37,7 @@ def test_published_trajectory(name: str, published: Published) -> None:
         assert reward == pytest.approx(rewards[t], rel=1e-9)
         assert not terminated
         assert truncated == (t == 49)
-        if t + 1 < len(states):
-            np.testing.assert_allclose(info["state"], states[t + 1], rtol=1e-9)
+        np.testing.assert_allclose(info["state"], states[t + 1], rtol=1e-9)
         np.testing.assert_array_equal(observation, info["state"].astype(np.float32))
     env.close()
 
