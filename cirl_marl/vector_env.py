@@ -25,6 +25,7 @@ from cirl_marl.starts import Starts
 from cirl_marl.state import Outcome, Snapshot, State
 
 Infos = dict[str, dict[str, Any]]
+_NO_STATE = "the environment has no state yet: call reset() first"
 
 
 class VectorEnv:
@@ -114,7 +115,7 @@ class VectorEnv:
             ControlError: before the first ``reset``.
         """
         if self._state is None:
-            raise ControlError("the environment has no state yet: call reset() first")
+            raise ControlError(_NO_STATE)
         return self._state
 
     def reset(
@@ -226,7 +227,8 @@ class VectorEnv:
         Raises:
             ControlError: before the first ``reset``.
         """
-        assert self.physical is not None
+        if self._state is None:
+            raise ControlError(_NO_STATE)
         return self.by_agent(self._latest)
 
     def snapshot(self) -> Snapshot:

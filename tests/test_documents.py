@@ -55,7 +55,7 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "seed=0)" in code
     recipe = load_recipe("independent_ppo")
     short = recipe.model_copy(update={"run": recipe.run.model_copy(update={"steps": 1280})})
-    monkeypatch.setattr("cirl_marl.learners.training.load_recipe", lambda name: short)
+    monkeypatch.setattr("cirl_marl.learners.launch.load_recipe", lambda name: short)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     exec(compile(code, "README.md", "exec"), names)

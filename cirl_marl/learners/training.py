@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import signal
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from cirl_marl.catalogue import load_network
-from cirl_marl.definition import write_network
-from cirl_marl.errors import CirlError, LearnerError, RunError, unknown
+from cirl_marl.errors import CirlError, LearnerError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.lockstep import Interrupted, Lockstep
-from cirl_marl.learners.recipe import OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
 from cirl_marl.learners.trainee import Trainee, derived_seed
-from cirl_marl.network import Network
 from cirl_marl.vector_env import Infos, VectorEnv
 
 CHECKPOINTS = 10
@@ -236,113 +230,6 @@ class _Hook:
                 )
             )
         training.after_step(seconds, infos, ended)
-
-
-def train(
-    network: str | Path | Network,
-    recipe: str | Path | Recipe = "independent_ppo",
-    *,
-    directory: str | Path | None = None,
-    steps: int | None = None,
-    envs: int | None = None,
-    seed: int = 0,
-    agents: Sequence[str] | None = None,
-    callbacks: Mapping[str, BaseCallback] | None = None,
-    report: Callable[[Progress], None] | None = None,
-    **options: Any,
-) -> Training:
-    """Train the learners of all agents, all at once, in the same coupled environment.
-
-    The same arguments give bit-identical policies.
-
-    Args:
-        network: catalogue name, definition file, or network.
-        recipe: catalogue name, recipe file, or recipe.
-        directory: where the run is kept; None keeps it in memory only.
-        steps: environment steps, summed over the copies; None takes the recipe's.
-        envs: copies of the environment; None takes the recipe's.
-        seed: from which every random stream derives.
-        agents: who acts and learns; None takes the network's choice.
-        callbacks: Stable-Baselines3 callbacks by name of the learner.
-        report: called after every joint step.
-        **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``, ``horizon``; they
-            override the recipe's.
-
-    Returns:
-        The finished training; ``trainees[name].model`` is the Stable-Baselines3 model.
-
-    Raises:
-        CirlError: for input that cannot be used, before anything is written.
-        LearnerError: if a learner fails; what was learnt is saved first.
-    """
-    found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
-    for option in options:
-        if option not in OPTIONS:
-            raise CirlError(unknown("option", option, OPTIONS))
-    settings = found.environment | {name: value for name, value in options.items() if value is not None}
-    copies = found.run.envs if envs is None else _whole("envs", envs, 1)
-    env = VectorEnv(network, num_envs=copies, agents=agents, **settings)
-    if not env.agents:
-        raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
-    found.check(env.network, env.agents)
-    settings.pop("scenario", None)
-    config = RunConfig(
-        network=env.network.name,
-        scenario=env.network.scenario_name,
-        agents=env.agents,
-        recipe=found,
-        seed=_whole("seed", seed, 0),
-        steps=found.run.steps if steps is None else _whole("steps", steps, 1),
-        envs=copies,
-        options=settings,
-    )
-    found.check_demonstrations(config.steps)
-    training = Training(config, env)
-    if directory is not None:
-        training.keep_in(_create(Path(directory), config, env.network))
-    training.start(callbacks=callbacks, report=report)
-    return training
-
-
-def resume(directory: str | Path, *, report: Callable[[Progress], None] | None = None) -> Training:
-    """Go on with an interrupted run from its last checkpoint, with fresh episodes and fresh random streams.
-
-    Checkpoints of unfinished runs hold the replay buffers, so that demonstrations are not lost; a learner that was in
-    the middle of them gets the rest.
-
-    Raises:
-        RunError: if the run is complete, or its directory is not.
-    """
-    run = RunDirectory(directory)
-    config, status = run.config, run.status
-    if status["state"] == "complete":
-        raise RunError(f"{run.path}: the run is complete ({status['joint_steps']} joint steps); nothing is left to do")
-    training = Training(config, run.make_env(config.envs), run)
-    training.keep_in(run)
-    training.start(report=report)
-    return training
-
-
-def _create(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
-    """Start the run directory; the definition is copied if it is still what was trained on, and written if not."""
-    groups = {"horizon": ("episode", network.episode), "circularity_weight": ("objective", network.objective)}
-    asked = {group: {name: getattr(now, name)} for name, (group, now) in groups.items() if name in config.options}
-    source = network.source
-    if source is not None and source.is_file():
-        read = load_network(source, scenario=network.scenario_name).with_options(**asked)
-        if read == network:
-            return RunDirectory.create(directory, config, source)
-    directory.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder:
-        written = Path(folder) / "network.toml"
-        write_network(network, written)
-        return RunDirectory.create(directory, replace(config, scenario="default"), written)
-
-
-def _whole(name: str, value: object, least: int) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
-    return int(value)
 
 
 def _learner(trainee: Trainee, steps: int, callback: BaseCallback | None) -> Callable[[], None]:
