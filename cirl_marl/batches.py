@@ -153,8 +153,8 @@ class Batches:
         mass = self._schedule[:, step]
         if not mass.any():
             return np.zeros(stock.shape[1])
-        asked = -self._departure(mass)
-        share = np.divide(stock * (1.0 - 1e-12), asked, out=np.ones_like(asked), where=asked > stock)
+        asked, left = -self._departure(mass), self._departure.add_to(stock.copy(), mass)
+        share = np.divide(stock * (1.0 - 1e-12), asked, out=np.ones_like(asked), where=left < 0)
         mass = mass * share.take(self._sent_donor, axis=0)
         self._departure.add_to(stock, mass)
         # the slot that is read at the end of the last interval of the delay

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,6 +27,9 @@ NOTHING = 1e-290
 
 TRUNCATION = 1e-13
 """Bound on the first neglected term of the exact solver's series, relative to the mass in the network."""
+
+Passing = Callable[..., Floats]
+"""``(rate, settled) → moved``: mass that a substep moves along each arc; flows in ``settled`` hold, but for NaN."""
 
 RUNGE_KUTTA = {"rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), "euler": ((0.0,), (1.0,))}
 """Nodes and weights of the explicit schemes; each stage starts from the slope of the one before."""
@@ -57,7 +62,7 @@ class Dynamics(FlowLaws):
     the state over the substep, ȳ = x + (h/2)·ẋ(x + (h/3)·ẋ(x + …)); the mass moved is h·r∘ȳ[driver]. A node turns over
     at most its stock in a substep, so the series is free of cancellation, and it is cut where the neglected term is
     below ``TRUNCATION``. ``rk4`` and ``euler`` take stocks and inner states together. In the physical mode (all but
-    ``euler``) no flow exceeds what its donor holds.
+    ``euler``) no flow is negative or exceeds what its donor holds.
 
     Attributes:
         inner: the models of the compartments.
@@ -89,7 +94,11 @@ class Dynamics(FlowLaws):
         self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
         shape = (self.unit + 1, len(network.arcs))
         self._outgoing = RowSum(network.donors, np.arange(shape[1]), np.ones(shape[1]), shape)
-        self._pulls = any(arc.law is Law.RECIPIENT for arc in network.arcs)
+        busiest = int(np.bincount(network.donors, minlength=1).max())
+        self._all_but = 1.0 - max(1e-12, 4.0 * np.finfo(float).eps * busiest)  # more than a sum of outflows rounds
+        laws = {arc.law for arc in network.arcs}
+        self._pulls = Law.RECIPIENT in laws
+        self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
         self._compile_orders()
 
     def _series_terms(self) -> int:
@@ -175,7 +184,7 @@ class Dynamics(FlowLaws):
         for _ in range(self.substeps):
             realised = self._limit_orders(stock, rate) if self.physical else rate
             if self._exact:
-                stock, moved, realised = self._move(stock, self._moved_exactly(stock, realised), realised)
+                stock, moved, realised = self._settle(stock, realised, partial(self._moved_exactly, stock))
             else:
                 stock, inner, moved, realised = self._explicit_step(stock, inner, realised, controls)
             total = moved if total is None else total + moved
@@ -193,11 +202,20 @@ class Dynamics(FlowLaws):
         rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp))
         if self.physical:
             rate = self._limit_orders(stock, rate)
-        return self.flow_at(stock, inner, controls, rate)
+        flow = self.flow_at(stock, inner, controls, rate)
+        if not self._heedless:
+            return flow
+        out = self._outgoing(flow) * self.substep
+        share = np.divide(stock, out, out=np.ones_like(out), where=out > stock)
+        return flow * share.take(self.network.donors, axis=0)
 
     def flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats) -> Floats:
         """Return the instantaneous flows r ∘ y[driver], shape (arcs, B), mass/time."""
-        return self.flow(self.inner.extend(stock, inner, controls), rate)
+        return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate))
+
+    def _forward(self, flow: Floats) -> Floats:
+        """Stop, in place, flows that a model or the stage of a solver would reverse."""
+        return np.maximum(flow, 0.0, out=flow) if self.physical and not self._exact else flow
 
     def _explicit_step(
         self, stock: Floats, inner: Floats, rate: Floats, controls: Floats
@@ -206,33 +224,29 @@ class Dynamics(FlowLaws):
         h = self.substep
         ahead, means = self.inner.own_steps(inner, controls, h, stock)
         nodes, weights = RUNGE_KUTTA[self.network.episode.solver]
-        flow, slope = np.zeros_like(rate), np.zeros_like(inner)
-        moved, change = np.zeros_like(rate), np.zeros_like(inner)
-        for node, weight in zip(nodes, weights, strict=True):
-            stage = self.incidence.add_to(stock.copy(), flow * (node * h)) if node else stock
-            stage_inner = inner + slope * (node * h) if node else inner
-            flow = self.flow(self.inner.extend(stage, stage_inner, controls, means), rate)
-            slope = self.inner.derivative(stage_inner, controls, stage)
-            moved += flow * (weight * h)
-            change += slope * (weight * h)
-        if self.physical:
-            stock, moved, rate = self._move_what_is_there(stock, moved, rate)
-        else:
-            stock = self.incidence.add_to(stock.copy(), moved)
-        return stock, self.inner.moved(ahead, change), moved, rate
+        change = np.zeros_like(inner)
 
-    def _move_what_is_there(self, stock: Floats, moved: Floats, rate: Floats) -> tuple[Floats, Floats, Floats]:
-        """Move mass; scale the outflows of nodes that would be overdrawn to the stock they started with."""
-        moved = np.maximum(moved, 0.0)
-        after = self.incidence.add_to(stock.copy(), moved)
-        held = np.where(stock > NOTHING, stock * (1.0 - 1e-12), 0.0)
-        while after.min() < 0:
-            out = self._outgoing(moved)
-            share = np.divide(held, out, out=np.ones_like(out), where=(after < 0) & (out > stock))
-            by_arc = share.take(self.network.donors, axis=0)
-            moved, rate = moved * by_arc, rate * by_arc
+        def passing(rate: Floats, settled: Floats | None = None) -> Floats:
+            """Go through the stages; leaves the change of the inner states in ``change``."""
+            flow, slope, moved = np.zeros_like(rate), np.zeros_like(inner), np.zeros_like(rate)
+            change.fill(0.0)
+            for node, weight in zip(nodes, weights, strict=True):
+                stage = self.incidence.add_to(stock.copy(), flow * (node * h)) if node else stock
+                stage_inner = inner + slope * (node * h) if node else inner
+                flow = self._forward(self.flow(self.inner.extend(stage, stage_inner, controls, means), rate))
+                if settled is not None:
+                    np.copyto(flow, settled, where=~np.isnan(settled))
+                slope = self.inner.derivative(stage_inner, controls, stage)
+                moved += flow * (weight * h)
+                np.add(change, slope * (weight * h), out=change)
+            return moved
+
+        if self.physical:
+            after, moved, rate = self._settle(stock, rate, passing)
+        else:
+            moved = passing(rate)
             after = self.incidence.add_to(stock.copy(), moved)
-        return after, moved, rate
+        return after, self.inner.moved(ahead, change), moved, rate
 
     def _moved_exactly(self, stock: Floats, rate: Floats, settled: Floats | None = None) -> Floats:
         """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep.
@@ -249,6 +263,8 @@ class Dynamics(FlowLaws):
                 mean[...] = stock
                 incidence.add_to(mean, moved)
         moved *= self.substep
+        if self._pulls:
+            np.maximum(moved, 0.0, out=moved)  # the mean of an overdrawn stock may be negative
         return moved
 
     def _limit_orders(self, stock: Floats, rate: Floats) -> Floats:
@@ -272,29 +288,36 @@ class Dynamics(FlowLaws):
         rate[self._order_arcs] *= factor.take(self._order_slot, axis=0)
         return rate
 
-    def _move(self, stock: Floats, moved: Floats, rate: Floats) -> tuple[Floats, Floats, Floats]:
-        """Move mass; where a recipient-driven flow asked for more than its donor held, send what was there.
+    def _settle(self, stock: Floats, rate: Floats, passing: Passing) -> tuple[Floats, Floats, Floats]:
+        """Move mass; where a flow that does not heed its donor asked for more than that held, send what was there.
 
-        Proportional and scheduled flows never overdraw. A recipient that pulls more than there is gets its share: all
-        outflows of the overdrawn node, and their rates, are scaled to the stock it started with. They are then settled,
-        and the others follow from them, lest the recipient passes on what it did not get. Each pass settles at least
-        one more node.
+        Proportional and scheduled flows never overdraw. A recipient or a model that asks for more than there is gets
+        its share: all outflows of the overdrawn node, and their rates, are scaled to the stock it started with. They
+        are then settled, and the others follow from them, lest the recipient passes on what it did not get. Each pass
+        settles at least one more node.
+
+        Args:
+            stock: stocks at the start of the substep, shape (unit + 1, B).
+            rate: rates of the flows, shape (arcs, B).
+            passing: what moves at given rates.
+
+        Returns:
+            Stocks at the end, mass moved, and the rates realised.
         """
-        if self._pulls:
-            moved = np.maximum(moved, 0.0)  # the mean of an overdrawn stock may be negative
+        moved = passing(rate)
         after = self.incidence.add_to(stock.copy(), moved)
         if after.min() >= 0:
             return after, moved, rate
+        held = np.where(stock > NOTHING, stock * self._all_but, 0.0)
         settled = np.full_like(moved, np.nan)
         while after.min() < 0:
             out = self._outgoing(moved)
             short = (after < 0) & (out > 0)
-            held = np.where(stock > NOTHING, stock * (1.0 - 1e-12), 0.0)
-            kept = np.divide(held, out, out=np.ones_like(out), where=short)
-            share = np.minimum(kept, 1.0).take(self.network.donors, axis=0)
+            share = np.divide(held, out, out=np.ones_like(out), where=short & (out > held))
+            share = share.take(self.network.donors, axis=0)
             cut = short.take(self.network.donors, axis=0)
             settled[cut] = (moved * share)[cut] / self.substep
             rate = rate * share
-            moved = np.maximum(self._moved_exactly(stock, rate, settled), 0.0)
+            moved = passing(rate, settled)
             after = self.incidence.add_to(stock.copy(), moved)
         return after, moved, rate

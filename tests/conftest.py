@@ -26,6 +26,7 @@ from cirl_marl import (
     Service,
 )
 from cirl_marl.rowsum import Floats
+from cirl_marl.simulate import Dynamics
 
 if TYPE_CHECKING:
     from cirl_marl.learners import Progress
@@ -88,7 +89,7 @@ def ppo_recipe() -> Recipe:
     return Recipe(name="small", title="small", run=Run(steps=80, envs=2), learner=learner)
 
 
-def random_network(seed: int, nodes: int, arcs: int) -> Network:
+def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = False) -> Network:
     """Return a network with every law, role and kind of control, drawn from ``seed``."""
     rng = np.random.default_rng(seed)
     ends = [rng.choice(nodes, 2, replace=False) for _ in range(arcs if nodes > 1 else 0)]
@@ -96,7 +97,7 @@ def random_network(seed: int, nodes: int, arcs: int) -> Network:
     interval = float(rng.uniform(0.05, 3))
     orders = np.bincount([i for (i, _), law in zip(ends, laws, strict=True) if law is Law.CONTROLLED], minlength=nodes)
     sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) for i in range(nodes)]
-    return Network(
+    network = Network(
         name="random",
         nodes=tuple(_node(rng, i, sets_flow[i]) for i in range(nodes)),
         arcs=tuple(
@@ -112,6 +113,10 @@ def random_network(seed: int, nodes: int, arcs: int) -> Network:
             circularity_weight=float(rng.random()),
         ),
     )
+    if not runge_kutta:
+        return network
+    step = interval / Dynamics(network).substeps
+    return network.with_options(episode={"solver": "rk4", "solver_step": step})
 
 
 def _control(rng: np.random.Generator, kind: ControlKind) -> Control:
@@ -192,5 +197,12 @@ def _services(rng: np.random.Generator, nodes: int, arcs: int) -> list[Service]:
 
 
 st.register_type_strategy(
-    Network, st.builds(random_network, st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(0, 20))
+    Network,
+    st.builds(
+        random_network,
+        st.integers(0, 2**32 - 1),
+        st.integers(1, 12),
+        st.integers(0, 20),
+        runge_kutta=st.sampled_from([False, False, True]),
+    ),
 )

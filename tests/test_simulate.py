@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Network, Node, Role, VectorEnv, parallel_env
+from cirl_marl.compartments import RewardState
 from cirl_marl.controllers import Neutral
 from cirl_marl.evaluate import rollout
 from cirl_marl.simulate import Dynamics
@@ -26,7 +29,7 @@ def continuous(network: Network) -> Network:
     arcs = [
         replace(arc, law=Law.DONOR, rate=0.3, batches=(), delay=0.0) if arc.batches else arc for arc in network.arcs
     ]
-    return replace(network, arcs=tuple(arcs))
+    return replace(network, arcs=tuple(arcs)).with_options(episode={"solver": "exact", "solver_step": None})
 
 
 any_network = st.from_type(Network).map(continuous)
@@ -53,6 +56,42 @@ def order(id_: str, donor: str, recipient: str, most: float) -> Arc:
     """Return an arc whose flow is set between 0 and ``most``, ``most`` being neutral."""
     control = Control(kind=ControlKind.FLOW, low=0.0, neutral=most, high=most)
     return Arc(id=id_, donor=donor, recipient=recipient, law=Law.CONTROLLED, control=control)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """A model without states whose output is constant."""
+
+    kind: ClassVar[str] = "source"
+    state_names: ClassVar[tuple[str, ...]] = ()
+    input_names: ClassVar[tuple[str, ...]] = ()
+    time_unit: ClassVar[str] = "day"
+    reward_state: ClassVar[RewardState] = "after"
+
+    output: float
+
+    def derivative(self, state: Floats, inputs: Floats) -> Floats:
+        """Return nothing: there is no state."""
+        return state
+
+    def outflow(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the output."""
+        return np.full(state.shape[1], self.output)
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return 0."""
+        return np.zeros(state.shape[1])
+
+
+def emptied(output: float, rates: Sequence[float], stock: float, step: float = 0.01) -> Network:
+    """Return a node that gives to others at constant rates, as long as it has something to give."""
+    arcs = [
+        Arc(id=f"f{k}", donor="a", recipient="b", law=Law.COMPARTMENT, by="a", rate=rate)
+        for k, rate in enumerate(rates)
+    ]
+    network = small({"a": stock, "b": 0.0}, [], interval=step, solver="rk4")
+    nodes = (replace(network.nodes[0], model=Source(output=output)), network.nodes[1])
+    return replace(network, nodes=nodes, arcs=tuple(arcs))
 
 
 NO_STATES = np.empty((0, 1))
@@ -309,6 +348,51 @@ def test_runge_kutta_ends_on_vanishing_stocks() -> None:
     stock = advanced(replace(network, episode=Episode(solver="rk4", solver_step=1.0, horizon=3000)), steps=3000)
     assert stock[0] >= 0
     assert stock.sum() == pytest.approx(1.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(("rates", "stock"), [((10, 1), 0.22), ((10, 2), 0.24), ((3, 22), 0.5)])
+def test_what_is_just_asked_for_is_given(rates: tuple[float, float], stock: float) -> None:
+    """Two flows whose sum rounds to the stock, while taking one after the other rounds below nothing."""
+    left = advanced(emptied(2.0, rates, stock))
+    assert (left >= 0).all()
+    assert left[1] == pytest.approx(stock, rel=1e-11)
+
+
+@given(outputs=st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=40), share=st.floats(0.1, 1.5))
+def test_models_give_no_more_than_there_is(outputs: list[float], share: float) -> None:
+    """Whatever the sums of many flows round to, the step ends, nothing is negative and nothing is lost."""
+    stock = share * sum(outputs) * 0.01
+    left = advanced(emptied(1.0, outputs, stock))
+    assert (left >= 0).all()
+    assert left.sum() == pytest.approx(stock, rel=1e-12)
+    assert left[1] == pytest.approx(min(1.0, 1 / share) * stock, rel=1e-10)
+
+
+def test_models_do_not_reverse_flows() -> None:
+    """A negative output moves nothing, at the start, in the step and at its end."""
+    env = VectorEnv(emptied(-1.0, (3.0,), 5.0), num_envs=1)
+    env.reset(seed=0)
+    assert env.physical.flow[0, 0] == 0.0
+    transition = env.dynamics.advance(env.physical.stock, env.physical.inner, np.empty((0, 1)), env.physical.step)
+    assert transition.moved[0, 0] == transition.flow[0, 0] == 0.0
+
+
+@pytest.mark.parametrize("solver", ["exact", "rk4"])
+def test_nothing_passes_on_what_it_did_not_get(solver: str) -> None:
+    """Node b pulls from an empty donor: its own decay is as without the pull, x_b(h) = 10·e^{-2h}."""
+    pull = Arc(id="pull", donor="a", recipient="b", law=Law.RECIPIENT, rate=7.0)
+    decay = Arc(id="decay", donor="b", recipient="c", rate=2.0)
+    stock = advanced(small({"a": 0.0, "b": 10.0, "c": 0.0}, [pull, decay], interval=0.05, solver=solver), steps=10)
+    np.testing.assert_allclose(stock, [0.0, 10 * math.exp(-1), 10 - 10 * math.exp(-1)], rtol=1e-6)
+
+
+def test_empty_donors_give_nothing_at_the_start() -> None:
+    """The flow that is observed first is none that cannot be."""
+    pull = Arc(id="pull", donor="a", recipient="b", law=Law.RECIPIENT, rate=0.5)
+    for held, flow in ((0.0, 0.0), (1.0, 1.0), (100.0, 5.0)):
+        env = VectorEnv(small({"a": held, "b": 10.0}, [pull]), num_envs=1)
+        env.reset(seed=0)
+        assert env.physical.flow[0, 0] == pytest.approx(flow, rel=1e-12)
 
 
 def test_network_without_controls_can_be_simulated() -> None:
