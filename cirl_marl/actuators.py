@@ -64,11 +64,15 @@ class Actuators:
             action = np.asarray(actions[agent])
             expected = (self.num_envs, entries.stop - entries.start)
             if action.shape != expected:
-                raise ControlError(f"action of agent '{agent}' has shape {action.shape}, expected {expected}")
+                raise ControlError(wrong_shape(agent, action.shape, expected))
             if action.dtype.kind not in "biuf":
                 raise ControlError(f"action of agent '{agent}' is {actions[agent]!r}; it must hold numbers in [-1, 1]")
             stacked[entries] = action.T
         return stacked
+
+    def unstack(self, actions: Floats) -> dict[str, Floats]:
+        """Split stacked actions, shape (entries, B), into agent → (B, entries of its action)."""
+        return {agent: actions[entries].T for agent, entries in self.entries.items()}
 
     def controls(self, actions: Floats) -> Floats:
         """Map stacked actions, shape (entries, B), to the physical values of every control, shape (controls, B).
@@ -97,6 +101,11 @@ class Actuators:
         entry, copy_ = np.argwhere(wrong)[0]
         agent = next(agent for agent, entries in self.entries.items() if entries.start <= entry < entries.stop)
         return f"action of agent '{agent}' in copy {copy_} is {actions[entry, copy_]}; it must be a number in [-1, 1]"
+
+
+def wrong_shape(agent: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> str:
+    """Say that an agent's action has another shape than it should have."""
+    return f"action of agent '{agent}' has shape {shape}, expected {expected}"
 
 
 def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:

@@ -8,7 +8,8 @@ interval, or when the model of the compartment ``by`` has completed one, at its 
     collecting --complete--> packed --vehicle at the donor--> aboard --arrived--> recipient
     collecting --complete--> slots, n intervals --> recipient
 
-Mass is only ever taken from one row and added to another.
+Mass is only ever taken from one row and added to another. m_fb, the net batch mass moved finite-time sustainably, has
+two parts: that not through the environment and that through it.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ class Line:
         slots: number of slots; 0 with a vehicle.
         leaves: weight with which mass that leaves the donor counts in m_fb.
         arrives: weight with which mass that reaches the recipient counts in m_fb.
+        part: part of m_fb in which it counts, 1 if the arc touches the environment, else 0.
     """
 
     id: str
@@ -57,6 +59,7 @@ class Line:
     slots: int
     leaves: float
     arrives: float
+    part: int
 
     @property
     def rows(self) -> range:
@@ -88,7 +91,8 @@ class Batches:
         count, rows = len(self.lines), len(network.nodes) + len(self.names) + 1
         every, lines = np.arange(count), self.lines
         self._delivery = RowSum([line.recipient for line in lines], every, np.ones(count), (rows, count))
-        self._arrivals = RowSum(np.zeros(count, int), every, [line.arrives for line in lines], (1, count))
+        parts = [line.part for line in lines]
+        self._arrivals = RowSum(parts, every, [line.arrives for line in lines], (2, count))
         self._held = RowSum(
             [i for i, line in enumerate(lines) for _ in line.rows],
             [row for line in lines for row in line.rows],
@@ -114,7 +118,8 @@ class Batches:
         self._sent_slots = np.array([line.slots for line in lines], dtype=np.intp)[:, None]
         self._sent_donor = np.array([line.donor for line in lines], dtype=np.intp)
         self._departure = RowSum(self._sent_donor, np.arange(count), -np.ones(count), (rows, count))
-        self._departures = RowSum(np.zeros(count, int), np.arange(count), [line.leaves for line in lines], (1, count))
+        parts, weights = [line.part for line in lines], [line.leaves for line in lines]
+        self._departures = RowSum(parts, np.arange(count), weights, (2, count))
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -143,24 +148,24 @@ class Batches:
             slots=slots,
             leaves=sign if early else 0.0,
             arrives=0.0 if early else sign,
+            part=int(network.environmental[k]),
         )
 
     def dispatch(self, stock: Floats, step: Integers) -> Floats:
-        """Send off, in place, what is scheduled for the start of the interval; return its m_fb, shape (B,).
+        """Send off, in place, what is scheduled for the start of the interval; return its m_fb, shape (2, B).
 
         A donor that holds less than is scheduled sends what it has, split in proportion.
         """
         mass = self._schedule[:, step]
         if not mass.any():
-            return np.zeros(stock.shape[1])
+            return np.zeros((2, stock.shape[1]))
         asked, left = -self._departure(mass), self._departure.add_to(stock.copy(), mass)
         share = np.divide(stock * (1.0 - 1e-12), asked, out=np.ones_like(asked), where=left < 0)
         mass = mass * share.take(self._sent_donor, axis=0)
         self._departure.add_to(stock, mass)
         # the slot that is read at the end of the last interval of the delay
         stock[self._sent_first + (step - 1) % self._sent_slots, np.arange(stock.shape[1])] += mass
-        counted: Floats = self._departures(mass)[0]
-        return counted
+        return self._departures(mass)
 
     def settle(self, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> tuple[Floats, Floats]:
         """Deliver, release and send off, in place, what is due at the end of the interval.
@@ -172,7 +177,7 @@ class Batches:
             physics: the models that release batches, drive vehicles and receive deliveries.
 
         Returns:
-            Mass delivered by each batch arc, shape (batch arcs, B), and m_fb of the interval's end, shape (B,).
+            Mass delivered by each batch arc, shape (batch arcs, B), and m_fb of the interval's end, shape (2, B).
         """
         delivered = np.empty((len(self.lines), stock.shape[1]))
         slots, copies = self._first + step % self._slots, np.arange(stock.shape[1])
@@ -185,9 +190,9 @@ class Batches:
         stock += arrived
         for node in self._receiving:
             physics.receive(node, inner, arrived[node])
-        counted: Floats = self._arrivals(delivered)[0]
+        counted = self._arrivals(delivered)
         for line in self._releasing:
-            counted += line.leaves * self._collect(line, stock, physics.released(line.by, line.port, inner))
+            counted[line.part] += line.leaves * self._collect(line, stock, physics.released(line.by, line.port, inner))
             self._send(line, stock, inner, step, physics)
         return delivered, counted
 

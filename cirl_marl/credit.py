@@ -103,7 +103,7 @@ class Credit:
                 imagined,
                 np.tile(state.step, count),
             )
-            imagined_state = replace(state, batched=np.tile(state.batched, count))
+            imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
             flow = transition.moved / dynamics.network.episode.control_interval
             end, mean, _ = self.circularity(imagined_state, transition, flow)
             results.append((end if self._measure == "end" else mean).reshape(count, batch))

@@ -40,7 +40,8 @@ def read_network(path: Path) -> Network:
         if strangers:
             continue
         try:
-            networks[name] = _build(_merge(_without(document, override), override), name)
+            told = {key: value for key, value in override.items() if key != "without"}
+            networks[name] = _build(_merge(_without(document, override), told), name)
         except NetworkError as error:
             mistakes += [where + problem for problem in error.problems]
             if name == "default":
@@ -81,8 +82,6 @@ def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, An
     """Return ``base`` with the tables of ``override`` laid over it; a quantity is replaced whole."""
     merged = {key: value for key, value in base.items() if key != "scenarios"}
     for key, value in override.items():
-        if key == "without":
-            continue
         old = merged.get(key)
         whole = isinstance(old, Mapping) and "source" in old
         nested = isinstance(value, Mapping) and isinstance(old, Mapping) and not whole
@@ -110,6 +109,9 @@ def _lost(document: Mapping[str, Any], paths: Any, where: str) -> typing.Iterato
     if len(set(paths)) != len(paths):
         yield f"{where}without: names a path twice"
     for path in paths:
+        for other in paths:
+            if path.startswith(f"{other}."):
+                yield f"{where}without: '{path}' lies in '{other}', which goes as a whole"
         table: Any = document
         for key in path.split("."):
             if not isinstance(table, Mapping) or key not in table:

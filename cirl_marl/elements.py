@@ -7,6 +7,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from cirl_marl.rowsum import Floats
+
 if TYPE_CHECKING:
     from cirl_marl.compartments.model import CompartmentModel
 
@@ -64,6 +68,12 @@ class Control:
     low: float
     high: float
     neutral: float
+
+    def action(self, value: Floats) -> Floats:
+        """Return the normalised actions, in [-1, 1], that come closest to physical values."""
+        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        action: Floats = np.clip((value - middle) / half, -1.0, 1.0)
+        return action
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,6 +29,12 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
         return f"{path}: {unknown('value', item['input'], known)}"
     if item["type"] == "missing":
         return f"{path}: missing"
+    if item["type"] in ("model_type", "model_attributes_type"):
+        wanted = _model_at(model, location)
+        keys = [f.alias or name for name, f in wanted.model_fields.items() if f.is_required()] if wanted else []
+        return f"{path}: must be a table {{ {', '.join(f'{key} = …' for key in keys)} }}, got {item['input']!r}"
+    if item["type"] == "string_pattern_mismatch":
+        return f"{path}: begins with a letter and has lower-case letters, digits and _ only, got {item['input']!r}"
     return f"{path}: {item['msg']}, got {item['input']!r}"
 
 

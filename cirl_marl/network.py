@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,11 +92,14 @@ class Network:
             return self
         if name not in self.scenarios:
             known = sorted({self.scenario_name, *self.scenarios})
-            raise CirlError(f"network '{self.name}': {unknown('scenario', name, known)}")
+            hint = "" if self.scenarios else " A network with other options has no other scenarios: choose it first."
+            raise CirlError(f"network '{self.name}': {unknown('scenario', name, known)}{hint}")
         return self.scenarios[name]
 
     def with_options(self, **groups: Mapping[str, object]) -> Network:
         """Return a copy with fields of ``episode``, ``objective`` or ``observation`` replaced.
+
+        The copy has no other scenarios: they would not have these options.
 
         >>> from cirl_marl import load_network
         >>> load_network("copper_net").with_options(episode={"horizon": 3}).episode.horizon
@@ -111,13 +114,14 @@ class Network:
                 if name not in known:
                     raise CirlError(f"with_options: {group}: {unknown('field', name, known)}")
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
-        return replace(self, **changes)
+        return replace(self, **changes, scenarios={})
 
     def in_local_order(self) -> Network:
         """Return the same network with neighbours next to each other: nodes by reverse Cuthill-McKee, arcs by donor.
 
-        It changes the order of every array and nothing else, but for round-off. A step of a large network whose
-        compartments come in random order spends most of its time waiting for memory; in this order it does not.
+        It changes the order of every array and nothing else, but for round-off; the copy has no other scenarios. A step
+        of a large network whose compartments come in random order spends most of its time waiting for memory; in this
+        order it does not.
         """
         size = len(self.nodes)
         links = sparse.csr_array((np.ones(len(self.arcs)), (self.donors, self.recipients)), shape=(size, size))
@@ -129,6 +133,7 @@ class Network:
             self,
             nodes=tuple(self.nodes[i] for i in order),
             arcs=tuple(self.arcs[k] for k in arcs),
+            scenarios={},
         )
 
     @cached_property
@@ -149,12 +154,12 @@ class Network:
     @cached_property
     def donors(self) -> Integers:
         """Donor node of each arc, shape (arcs,)."""
-        return np.array([self.node_index[arc.donor] for arc in self.arcs], dtype=np.intp)
+        return _read_only(np.array([self.node_index[arc.donor] for arc in self.arcs], dtype=np.intp))
 
     @cached_property
     def recipients(self) -> Integers:
         """Recipient node of each arc, shape (arcs,)."""
-        return np.array([self.node_index[arc.recipient] for arc in self.arcs], dtype=np.intp)
+        return _read_only(np.array([self.node_index[arc.recipient] for arc in self.arcs], dtype=np.intp))
 
     @cached_property
     def controllable(self) -> tuple[str, ...]:
@@ -186,53 +191,60 @@ class Network:
             lost = donor is Role.NONRENEWABLE_RESERVOIR or enters
             regained = donor is Role.ENVIRONMENT or recipient is Role.NONRENEWABLE_RESERVOIR
             signs.append(float(lost) - float(regained))
-        return np.array(signs)
+        return _read_only(np.array(signs))
 
     @cached_property
     def environmental(self) -> NDArray[np.bool_]:
         """Arcs that touch the environment, whose net flow is φ_nz, shape (arcs,)."""
-        return np.array(
-            [Role.ENVIRONMENT in (self._role(a.donor), self._role(a.recipient)) for a in self.arcs], dtype=bool
-        )
+        through = [Role.ENVIRONMENT in (self._role(a.donor), self._role(a.recipient)) for a in self.arcs]
+        return _read_only(np.array(through, dtype=bool))
 
     @cached_property
     def graph(self) -> networkx.DiGraph:
-        """The network as a networkx digraph; parallel arcs share an edge, whose ``arcs`` lists them."""
+        """The network as a frozen networkx digraph; parallel arcs share an edge, whose ``arcs`` are all of them."""
         import networkx
 
         graph = networkx.DiGraph(name=self.name)
         for node in self.nodes:
             graph.add_node(node.id, role=node.role.value, compartment=node)
         for arc in self.arcs:
-            if not graph.has_edge(arc.donor, arc.recipient):
-                graph.add_edge(arc.donor, arc.recipient, arcs=[])
-            graph.edges[arc.donor, arc.recipient]["arcs"].append(arc)
+            known = graph.get_edge_data(arc.donor, arc.recipient, {"arcs": ()})["arcs"]
+            graph.add_edge(arc.donor, arc.recipient, arcs=(*known, arc))
+        networkx.freeze(graph)
         return graph
 
     def circularity(self, flow: Floats, batched: Floats | None = None) -> Floats:
         """Return λ(N;t) = −(m_fb + Δ·σᵀf), σᵀf summed over the continuous flows.
 
-        With ``net_zero = "abs"`` the part through the environment enters by its absolute value:
-        λ = −Δ(σ_rest·f + |σ_env·f|). Given mean flows this is λ of the mean flows, which for ``abs`` is not the mean
-        of λ if the net flow changes its sign within the interval.
+        With ``net_zero = "abs"`` the part through the environment enters by its absolute value,
+        λ = −(m_rest + Δ·σ_rest·f) − |m_env + Δ·σ_env·f|. Given mean flows this is λ of the mean flows, which for
+        ``abs`` is not the mean of λ if the net flow changes its sign within the interval.
 
         Args:
             flow: f, shape (arcs, ...), mass/time; entries of batch arcs are ignored.
-            batched: m_fb, net batch mass moved finite-time sustainably so far, shape (...), mass; None if nothing moves
-                in batches.
+            batched: m_fb, net batch mass moved finite-time sustainably so far, not through and through the environment,
+                shape (2, ...), mass; None if nothing moves in batches.
 
         Returns:
             λ, shape (...), mass.
 
+        Raises:
+            CirlError: if there is not one flow for each arc.
+
         References: Zocco et al., CiRL (arXiv 2505.21536), Definition 2.
         """
-        parts = self._circularity_parts(flow.reshape(len(self.arcs), math.prod(flow.shape[1:])))
-        if self.objective.net_zero == "abs":
-            circularity = parts[0] - np.abs(parts[1])
-        else:
-            circularity = parts[0] + parts[1]
-        shaped: Floats = circularity.reshape(flow.shape[1:])
-        return shaped if batched is None else shaped - batched
+        if flow.shape[:1] != (len(self.arcs),):
+            raise CirlError(
+                f"network '{self.name}': flows of shape {flow.shape}; the first axis is that of its {len(self.arcs)} "
+                f"arcs, {', '.join(self.arc_index)}"
+            )
+        columns = (2, math.prod(flow.shape[1:]))
+        parts = self._circularity_parts(flow.reshape(len(self.arcs), columns[1]))
+        if batched is not None:
+            parts = parts - batched.reshape(columns)
+        through = -np.abs(parts[1]) if self.objective.net_zero == "abs" else parts[1]
+        circularity: Floats = (parts[0] + through).reshape(flow.shape[1:])
+        return circularity
 
     @cached_property
     def _circularity_parts(self) -> RowSum:
@@ -245,3 +257,9 @@ class Network:
 
     def _role(self, node: str) -> Role:
         return self.nodes[self.node_index[node]].role
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """Keep what a network derives once from being written to: networks are shared."""
+    array.flags.writeable = False
+    return array

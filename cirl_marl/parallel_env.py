@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import conversions
 
+from cirl_marl.actuators import wrong_shape
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.state import Outcome, Snapshot
@@ -24,9 +25,9 @@ OPTIONS = ("observe", "circularity", "circularity_weight", "horizon")
 class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
     """One copy of a material network whose compartments are PettingZoo agents.
 
-    Each agent has its own Box(−1, 1) action and its own float32 observation; ``layout.names[agent]`` says what each
-    entry is. Episodes end by truncation at the horizon. ``infos[agent]`` carries ``circularity`` (λ at the end of the
-    step, mass), ``local_reward``, ``flows`` (mean flows in the order of ``network.arcs``, mass/time) and
+    Each agent has its own Box(−1, 1) action and its own float32 observation; ``observation_names[agent]`` says what
+    each entry is. Episodes end by truncation at the horizon. ``infos[agent]`` carries ``circularity`` (λ at the end of
+    the step, mass), ``local_reward``, ``flows`` (mean flows in the order of ``network.arcs``, mass/time) and
     ``service_level``; for an agent whose model has a criterion of success also ``success``.
 
     Attributes:
@@ -68,6 +69,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         self.possible_agents = list(self.batch.agents)
         self.agents: list[str] = []
         self.observation_spaces = dict(self.batch.observation_spaces)
+        self.observation_names = self.batch.observation_names
         self.action_spaces = dict(self.batch.action_spaces)
         self.state_names = self.batch.state_names
         self._entries = sum(len(neutral) for neutral in self.batch.neutral_action.values())
@@ -191,8 +193,15 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             or stacked.shape != (self._entries, 1)
             or len(actions) != len(self.possible_agents)
         ):
-            return self.batch.stack({agent: np.asarray(action)[None] for agent, action in actions.items()})
+            return self.batch.stack({agent: self._checked(agent, action)[None] for agent, action in actions.items()})
         return stacked
+
+    def _checked(self, agent: str, action: ArrayLike) -> NDArray[Any]:
+        """Refuse an action of the wrong shape; the batch would say it with an axis that is not the user's."""
+        found, space = np.asarray(action), self.batch.action_spaces.get(agent)
+        if space is not None and found.shape != space.shape:
+            raise ControlError(wrong_shape(agent, found.shape, space.shape))
+        return found
 
     def _infos(self, outcome: Outcome) -> dict[str, dict[str, Any]]:
         circularity, service = float(outcome.circularity[0]), float(outcome.service_level[0])
@@ -241,4 +250,8 @@ def vector_env(network: str | Path | Network, num_envs: int = 64, **options: Any
     >>> env.reset(seed=0)["mine"].shape
     (3, 4)
     """
+    known = ("scenario", "agents", "reward", *OPTIONS)
+    for option in options:
+        if option not in known:
+            raise CirlError(unknown("option", option, known))
     return VectorEnv(network, num_envs=num_envs, **options)

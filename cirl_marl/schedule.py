@@ -75,7 +75,8 @@ def schedule(
     Args:
         env: a single copy.
         controller: who acts.
-        seed: of the evaluation whose first start is taken; None starts from the middle of all initial ranges.
+        seed: of the evaluation whose first start is taken; None starts from the middle of all initial ranges, with
+            inner states that models draw themselves as the first evaluation draws them.
         progress: called with the number of intervals done.
 
     Raises:
@@ -85,6 +86,9 @@ def schedule(
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
     middle = {node.id: sum(node.initial) / 2 for node in network.nodes}
+    inner = env.dynamics.inner
+    rows = zip(inner.ranged.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
+    middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}
     recorded = _Recorded(controller, env)
     first = EVALUATION_SEEDS if seed is None else first_seed(seed)
     run = rollout(env, recorded, seed=first, start=middle if seed is None else None, progress=progress)

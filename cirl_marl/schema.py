@@ -7,10 +7,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from cirl_marl.elements import ControlKind, Law, Role
+from cirl_marl.validate import IDENTIFIER
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Source = Annotated[str, Field(min_length=1, description="where the number comes from")]
-Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+Identifier = Annotated[str, Field(pattern=IDENTIFIER)]
 
 
 class Table(BaseModel):

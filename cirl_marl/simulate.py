@@ -44,8 +44,8 @@ class Transition:
         inner: inner states of the models after the interval, shape (states, B).
         moved: mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass.
         flow: realised continuous flows at the end of the interval, shape (arcs, B), mass/time.
-        batched: m_fb of the interval, net batch mass moved finite-time sustainably at its start and at its end, shape
-            (2, B), mass; None without batch arcs.
+        batched: m_fb of the interval, net batch mass moved finite-time sustainably at its start and at its end, not
+            through and through the environment, shape (2, 2, B), mass; None without batch arcs.
     """
 
     stock: Floats

@@ -72,6 +72,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_mode = self.parallel.render_mode
         self.observation_space = self.parallel.observation_space(self.agent)
         self.action_space = self.parallel.action_space(self.agent)
+        self.observation_names = {self.agent: self.parallel.observation_names[self.agent]}
         names = self.parallel.state_names
         observed = self.parallel.layout.array_order or names
         self._order = np.array([names.index(name) for name in observed], dtype=np.intp)

@@ -118,7 +118,8 @@ class Starts:
         most = (self._low + self._width)[: self._nodes]
         limit = float(most.sum())
         if self._physical and checked:
-            total = sum(float(np.max(checked.get(i, most[i]))) for i in range(len(most)))
+            held = [np.broadcast_to(checked.get(i, most[i]), len(self.streams)) for i in range(len(most))]
+            total = float(np.sum(held, axis=0).max())
             if total > limit * (1 + 1e-9):
                 raise ControlError(
                     f"initial_state: {total:.6g} {self._network.mass_unit} in all, but the observation space of "

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.network import Floats, Integers
+from cirl_marl.network import Floats, Integers, Network
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,8 @@ class State:
         inner: inner states of the compartments' models, shape (states, B).
         flow: mean flows of the last control interval, shape (arcs, B), mass/time.
         step: control intervals done, shape (B,).
-        batched: m_fb, net batch mass moved finite-time sustainably in this episode, shape (B,), mass.
+        batched: m_fb, net batch mass moved finite-time sustainably in this episode, not through and through the
+            environment, shape (2, B), mass.
         circularity: sum over the episode of the interval means of λ, shape (B,), mass.
         service: sum over the episode of the service level, shape (B,).
     """
@@ -47,14 +48,14 @@ class Snapshot:
         state: the physical state.
         streams: state of the random stream of each copy.
         agents: who acts.
-        network: what it is a snapshot of.
+        network: what it is a snapshot of, under its scenario and horizon.
         elapsed: the published step counter of a one-agent environment with ``legacy_episode``.
     """
 
     state: State
     streams: tuple[Mapping[str, Any], ...]
     agents: tuple[str, ...]
-    network: str
+    network: Network
     elapsed: int = 0
 
 

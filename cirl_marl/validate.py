@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -29,15 +32,30 @@ if TYPE_CHECKING:
     from cirl_marl.network import Network
 
 
+IDENTIFIER = r"^[a-z][a-z0-9_]*$"
+"""How compartments and services may be called; their names are keys of definition files and names of files."""
+
+FIELDS = {
+    Law.DONOR: ("rate",),
+    Law.RECIPIENT: ("rate",),
+    Law.CONTROLLED: (),
+    Law.EXOGENOUS: ("flow", "times"),
+    Law.COMPARTMENT: ("rate", "by"),
+    Law.BATCH: ("rate", "by", "port", "batches", "delay"),
+}
+"""What each law takes, of the fields that only some laws take."""
+
+OWN = {f.name: f.default for f in fields(Arc) if any(f.name in taken for taken in FIELDS.values())}
+"""Those fields, with their defaults."""
+
+
 def problems(network: Network) -> Iterator[str]:
     """Yield every reason why ``network`` cannot be simulated."""
     if not network.nodes:
         yield "nodes: a network needs at least one"
-    seen: set[str] = set()
-    for compartment in (*network.nodes, *network.arcs):
-        if compartment.id in seen:
-            yield f"compartment '{compartment.id}': the id is used twice"
-        seen.add(compartment.id)
+    compartments = [c.id for c in (*network.nodes, *network.arcs)]
+    yield from _name_problems("compartment", compartments)
+    yield from _name_problems("service", [service.id for service in network.services])
     nodes = {node.id: node for node in network.nodes}
     for node in network.nodes:
         yield from _node_problems(network, node)
@@ -66,8 +84,22 @@ def problems(network: Network) -> Iterator[str]:
     for agent in network.acting:
         if agent not in acting:
             yield f"agents: {unknown('acting compartment', agent, acting)}"
-    if len(set(network.acting)) != len(network.acting):
-        yield f"agents: {list(network.acting)} names a compartment twice"
+    yield from _repeated("agents", network.acting)
+
+
+def _name_problems(kind: str, ids: list[str]) -> Iterator[str]:
+    for id_ in dict.fromkeys(ids):
+        if not re.match(IDENTIFIER, id_):
+            yield f"{kind} '{id_}': an id begins with a letter and has lower-case letters, digits and underscores only"
+    for id_, times in Counter(ids).items():
+        if times > 1:
+            yield f"{kind} '{id_}': the id is used twice"
+
+
+def _repeated(where: str, names: Iterable[str]) -> Iterator[str]:
+    for name, times in Counter(names).items():
+        if times > 1:
+            yield f"{where}: names '{name}' twice"
 
 
 def _node_problems(network: Network, node: Node) -> Iterator[str]:
@@ -76,7 +108,7 @@ def _node_problems(network: Network, node: Node) -> Iterator[str]:
         yield f"node '{node.id}': initial range [{low}, {high}] is empty or not finite"
     elif low < 0 and network.episode.solver != "euler":
         yield f"node '{node.id}': initial stock {low} is negative"
-    yield from _common_problems(f"node '{node.id}'", node)
+    yield from _common_problems(f"node '{node.id}'", node, network.episode)
 
 
 def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
@@ -86,6 +118,11 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
             yield f"{where}: {end}: {unknown('node', node, nodes)}"
     if arc.donor == arc.recipient:
         yield f"{where}: a cycle of zero delay: it returns to its own donor '{arc.donor}' without passing a stock"
+    for name, default in OWN.items():
+        given = getattr(arc, name)
+        if name not in FIELDS[arc.law] and given != default:
+            taken = ", ".join(FIELDS[arc.law]) or "none of these"
+            yield f"{where}: {name} = {given!r}: law '{arc.law}' takes {taken}"
     if not math.isfinite(arc.rate) or arc.rate < 0:
         yield f"{where}: rate {arc.rate} must be finite and not negative"
     if arc.law is Law.COMPARTMENT:
@@ -104,10 +141,7 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
         yield f"{where}: control.kind 'flow' needs law 'controlled', not '{arc.law}'"
     if arc.control and arc.control.kind is ControlKind.RATE and arc.law is Law.CONTROLLED:
         yield f"{where}: law 'controlled' needs control.kind 'flow', not 'rate'"
-    yield from _common_problems(where, arc)
-    control = arc.control
-    if control and control.kind is ControlKind.FLOW and control.low < 0 and network.episode.solver != "euler":
-        yield f"{where}: control.low {control.low} would reverse the flow; use a second arc"
+    yield from _common_problems(where, arc, network.episode)
 
 
 def _model_flow_problems(where: str, arc: Arc, network: Network) -> Iterator[str]:
@@ -129,13 +163,16 @@ def _batch_problems(where: str, arc: Arc, interval: float, nodes: Mapping[str, N
         yield f"{where}: a vehicle carries what a compartment releases: it needs 'by', not a schedule"
     if arc.by and arc.batches:
         yield f"{where}: law 'batch' takes 'by' or a schedule of batches, not both"
+    if not arc.by and (arc.rate or arc.port):
+        yield f"{where}: a schedule of batches takes no rate and no port"
     times = [time for time, _ in arc.batches]
     if any(not (math.isfinite(value) and value >= 0) for pair in arc.batches for value in pair):
         yield f"{where}: times and masses of batches {arc.batches} must be finite and not negative"
         return
-    for what, time in [("delay", arc.delay), *(("batch at", time) for time in times)]:
-        if not math.isfinite(time) or not math.isclose(time / interval, round(time / interval), abs_tol=1e-6):
-            yield f"{where}: {what} {time:g} is not a whole number of control intervals of {interval:g}"
+    if math.isfinite(interval) and interval > 0:  # anything else is a problem of its own
+        for what, time in [("delay", arc.delay), *(("batch at", time) for time in times)]:
+            if not _whole(time / interval) or (0 < time < interval / 2):
+                yield f"{where}: {what} {time:g} is not a whole number of control intervals of {interval:g}"
     for what, given in (("set_point", arc.set_point), ("control of kind 'rate'", _rate_control(arc))):
         if given is not None:
             yield f"{where}: law 'batch' takes no {what}"
@@ -154,7 +191,11 @@ def _rate_control(arc: Arc) -> str | None:
     return arc.control.kind if arc.control is not None and arc.control.kind is ControlKind.RATE else None
 
 
-def _common_problems(where: str, compartment: Compartment) -> Iterator[str]:
+def _whole(ratio: float) -> bool:
+    return math.isfinite(ratio) and math.isclose(ratio, round(ratio), rel_tol=1e-9, abs_tol=1e-9)
+
+
+def _common_problems(where: str, compartment: Compartment, episode: Episode) -> Iterator[str]:
     if not math.isfinite(compartment.scale) or compartment.scale <= 0:
         yield f"{where}: scale {compartment.scale} must be positive and finite"
     if compartment.set_point is not None and not math.isfinite(compartment.set_point):
@@ -168,11 +209,18 @@ def _common_problems(where: str, compartment: Compartment) -> Iterator[str]:
         if not (math.isfinite(low) and math.isfinite(high)) or low > high:
             yield f"{where}: initial range [{low}, {high}] of an inner state is empty or not finite"
     control = compartment.control
+    inputs = compartment.model.input_names if compartment.model is not None else ()
+    if compartment.model is not None and inputs and (control is None or control.kind is not ControlKind.INPUT):
+        yield (
+            f"{where}: model '{compartment.model.kind}' needs a control of kind 'input' for {', '.join(inputs)}, "
+            f"not {control.kind if control else 'none'}"
+        )
     if control is None:
         return
-    takes_input = compartment.model is not None and compartment.model.input_names
-    if control.kind is ControlKind.INPUT and not takes_input:
+    if control.kind is ControlKind.INPUT and not inputs:
         yield f"{where}: control.kind 'input' needs a model with inputs"
+    if control.kind is ControlKind.FLOW and control.low < 0 and episode.solver != "euler":
+        yield f"{where}: control.low {control.low} would reverse the flow; use a second arc"
     if not all(map(math.isfinite, (control.low, control.neutral, control.high))):
         yield f"{where}: control bounds must be finite"
     elif not control.low <= control.neutral <= control.high or control.low == control.high:
@@ -201,6 +249,9 @@ def _service_problems(service: Service, network: Network, nodes: Mapping[str, No
     if service.provider not in known:
         kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
         yield f"{where}: provider: {unknown(kind, service.provider, known)}"
+    if service.measure and service.quantity != "measure":
+        yield f"{where}: measure '{service.measure}': quantity '{service.quantity}' takes none"
+    yield from _repeated(f"{where}: owed_by", service.owed_by)
     for debtor in service.owed_by:
         if debtor not in everyone:
             yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
@@ -238,11 +289,19 @@ def _setting_problems(network: Network) -> Iterator[str]:
         yield f"circularity_weight {objective.circularity_weight} must lie in [0, 1]"
     if episode.solver != "exact":
         yield from _step_problems(episode)
-    elif any(c.model is not None and not hasattr(c.model, "interval") for c in (*network.nodes, *network.arcs)):
-        yield "solver 'exact' knows no continuous inner physics: a network with models needs solver 'rk4' or 'euler'"
+    else:
+        if episode.solver_step is not None:
+            yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
+        moving = any(c.model is not None and not hasattr(c.model, "interval") for c in (*network.nodes, *network.arcs))
+        if moving or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
+            yield (
+                "solver 'exact' knows no continuous inner physics: a network with models needs solver 'rk4' or 'euler'"
+            )
     for compartment in (*network.nodes, *network.arcs):
         yield from _clock_problems(network, compartment)
     tracked = [c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None]
+    yield from _repeated("objective.tracked", objective.tracked)
+    yield from _repeated("observation.nodes", network.observation.nodes)
     for name in objective.tracked:
         if name not in tracked:
             yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
@@ -272,11 +331,11 @@ def _clock_problems(network: Network, compartment: Compartment) -> Iterator[str]
 
 def _step_problems(episode: Episode) -> Iterator[str]:
     step = episode.solver_step
-    if step is None or not step > 0:
+    if step is None or not (math.isfinite(step) and step > 0):
         yield f"solver '{episode.solver}' needs a positive solver_step, got {step}"
         return
     ratio = episode.control_interval / step
-    if not math.isclose(ratio, round(ratio), rel_tol=1e-9) or round(ratio) < 1:
+    if math.isfinite(episode.control_interval) and (not _whole(ratio) or round(ratio) < 1):
         yield (
             f"control_interval {episode.control_interval} is not a whole number of solver steps of {step} "
             f"({ratio:.6g} steps)"

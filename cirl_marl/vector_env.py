@@ -17,7 +17,7 @@ from cirl_marl.catalogue import load_network
 from cirl_marl.credit import Credit
 from cirl_marl.elements import REWARDS
 from cirl_marl.errors import CirlError, ControlError, unknown
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.observe import ObservationLayout
 from cirl_marl.reward import Scoring
 from cirl_marl.simulate import Dynamics, Transition
@@ -40,9 +40,11 @@ class VectorEnv:
         agents: compartments that act, in the order of every stacked array.
         reward_mode: one of those of ``credit.Credit``.
         observation_spaces: by agent.
+        observation_names: by agent, what each entry of its observation is.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
             order of ``state()``.
+        episodes: episodes begun in each copy, those gone back to included, shape (num_envs,).
     """
 
     def __init__(
@@ -95,9 +97,11 @@ class VectorEnv:
         self.scoring = Scoring(found, self.layout, self.agents, num_envs)
         self._credit = Credit(self.dynamics, self.scoring, self.agents, self.reward_mode, measure)
         self.observation_spaces = self.layout.spaces
+        self.observation_names = self.layout.names
         self._starts = Starts(found, self.dynamics, num_envs, self.layout.array_order)
         self.state_names = (*self._starts.names, *self.dynamics.batches.names)
         self._batched = slice(len(found.nodes), self.dynamics.unit)
+        self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
         self._state: State | None = None
         self._latest = np.empty((0, num_envs), dtype=np.float32)
         _keep_freed_memory()
@@ -134,6 +138,7 @@ class VectorEnv:
             ControlError: for a seed, option or state that cannot be used; the environment is left as it was.
         """
         self._state = self._fresh(self._starts.begin(seed, options))
+        self.episodes = self.episodes + 1
         self._latest = self._observe(self._state)
         return self.by_agent(self._latest)
 
@@ -176,6 +181,10 @@ class VectorEnv:
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
         return self._actuators.stack(actions)
+
+    def unstack(self, actions: Floats) -> dict[str, Floats]:
+        """Split stacked actions, shape (entries, B), into agent → (B, entries of its action)."""
+        return self._actuators.unstack(actions)
 
     def advance(self, actions: Floats) -> Outcome:
         """Hold stacked actions, shape (entries, B), for one control interval; no copy is restarted.
@@ -222,7 +231,7 @@ class VectorEnv:
         ).T
 
     def observations(self) -> dict[str, NDArray[np.float32]]:
-        """Return the observations that the agents act on next: those that the last reset, step or restore returned.
+        """Return the observations that the agents act on next: the arrays that the last reset, step or restore gave.
 
         Raises:
             ControlError: before the first ``reset``.
@@ -233,20 +242,23 @@ class VectorEnv:
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the state and the random streams; environments are not changed."""
-        return Snapshot(self.physical.copied(), self._starts.saved_streams(), self.agents, self._identity)
+        return Snapshot(self.physical.copied(), self._starts.saved_streams(), self.agents, self.network)
 
     def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
         """Go back to a snapshot and return the observations there.
 
         Raises:
-            ControlError: if the snapshot is of another network, batch size or choice of agents.
+            ControlError: if the snapshot is of another network, horizon, batch size or choice of agents.
         """
-        theirs = (snapshot.network, len(snapshot.streams), snapshot.agents)
-        ours = (self._identity, self.num_envs, self.agents)
+        theirs = _described(snapshot.network, len(snapshot.streams), snapshot.agents)
+        ours = _described(self.network, self.num_envs, self.agents)
         if theirs != ours:
-            raise ControlError(f"the snapshot (network, copies, agents) {theirs} does not fit {ours}")
+            raise ControlError(f"the snapshot does not fit: it is of {theirs}; this is {ours}")
+        if snapshot.network != self.network:
+            raise ControlError(f"the snapshot does not fit: it is of another definition of {ours}")
         self._starts.restore_streams(snapshot.streams)
         self._state = snapshot.state.copied()
+        self.episodes = self.episodes + 1
         self._latest = self._observe(self._state)
         return self.by_agent(self._latest)
 
@@ -257,14 +269,10 @@ class VectorEnv:
         """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
         return {agent: stacked[rows].T for agent, rows in self.layout.slices.items()}
 
-    @property
-    def _identity(self) -> str:
-        """What a snapshot has to fit; the horizon may differ, as planners look less far ahead."""
-        return f"{self.network.name}, scenario {self.network.scenario_name}"
-
     def infos(self, outcome: Outcome) -> Infos:
         """Return λ, local reward, flows (B, arcs) and service level for each agent; success where it is defined."""
         flows = outcome.flow.T
+        outcome.circularity.flags.writeable = outcome.service_level.flags.writeable = False  # the same for all agents
         infos: Infos = {
             agent: {
                 "circularity": outcome.circularity,
@@ -293,6 +301,7 @@ class VectorEnv:
 
     def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in the copies that ended and return the observation of all."""
+        self.episodes = self.episodes + ended
         which = np.flatnonzero(ended)
         old = self.physical
         drawn = np.concatenate([old.stock[: len(self.network.nodes)], old.inner])
@@ -317,7 +326,7 @@ class VectorEnv:
         neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
         flow = dynamics.start_flow(stock, inner, neutral)
         zeros = np.zeros(batch)
-        return State(stock, inner, flow, step, zeros, zeros, zeros)
+        return State(stock, inner, flow, step, np.zeros((2, batch)), zeros, zeros)
 
     def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
         """Return all quantities in one array, and the mean flows, which are read-only."""
@@ -344,6 +353,13 @@ class VectorEnv:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
         return self.layout.observe(quantities, time, self.scoring.levels(quantities))
+
+
+def _described(network: Network, copies: int, agents: Sequence[str]) -> str:
+    return (
+        f"network '{network.name}', scenario '{network.scenario_name}', {network.episode.horizon} steps, "
+        f"{copies} copies, agents {', '.join(agents)}"
+    )
 
 
 def _share(weight: float) -> float:

@@ -9,13 +9,18 @@ from collections.abc import Iterator
 from typing import Any
 
 from cirl_marl.elements import Arc, Compartment, Control, ControlKind, Law, Node, ranged_states
+from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
 
 SOURCE = "network built in Python"
 
 
 def definition_of(network: Network) -> str:
-    """Return a TOML definition that reads back as ``network``, its numbers equal to the last bit."""
+    """Return a TOML definition that reads back as ``network``, its numbers equal to the last bit.
+
+    Raises:
+        NetworkError: if a model has parameters other than numbers and its form.
+    """
     return "\n".join(_lines(network)) + "\n"
 
 
@@ -116,8 +121,12 @@ def _control(network: Network, control: Control) -> str:
 
 def _model(compartment: Compartment) -> str:
     model: Any = compartment.model
-    values = dataclasses.asdict(model)
+    values = {each.name: getattr(model, each.name) for each in dataclasses.fields(model)}
     form = f"form = {_text(values.pop('form'))}, " if "form" in values else ""
+    for name, value in values.items():
+        if not isinstance(value, int | float):
+            problem = f"parameter '{name}' of its model '{model.kind}' is no number, which a definition cannot say"
+            raise NetworkError(f"compartment '{compartment.id}'", [problem])
     parameters = ", ".join(f"{name} = {float(value)!r}" for name, value in values.items())
     initial = ", ".join(
         f"{name} = {{ low = {float(low)!r}, high = {float(high)!r}, source = {_text(SOURCE)} }}"

@@ -3,6 +3,8 @@
 Ten days of the copper network; whole episodes take a minute.
 """
 
+from rich import print
+
 from cirl_marl import vector_env
 from cirl_marl.controllers.mpc import MPC
 from cirl_marl.evaluate import rollout
@@ -26,3 +28,4 @@ summary = (
     f"no actions reach more than λ̄ = {proof.bound:.2f} kt with a service level of {service}; the plan reaches "
     f"{plan.episode_circularity[0]:.2f} kt, and MPC, from two other starts, is at most {gap.max():.1%} from the best"
 )
+print(summary)

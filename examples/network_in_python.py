@@ -5,6 +5,7 @@ if the deposit scheme did nothing?
 """
 
 import numpy as np
+from rich import print
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Network, Node, Objective, Role, Service, parallel_env
 
@@ -41,3 +42,4 @@ env.restore(here)
 idle = env.step(act | {"deposit": env.neutral_action["deposit"]})[4]["deposit"]["circularity"]
 
 summary = f"λ = {acting:.2f} t with the deposit scheme, {idle:.2f} t without it on that day"
+print(summary)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +24,6 @@ from cirl_marl import (
     Role,
     Service,
 )
-from cirl_marl.rowsum import Floats
 from cirl_marl.simulate import Dynamics
 
 if TYPE_CHECKING:
@@ -43,20 +41,8 @@ settings.register_profile(
 settings.register_profile("thorough", settings.get_profile("cirl_marl"), max_examples=1000, derandomize=False)
 settings.load_profile("cirl_marl")
 
-REFERENCE = Path(__file__).parent / "reference"
 ROLES = list(Role)
 LAWS = [law for law in Law if law is not Law.COMPARTMENT]
-
-
-@pytest.fixture(scope="session")
-def published() -> Callable[[str], tuple[Floats, Floats, Floats]]:
-    """Return ``published(name)``: normalised actions (n,), states (n + 1, k), rewards (n,) of a class of the paper."""
-
-    def read(name: str) -> tuple[Floats, Floats, Floats]:
-        table = np.loadtxt(REFERENCE / f"{name}.csv", delimiter=",", skiprows=1)
-        return table[:-1, 0], table[:, 1:-1], table[:-1, -1]
-
-    return read
 
 
 @pytest.fixture
@@ -166,7 +152,7 @@ def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_
         donor=f"node_{i}",
         recipient=f"node_{j}",
         law=law,
-        rate=float(10 ** rng.uniform(-2, 0.7)),
+        rate=float(10 ** rng.uniform(-2, 0.7)) * (law in (Law.DONOR, Law.RECIPIENT)),
         flow=tuple(flow),
         times=tuple(starts),
         set_point=float(rng.uniform(0, 100)) if rng.random() < 0.3 else None,

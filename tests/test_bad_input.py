@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from networkx import NetworkXError
 
 from cirl_marl import (
+    Arc,
     CirlError,
     ControlError,
+    Network,
+    Node,
     VectorEnv,
     load_network,
     parallel_env,
@@ -137,9 +142,55 @@ def test_bad_snapshots() -> None:
         vector_env("copper_net", num_envs=2, agents=["mine"]),
         vector_env("carbo_net", num_envs=2),
         vector_env("copper_net", num_envs=2, scenario="paper", agents=list(env.agents)),
+        vector_env("copper_net", num_envs=2, horizon=10),
     ):
         with pytest.raises(ControlError, match="snapshot"):
             other.restore(snapshot)
+
+
+def test_snapshot_of_another_definition() -> None:
+    """The same names with other rates are another network."""
+    network = load_network("copper_net")
+    env = VectorEnv(network, num_envs=1)
+    env.reset(0)
+    faster = tuple(replace(arc, rate=2 * arc.rate) for arc in network.arcs)
+    with pytest.raises(ControlError, match="another definition of network 'copper_net'"):
+        VectorEnv(replace(network, arcs=faster), num_envs=1).restore(env.snapshot())
+
+
+def test_mass_is_counted_in_each_copy() -> None:
+    """What one copy holds here and another there is not added up."""
+    ends = Node(id="a", initial=(0.0, 100.0)), Node(id="b")
+    env = VectorEnv(
+        Network(name="two", nodes=ends, arcs=(Arc(id="f", donor="a", recipient="b", rate=0.1),)), num_envs=2
+    )
+    env.reset(0, options={"initial_state": {"a": [100.0, 0.0], "b": [0.0, 100.0]}})
+    np.testing.assert_array_equal(env.physical.stock[:2], [[100.0, 0.0], [0.0, 100.0]])
+    with pytest.raises(ControlError, match="150 kg in all"):
+        env.reset(0, options={"initial_state": {"a": [100.0, 0.0], "b": [50.0, 100.0]}})
+
+
+def test_scenario_after_options_is_an_error() -> None:
+    """Options would be lost with the scenario they were set in."""
+    network = load_network("copper_net").with_options(objective={"reward": "team"})
+    with pytest.raises(CirlError, match="choose it first"):
+        VectorEnv(network, scenario="paper")
+    assert VectorEnv(network).reward_mode == "team"
+
+
+def test_what_is_shared_cannot_be_written_to() -> None:
+    """Neither a network of the catalogue nor an array that all agents get."""
+    network = load_network("carbo_net")
+    with pytest.raises(ValueError, match="read-only"):
+        network.sustainability[:] = 0.0
+    with pytest.raises(NetworkXError, match="Frozen"):
+        network.graph.clear()
+    env = VectorEnv(network, num_envs=2)
+    env.reset(0)
+    infos = env.step({agent: np.zeros((2, 1)) for agent in env.agents})[4]
+    for shared in ("circularity", "service_level", "flows"):
+        with pytest.raises(ValueError, match="read-only"):
+            infos[env.agents[0]][shared][:] = 0.0
 
 
 @pytest.mark.parametrize("options", [{"state": {}}, {"x0": 1}, 5])

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import highspy
+import numpy as np
 import pytest
 from scipy import optimize
 
@@ -84,6 +85,55 @@ def test_check_names_every_mistake(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert "missing.toml: no such file" in capsys.readouterr().err
 
 
+def test_check_takes_names_and_recipes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever there is can be checked, by its name or as a file; mistakes of recipes are named too."""
+    recipe = (folder("agents") / "independent_ppo.toml").read_text()
+    Path("mine.toml").write_text(recipe)
+    assert run(monkeypatch, "check", "copper_net", "independent_ppo", "mine.toml") == 0
+    said = capsys.readouterr().out
+    assert said.count("no mistakes") == 3
+    assert "mine.toml: recipe of PPO, 200,000 steps in 32 copies" in said
+    Path("mine.toml").write_text(recipe.replace('algorithm = "PPO"', 'algorithm = "PPQ"'))
+    assert run(monkeypatch, "check", "mine.toml") == 2
+    assert "Did you mean 'PPO'?" in capsys.readouterr().err
+    assert run(monkeypatch, "check", "coper_net") == 2
+    assert "Did you mean 'copper_net'?" in capsys.readouterr().err
+
+
+def test_check_remarks_on_services_that_nobody_owes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a debtor that acts, stopping everything would pay: that is said, and is no mistake."""
+    owed = 'owed_by = ["quarry", "refill"]'
+    assert owed in guide()
+    for changed, said in (
+        (owed, ""),
+        ("", "owed_by is left out, so the provider owes it; households: does not act"),
+        ('owed_by = ["households"]', "owed_by households: does not act"),
+        ('owed_by = ["quarry", "households"]', "owed_by: households does not act and cannot be paid less"),
+    ):
+        Path("bottles.toml").write_text(guide().replace(owed, changed))
+        assert run(monkeypatch, "check", "bottles.toml") == 0
+        printed = capsys.readouterr().out
+        assert ("remark" in printed) == bool(said)
+        assert said in printed
+
+
+def test_short_trainings_say_that_there_are_no_curves(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No empty picture is drawn, and the number of steps that would do is given."""
+    Path("bottles.toml").write_text(guide(days=60))
+    assert run(monkeypatch, "train", "bottles.toml", "--steps", "640", "--out", "run", "--episodes", "2") == 0
+    assert "no learning curves, as no episode ended: 32 copies need 1,920 steps" in capsys.readouterr().out
+    assert {path.name for path in Path("run/pictures").iterdir()} == {"flows_before_after.png", "circularity.png"}
+    monkeypatch.setattr(sys, "argv", [])
+    assert run(monkeypatch, "plan", "run") == 0
+    assert Path("plan_run.csv").is_file()
+    assert run(monkeypatch, "evaluate", "rum", "--episodes", "2") == 2
+    assert "Did you mean 'run'?" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("control", ["neutral", "random", "constant"])
 def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every interval is a row with λ, service, stocks and flows."""
@@ -91,8 +141,11 @@ def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.Monke
     assert run(monkeypatch, "simulate", "copper_net", "--control", control, "--steps", "7", "--out", "out", *extra) == 0
     with Path(f"out/copper_net_{control}.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 7
-    assert float(rows[-1]["time (day)"]) == 1.75
+    assert len(rows) == 1 + 7, "the start and the end of every interval"
+    assert [float(row["time (day)"]) for row in rows] == [0.25 * i for i in range(8)]
+    stocks = [name for name in rows[0] if name.startswith("stock of")]
+    masses = [sum(float(row[name]) for name in stocks) for row in rows]
+    np.testing.assert_allclose(masses, masses[0], rtol=1e-12)
     assert {"circularity (kt)", "service level", "stock of use (kt)", "flow of mine_to_refinery (kt/day)"} <= set(
         rows[0]
     )
@@ -284,7 +337,7 @@ def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     held = ("simulate", "solids_net", "--control", "scripted", "--set", "sorter=0", "--steps", "40")
     assert run(monkeypatch, *held) == 0
     header, *rows = (tmp_path / "solids_net_scripted.csv").read_text().splitlines()
-    assert len(rows) == 40
+    assert len(rows) == 1 + 40
     columns = header.split(",")
     assert "mass on first_use (kg)" in columns
     assert "truck.position_m" in columns
@@ -300,10 +353,10 @@ def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         (["train", "copper_net", "--agents", "independent_pp"], "Did you mean 'independent_ppo'?"),
         (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
         (["train"], "needs either NETWORK or --resume RUN"),
-        (["train", "--resume", "nowhere"], "nowhere: no such run directory"),
+        (["train", "--resume", "nowhere"], "unknown run directory 'nowhere'"),
         (["train", "--resume", "nowhere", "--steps", "5", "--seed", "1"], "leave out --steps, --seed"),
-        (["show", "copper_net", "--picture", "no/such/folder.png"], "needs the name of a .png file"),
-        (["evaluate", "nowhere"], "nowhere: no such run directory"),
+        (["show", "copper_net", "--picture", "picture.pdf"], "needs the name of a .png file"),
+        (["evaluate", "nowhere"], "unknown run directory 'nowhere'"),
         (["simulate", "copper_net", "--control", "nutral"], "Did you mean 'neutral'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mien=0"], "Did you mean 'mine'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mine=nan"], "must lie in [-1, 1]"),
@@ -313,13 +366,13 @@ def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         (["plan", "copper_net", "--control", "mcp", "--out", "p.csv"], "Did you mean 'mpc'?"),
         (["plan", "copper_net", "--control", "lqr", "--out", "p.csv"], "rate controls multiply flows"),
         (["plan", "net_zero", "--control", "mpc", "--out", "p.csv"], "no bound is proved"),
-        (["plan", "copper_net", "--control", "neutral", "--out", "no/p.csv"], "in a folder that exists"),
+        (["plan", "copper_net", "--control", "neutral", "--out", "p.txt"], "needs the name of a .csv file"),
         (["plan", "copper_net", "--control", "neutral", "--min-service", "1", "--out", "p.csv"], "goes with mpc"),
-        (["plan", "nowhere", "--out", "p.csv"], "nowhere: no such run directory"),
+        (["plan", "nowhere", "--out", "p.csv"], "unknown run directory 'nowhere'"),
         (["pareto", "net_zero", "--out", "new"], "no bound is proved"),
         (["pareto", "coper_net", "--out", "new"], "Did you mean 'copper_net'?"),
         (["compare"], "give a training run or a network"),
-        (["compare", "nowhere"], "nowhere: no such run directory"),
+        (["compare", "nowhere"], "unknown run directory 'nowhere'"),
         (["compare", "--network", "coper_net"], "Did you mean 'copper_net'?"),
         (["compare", "--network", "copper_net", "--controllers", "mcp"], "Did you mean 'mpc'?"),
         (

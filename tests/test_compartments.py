@@ -66,7 +66,7 @@ RANGES: dict[str, tuple[list[float], list[float], list[float], list[float]]] = {
     "digester": ([1, 1, 4, 3, 205, 220], [2, 4, 8, 8, 215, 245], [0.3], [0.7]),
     "digester_published": ([1, 1, 4, 3, 205, 230], [2, 4, 8, 8, 215, 240], [0.4] * 6, [0.6] * 6),
     "atmosphere": ([1], [9], [0, 0], [5, 5]),
-    "troposphere_temperature": ([280], [300], [600], [1500]),
+    "troposphere_temperature": ([280], [300], [], []),
 }
 """State and input ranges from which samples are drawn."""
 
@@ -90,9 +90,7 @@ def sample(model: ContinuousModel, size: int) -> tuple[Floats, Floats, dict[str,
 
 def outputs(model: Any, state: Floats, inputs: Floats, context: dict[str, Floats]) -> dict[str, Floats]:
     """Return everything that the model computes of a state, by name."""
-    found = {"derivative": model.derivative(state, inputs), "reward": model.reward(state, inputs)}
-    if context:
-        found["derivative in context"] = model.derivative(state, inputs, **context)
+    found = {"derivative": model.derivative(state, inputs, **context), "reward": model.reward(state, inputs)}
     for name in ("outflow", "measures"):
         if hasattr(model, name):
             found[name] = getattr(model, name)(state, inputs)
@@ -101,14 +99,14 @@ def outputs(model: Any, state: Floats, inputs: Floats, context: dict[str, Floats
     return found
 
 
-def rk4(model: ContinuousModel, state: Floats, inputs: Floats, span: float, steps: int) -> Floats:
-    """Return the state after ``span`` at constant inputs, by the classical Runge-Kutta method."""
+def rk4(rate: Callable[[Floats], Floats], state: Floats, span: float, steps: int) -> Floats:
+    """Return the state after ``span``, by the classical Runge-Kutta method."""
     h = span / steps
     for _ in range(steps):
-        k1 = model.derivative(state, inputs)
-        k2 = model.derivative(state + h / 2 * k1, inputs)
-        k3 = model.derivative(state + h / 2 * k2, inputs)
-        k4 = model.derivative(state + h * k3, inputs)
+        k1 = rate(state)
+        k2 = rate(state + h / 2 * k1)
+        k3 = rate(state + h / 2 * k2)
+        k4 = rate(state + h * k3)
         state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     return state
 
@@ -243,14 +241,15 @@ class TestEveryModel:
 
     def test_agrees_with_scipy(self, model: ContinuousModel) -> None:
         """Runge-Kutta at a fine step and scipy's DOP853 at 1e-11 agree."""
-        state, inputs, _ = sample(model, 3)
+        state, inputs, context = sample(model, 3)
         span = SPAN[model.time_unit]
-        fine = rk4(model, state, inputs, span, 4000)
+        fine = rk4(lambda z: model.derivative(z, inputs, **context), state, span, 4000)
         for b in range(3):
             held = inputs[:, b : b + 1]
+            told = {name: values[b : b + 1] for name, values in context.items()}
 
-            def rate(_: float, z: Floats, held: Floats = held) -> Floats:
-                return model.derivative(z[:, None], held)[:, 0]
+            def rate(_: float, z: Floats, held: Floats = held, told: dict[str, Floats] = told) -> Floats:
+                return model.derivative(z[:, None], held, **told)[:, 0]
 
             exact = solve_ivp(rate, (0.0, span), state[:, b], method="DOP853", rtol=1e-11, atol=1e-11)
             assert exact.success
@@ -262,6 +261,7 @@ def test_context_matters(model: ContinuousModel) -> None:
     """What the network tells a model changes how it moves."""
     state, inputs, context = sample(model, 6)
     assert context
+    plain = model.derivative(state, inputs, **context)
     for name, value in context.items():
-        told = model.derivative(state, inputs, **{name: value})
-        assert not np.allclose(told, model.derivative(state, inputs), rtol=1e-6, atol=0.0), name
+        told = model.derivative(state, inputs, **context | {name: 2.0 * value})
+        assert not np.allclose(told, plain, rtol=1e-6, atol=0.0), name

@@ -154,10 +154,23 @@ REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
         ('from = "mine"', 'from = "mime"', ["arc 'mine_to_refinery'", "'mime'", "Did you mean 'mine'"]),
         (RATE, RATE.replace("0.82", "-0.82"), ["arc 'refinery_to_fabrication'", "-0.82", "negative"]),
         (RATE, RATE.replace("0.82", "nan"), ["arcs.refinery_to_fabrication.rate.value", "nan"]),
+        (RATE, RATE.replace("0.82", "true"), ["arcs.refinery_to_fabrication.rate.value", "number", "True"]),
+        (RATE, RATE.replace("0.82", '"0.82"'), ["arcs.refinery_to_fabrication.rate.value", "number", "'0.82'"]),
+        (RATE, 'by = "mine"\n' + RATE, ["arc 'refinery_to_fabrication'", "by = 'mine'", "takes rate"]),
+        (
+            RATE,
+            'delay = { value = 1, unit = "day", source = "x" }\n' + RATE,
+            ["arc 'refinery_to_fabrication'", "delay = 1.0", "takes rate"],
+        ),
+        ("[episode]", '[episode]\nsolver_step = { value = 1, unit = "day", source = "x" }', ["'exact'", "solver_step"]),
+        ('quantity = "stock"', 'quantity = "stock"\nmeasure = "weight"', ["'copper_in_use'", "'weight'", "none"]),
+        ("owed_by = [", 'owed_by = ["mine", "mine", ', ["'copper_in_use'", "owed_by", "'mine' twice"]),
         (RATE, RATE.replace("1/day", "kg"), ["arcs.refinery_to_fabrication.rate", "'kg'", "inconsistent"]),
         (RATE, RATE.replace("1/day", "1/dya"), ["arcs.refinery_to_fabrication.rate", "dya"]),
         (REFINERY, REFINERY.replace("kt", "knot"), ["nodes.refinery.initial", "'knot'", "inconsistent"]),
+        (REFINERY, REFINERY.replace("kt", "kton"), ["nodes.refinery.initial", "'kton'", "kt (kilotonne)"]),
         (REFINERY, REFINERY.replace("60.0", "-6.0"), ["node 'refinery'", "-6.0", "negative"]),
+        (RATE, "rate = 0.82 # {", ["arcs.refinery_to_fabrication.rate", "{ value = …, unit = …, source = … }", "0.82"]),
         (REFINERY, REFINERY.replace("60.0", "95.0"), ["node 'refinery'", "95.0", "90.0", "empty"]),
         ('to = "refinery"', 'to = "mine"', ["arc 'mine_to_refinery'", "zero delay", "'mine'"]),
         ("[arcs.mine_to_refinery]", "[arcs.mine]", ["'mine'", "twice"]),
@@ -307,6 +320,14 @@ def test_network_can_be_built_in_python() -> None:
         ('[scenarios.other]\nname = "x"', "scenarios.other.name: a scenario cannot set it"),
         ("[scenarios.other]\narcs = 5", "scenarios.other.arcs: must be a table"),
         ("[scenarios.other.nodes.mine.initial]\nlow = 1", "scenarios.other.nodes.mine.initial.high: missing"),
+        (
+            '[scenarios.other]\nwithout = ["services", "services.copper_in_use"]',
+            "scenarios.other.without: 'services.copper_in_use' lies in 'services'",
+        ),
+        (
+            '[scenarios.other.nodes.mine]\nwithout = ["control"]',
+            "scenarios.other.nodes.mine.without: unknown key 'without'",
+        ),
     ],
 )
 def test_scenarios_are_strict(tmp_path: Path, scenario: str, message: str) -> None:

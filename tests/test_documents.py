@@ -11,7 +11,7 @@ import typer.main
 import cirl_marl
 from cirl_marl.cli import app
 from cirl_marl.definition import read_network
-from cirl_marl.learners import load_recipe
+from cirl_marl.learners import load_recipe, train
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")])
@@ -75,10 +75,16 @@ def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:
 
 
 def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
-    """The recipe shown to newcomers reads without a mistake."""
+    """The recipe shown to newcomers learns in the network that it is shown for, and what is added to it reads."""
     path = tmp_path / "my_recipe.toml"
-    path.write_text((ROOT / "agents" / "README.md").read_text().split("```toml\n")[1].split("```")[0])
-    assert load_recipe(path).match[0].algorithm == "SAC"
+    whole, addition = (
+        part.split("```")[0] for part in (ROOT / "agents" / "README.md").read_text().split("```toml\n")[1:]
+    )
+    path.write_text(whole)
+    training = train("copper_net", path, steps=1280)
+    assert type(training.trainees["mine"].model).__name__ == "SAC"
+    path.write_text(whole + addition)
+    assert load_recipe(path).match[1].algorithm == "TQC"
 
 
 def test_examples_run() -> None:

@@ -18,6 +18,7 @@ LAYERS = (
         "rowsum",
         "validate",
         "network",
+        "remarks",
         "staged",
         "statistics",
     },

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from paper_classes import PAPER, trajectory
 from scipy.integrate import solve_ivp
 
 from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv, parallel_env
@@ -19,9 +19,6 @@ from cirl_marl.elements import Episode, Law, Objective, Observation
 from cirl_marl.network import Floats
 from cirl_marl.single_env import SingleAgentEnv
 from cirl_marl.testing import check_parallel_env, check_vector_env
-
-Published = Callable[[str], tuple[Floats, Floats, Floats]]
-"""Actions (n,), states (n + 1, k) and rewards (n,) of a class of the paper, by its name."""
 
 LITRES = 1000.0
 KG_PER_MMOL = 44.01e-6
@@ -52,8 +49,7 @@ def digester_network(step: float = 0.0125, horizon: int = 40) -> Network:
 
 def paper_network(kind: str) -> Network:
     """The published environment of one compartment: its model alone, Euler steps of 5·10⁻⁵ of its time unit."""
-    cls = model_class(kind)
-    paper = cls.paper
+    cls, paper = model_class(kind), PAPER[kind]
     low, high = paper.input_low[0], paper.input_high[0]
     node = Node(
         id="plant",
@@ -81,9 +77,9 @@ def paper_network(kind: str) -> Network:
         ("microalgae_droop", "CO2MicroalgaeDroop"),
     ],
 )
-def test_published_environments_as_the_one_agent_case(kind: str, name: str, published: Published) -> None:
+def test_published_environments_as_the_one_agent_case(kind: str, name: str) -> None:
     """The general machinery, given the published model, bounds and Euler step, reproduces the published trajectory."""
-    actions, states, rewards = published(name)
+    actions, states, rewards = trajectory(name)
     env = SingleAgentEnv(paper_network(kind))
     env.reset(seed=0)
     steps = min(len(actions), env.network.episode.horizon)

@@ -157,7 +157,7 @@ def assert_window_circularity(network: Network, seed: int) -> None:
     interval, horizon = network.episode.control_interval, network.episode.horizon
     infos: dict[str, dict[str, Any]] = {}
     moved = np.zeros((len(network.arcs), 3))
-    batched = np.zeros(3)
+    batched = np.zeros((2, 3))
     continuous = np.array([arc.law is not Law.BATCH for arc in network.arcs], dtype=bool)
     for step, actions in enumerate(episode(env, seed)):
         held = env.physical.stock.copy()
@@ -167,9 +167,9 @@ def assert_window_circularity(network: Network, seed: int) -> None:
         infos = env.step(actions)[4]
         moved += infos[env.agents[0]]["flows"].T * interval
     lost = network.sustainability[continuous] @ moved[continuous]
-    expected = -network.objective.reference_interval * lost / (interval * horizon) - batched / horizon
+    expected = -network.objective.reference_interval * lost / (interval * horizon) - batched.sum(axis=0) / horizon
     tolerance = 1e-12 * (1 + network.objective.reference_interval * moved.sum(axis=0) / (interval * horizon))
-    tolerance = tolerance + 1e-12 * np.abs(batched)
+    tolerance = tolerance + 1e-12 * np.abs(batched).sum(axis=0)
     for agent in env.agents:
         assert (np.abs(infos[agent]["episode_circularity"] - expected) <= tolerance).all()
 

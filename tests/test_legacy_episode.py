@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
+from paper_classes import PAPER
 
 import cirl_marl
 
@@ -64,7 +65,7 @@ def test_limit_of_the_compartments(name: str, horizon: int) -> None:
     lone: cirl_marl.SingleAgentEnv = env.unwrapped  # type: ignore[assignment]
     model = lone.network.compartments[lone.agent].model
     assert model is not None
-    paper = type(model).paper  # type: ignore[attr-defined]
+    paper = PAPER[model.kind]
     low, high = (np.array(end)[:, None] for end in zip(*paper.inferred_initial, strict=True))
     env.reset(seed=3)
     for length in (horizon + 1, horizon, horizon):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from paper_classes import PAPER
 from scipy.integrate import solve_ivp
 
 from cirl_marl.compartments import nutrient
@@ -265,7 +266,8 @@ class TestDrawDown:
 def test_start_that_the_returns_of_the_paper_need(action: float, figure: float) -> None:
     """Darkness, I = 75 and I = 150 from S in the inferred range; from S = 0 even darkness returns 103.4."""
     model = MicroalgaeMonod(form="published")
-    paper, inputs = model.paper, model.paper.inputs(np.full((1, 3), action))
+    paper = PAPER["microalgae_monod"]
+    inputs = paper.inputs(np.full((1, 3), action))
     low, high = paper.inferred_initial[1]
     state = np.array([[26.0] * 3, [low, high, 0.0]])
     returns = np.zeros(3)

@@ -143,6 +143,32 @@ def test_networks_that_it_refuses(name: str, scenario: str | None, said: str) ->
         MPC().start(env, 0)
 
 
+def test_a_new_episode_is_planned_anew() -> None:
+    """After a restart within a step, a reset in mid-plan and a snapshot, the plan is one for the stocks there are."""
+    network = replace(in_use(), nodes=(RESERVE, replace(USE, initial=(5.0, 20.0)), TIP))
+    env = VectorEnv(network, num_envs=1, horizon=4)
+    controller = MPC()
+    env.reset(0)
+    start = env.snapshot()
+    controller.start(env, 0)
+
+    def is_fresh() -> bool:
+        fresh = MPC()
+        fresh.start(env, 0)
+        seen = env.observations()
+        np.testing.assert_array_equal(controller.act(seen)["extraction"], fresh.act(seen)["extraction"])
+        return True
+
+    for _ in range(4):
+        env.step(controller.act(env.observations()))
+    assert env.physical.step[0] == 0
+    assert is_fresh()
+    env.reset(5)
+    assert is_fresh()
+    env.restore(start)
+    assert is_fresh()
+
+
 def test_the_episode_ends() -> None:
     """There is nothing to plan after the last decision."""
     env = VectorEnv(in_use(), num_envs=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -12,23 +11,20 @@ import pytest
 from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
+from paper_classes import trajectory
 from scipy.integrate import solve_ivp
 
 from cirl_marl import CirlError, Law, VectorEnv, load_network, parallel_env, single_agent_env
 from cirl_marl.registration import PAPER_ENVIRONMENTS
-from cirl_marl.rowsum import Floats
 from cirl_marl.simulate import Dynamics
-
-Published = Callable[[str], tuple[Floats, Floats, Floats]]
-"""Actions (n,), states (n + 1, k) and rewards (n,) of a class of the paper, by its name."""
 
 PAPER = {"CopperNet": ("copper_net", "use_to_collection"), "CarboNet": ("carbo_net", "urban_to_capture")}
 
 
 @pytest.mark.parametrize("name", PAPER)
-def test_published_trajectory(name: str, published: Published) -> None:
+def test_published_trajectory(name: str) -> None:
     """Through gymnasium.make: row t's action leads to row t+1's state and to row t's reward."""
-    actions, states, rewards = published(name)
+    actions, states, rewards = trajectory(name)
     env = gymnasium.make(f"cirl_marl/{name}-v0", disable_env_checker=True)
     observation, info = env.reset(seed=0)
     np.testing.assert_allclose(info["state"], states[0], rtol=1e-9)
@@ -43,9 +39,9 @@ def test_published_trajectory(name: str, published: Published) -> None:
 
 
 @pytest.mark.parametrize("name", PAPER)
-def test_initial_state_in_the_papers_order(name: str, published: Published) -> None:
+def test_initial_state_in_the_papers_order(name: str) -> None:
     """An array is taken in the paper's order; one step from it is one published step."""
-    actions, states, _ = published(name)
+    actions, states, _ = trajectory(name)
     network, agent = PAPER[name]
     env: gymnasium.Env[Any, Any] = single_agent_env(network, agent=agent, scenario="paper")
     _, info = env.reset(seed=0, options={"initial_state": states[7]})
@@ -129,9 +125,9 @@ def test_one_agent_is_all_agents_with_the_others_neutral(network: str, agent: st
     np.testing.assert_array_equal(one.parallel.state(), all_.state())
 
 
-def test_local_rewards_sum_to_the_papers(published: Published) -> None:
+def test_local_rewards_sum_to_the_papers() -> None:
     """The local rewards of copper_net's compartments are the paper's reward, split."""
-    actions, _, rewards = published("CopperNet")
+    actions, _, rewards = trajectory("CopperNet")
     env = parallel_env("copper_net", scenario="paper")
     env.reset(seed=0)
     for t in range(20):

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from paper_classes import PAPER, trajectory
 from scipy.integrate import solve_ivp
 
 from cirl_marl import SingleAgentEnv
 from cirl_marl.compartments import model_class
-from cirl_marl.rowsum import Floats
-
-Published = Callable[[str], tuple[Floats, Floats, Floats]]
-"""Actions (n,), states (n + 1, k) and rewards (n,) of a class of the paper, by its name."""
 
 MODELS = {
     "TransportTruck": ("transport_truck", 200),
@@ -42,11 +38,11 @@ def test_horizon_is_a_truncation(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_published_trajectory_of_one_compartment(name: str, published: Published) -> None:
+def test_published_trajectory_of_one_compartment(name: str) -> None:
     """Through gymnasium.make, started where the published class starts, over every published row."""
     kind, _ = MODELS[name]
-    actions, states, rewards = published(name)
-    paper = model_class(kind).paper
+    actions, states, rewards = trajectory(name)
+    paper = PAPER[kind]
     env = make(name, horizon=len(states))
     _, info = env.reset(seed=0, options={"initial_state": paper.reference_start})
     np.testing.assert_array_equal(info["state"], paper.reference_start)
@@ -68,7 +64,7 @@ def test_starts_and_bounds(name: str) -> None:
     kind, horizon = MODELS[name]
     cls = model_class(kind)
     env = make(name)
-    low, high = np.array(cls.paper.inferred_initial).T
+    low, high = np.array(PAPER[kind].inferred_initial).T
     starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(200)])
     assert (starts >= low).all()
     assert (starts <= high).all()
@@ -79,7 +75,7 @@ def test_starts_and_bounds(name: str) -> None:
     assert [name.split(".")[1] for name in agent.parallel.layout.names[agent.agent]] == list(cls.state_names)
     control = agent.network.compartments[agent.agent].control
     assert control is not None
-    assert (control.low, control.high) == (cls.paper.input_low[0], cls.paper.input_high[0])
+    assert (control.low, control.high) == (PAPER[kind].input_low[0], PAPER[kind].input_high[0])
     assert agent.network.episode.horizon == horizon
     assert agent.network.episode.control_interval == 5e-5
     assert env.action_space.shape == (1,)
@@ -91,9 +87,10 @@ def test_euler_is_first_order(name: str) -> None:
     kind, _ = MODELS[name]
     model = model_class(kind)(form="published")
     env: Any = make(name).unwrapped
-    start = np.mean(model.paper.inferred_initial, axis=1)
+    paper = PAPER[kind]
+    start = np.mean(paper.inferred_initial, axis=1)
     span = 0.002
-    value = 0.25 * (model.paper.input_high[0] - model.paper.input_low[0]) + model.paper.input_low[0]
+    value = 0.25 * (paper.input_high[0] - paper.input_low[0]) + paper.input_low[0]
 
     def slope(_: float, z: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(model.derivative(z[:, None], np.array([[value]]))[:, 0])

@@ -53,7 +53,7 @@ def test_half_written_runs_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> No
     train("copper_net", ppo_recipe, directory=directory, horizon=5)
     with pytest.raises(RunError, match="not empty"):
         train("copper_net", ppo_recipe, directory=directory, horizon=5)
-    with pytest.raises(RunError, match="no such run directory"):
+    with pytest.raises(RunError, match="unknown run directory"):
         Trained(tmp_path / "elsewhere")
     for name in ("config.json", "status.json", "network.toml"):
         broken = tmp_path / f"without_{name}"

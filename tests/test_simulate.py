@@ -48,7 +48,12 @@ def small(
         name="small",
         nodes=tuple(Node(id=name, initial=(stock, stock)) for name, stock in nodes.items()),
         arcs=tuple(arcs),
-        episode=Episode(control_interval=interval, horizon=horizon, solver=solver, solver_step=interval),
+        episode=Episode(
+            control_interval=interval,
+            horizon=horizon,
+            solver=solver,
+            solver_step=None if solver == "exact" else interval,
+        ),
     )
 
 

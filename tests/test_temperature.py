@@ -32,7 +32,8 @@ def test_temperature_follows_the_stock() -> None:
     model = network.nodes[air].model
 
     def slope(at: float, state: Floats) -> Floats:
-        return model.derivative(state[:, None], stock(np.array([[at]])))[:, 0]  # type: ignore[union-attr,no-any-return]
+        held = 1000.0 * stock(np.array([at]))
+        return model.derivative(state[:, None], np.empty((0, 1)), stock_kg=held)[:, 0]  # type: ignore[union-attr,no-any-return]
 
     expected = solve_ivp(slope, (0.0, time[-1]), [288.33], rtol=1e-10, atol=1e-10, t_eval=time[1:]).y[0]
     np.testing.assert_allclose(warm.inner[:, 0], expected, atol=1e-6)

@@ -54,33 +54,65 @@ def show(
         )
     console.print(f"λ of the start state: {float(found.circularity(flow)):.5g} {found.mass_unit}")
     path = picture or Path(f"{found.name}.png")
-    if path.suffix != ".png" or not path.parent.is_dir():
-        raise CirlError(f"--picture {path}: needs the name of a .png file in a folder that exists")
+    if path.suffix != ".png":
+        raise CirlError(f"--picture {path}: needs the name of a .png file")
     save_network(path, found, stock, flow, title=found.title)
     console.print(f"picture: {path}")
 
 
 @app.command()
-def check(files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Definition files.")]) -> None:
-    """Check definition files and name every mistake; exit code 2 if there is one."""
-    from cirl_marl.definition import read_network
+def check(
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue."),
+    ],
+) -> None:
+    """Check networks and recipes and name every mistake; exit code 2 if there is one.
 
+    What is no mistake but seldom meant is said as a remark.
+    """
     faulty = False
-    for path in files:
+    for source in sources:
         try:
-            network = read_network(path)
+            if _is_recipe(source):
+                _check_recipe(source)
+            else:
+                _check_network(source)
         except DefinitionError as error:
             faulty = True
             errors.print(plain(error), highlight=False, soft_wrap=True)
-        else:
-            scenarios = ", ".join([network.scenario_name, *network.scenarios])
-            console.print(
-                f"{path}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
-                f"scenarios {scenarios}: no mistakes",
-                soft_wrap=True,
-            )
     if faulty:
         raise typer.Exit(2)
+
+
+def _is_recipe(source: str) -> bool:
+    """Whether a file says how to learn, or a name is that of a recipe."""
+    from cirl_marl.definition import read_toml
+
+    if not source.endswith(".toml"):
+        return source in recipes()
+    return bool({"learner", "run", "match"} & set(read_toml(Path(source))))
+
+
+def _check_recipe(source: str) -> None:
+    from cirl_marl.learners.recipe import load_recipe
+
+    recipe = load_recipe(source)
+    algorithms = ", ".join(dict.fromkeys(learner.algorithm for _, learner in recipe.learners()))
+    say(f"{source}: recipe of {algorithms}, {recipe.run.steps:,} steps in {recipe.run.envs} copies: no mistakes")
+
+
+def _check_network(source: str) -> None:
+    from cirl_marl.remarks import remarks
+
+    network = load_network(source)
+    say(
+        f"{source}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
+        f"scenarios {', '.join([network.scenario_name, *network.scenarios])}: no mistakes"
+    )
+    for each in (network, *network.scenarios.values()):
+        for remark in remarks(each):
+            say(f"{source}: remark on scenario '{each.scenario_name}': {remark}")
 
 
 @app.command()
@@ -111,8 +143,19 @@ def simulate(
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{found.name}_{control}"
     time = interval_ends(found)
+    env.reset(seed=seed)  # to where the episode began
     _write_csv(folder / f"{name}.csv", env, time, run)
-    save_trajectory(folder / f"{name}.png", found, time, run.stock.T, run.flow.T, run.circularity[0], load=run.load.T)
+    save_trajectory(
+        folder / f"{name}.png",
+        found,
+        time,
+        run.stock.T,
+        run.flow.T,
+        run.circularity[0],
+        load=run.load.T,
+        service=run.service[0] if found.services else None,
+        title=f"{found.title or found.name}, {control} control",
+    )
     _say_figures(run, found)
     console.print(f"wrote {folder / name}.csv and {folder / name}.png")
 
@@ -122,9 +165,11 @@ def plan(
     source: Annotated[
         str, typer.Argument(metavar="RUN | NETWORK", help="Training run; or with --control a network, as elsewhere.")
     ],
-    out: Annotated[Path, typer.Option(help="CSV file to write.")],
     control: Annotated[
         str | None, typer.Option(help=f"Who acts in a network: {', '.join(CONTROLLERS)}; a run acts by its policies.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="CSV file to write; default: plan_NETWORK_CONTROL.csv or plan_RUN.csv here.")
     ] = None,
     scenario: Scenario = None,
     seed: Annotated[
@@ -140,17 +185,20 @@ def plan(
     from cirl_marl.controllers.optimum import Optimum
     from cirl_marl.schedule import schedule
 
-    if out.suffix != ".csv" or not out.parent.is_dir():
-        raise CirlError(f"--out {out}: needs the name of a .csv file in a folder that exists")
+    if out is not None and out.suffix != ".csv":
+        raise CirlError(f"--out {out}: needs the name of a .csv file")
     env, controller = _actor(source, control, scenario, min_service)
+    who = f"{env.network.name}_{control}" if control is not None else Path(source).resolve().name
+    path = Path(f"plan_{who}.csv") if out is None else out
     with bar("planning") as progress:
         watched = Watched(controller, progress)
         found = schedule(env, watched, seed=seed, progress=watched.acted)
-    found.write(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    found.write(path)
     _say_figures(found.rollout, env.network)
     if isinstance(controller, Optimum) and controller.note:
         say(controller.note)
-    say(f"wrote {out}")
+    say(f"wrote {path}")
 
 
 def _actor(
@@ -193,6 +241,7 @@ def _held(control: str, settings: list[str]) -> dict[str, float]:
 
 
 def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> None:
+    """Write the state in which ``env`` is, from which ``run`` began, and a row for the end of each interval."""
     from cirl_marl.learners.run import write_atomically
 
     network, physics = env.network, env.dynamics.inner
@@ -201,11 +250,15 @@ def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> No
     header += [f"flow of {arc.id} ({network.mass_unit}/{network.time_unit})" for arc in network.arcs]
     header += [f"mass on {line.id} ({network.mass_unit})" for line in env.dynamics.batches.lines]
     header += [physics.names[row] for row in physics.visible]
+    start = env.physical
+    held = [*start.stock[: len(network.nodes), 0].tolist(), *[""] * len(network.arcs)]
+    held += [*env.dynamics.batches.loads(start.stock)[:, 0].tolist(), *start.inner[physics.visible, 0].tolist()]
 
     def write(target: Path) -> None:
         with target.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(header)
+            writer.writerow([0.0, "", "", *held])
             columns = (time, run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
             writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from cirl_marl.cli.common import Episodes, RunPath, Scenario, Seed, app, console, say, shares, training_bar
+from cirl_marl.elements import OBSERVE, REWARDS
 from cirl_marl.errors import CirlError
 
 
@@ -20,8 +21,10 @@ def train(
     envs: Annotated[int | None, typer.Option(min=1, help="Copies of the environment.")] = None,
     seed: Seed = 0,
     scenario: Scenario = None,
-    reward: Annotated[str | None, typer.Option(help="local, circularity, mixed, difference or local_sum.")] = None,
-    observe: Annotated[str | None, typer.Option(help="local, neighbours or full.")] = None,
+    reward: Annotated[str | None, typer.Option(help=f"{', '.join(REWARDS)}; default: the recipe's.")] = None,
+    observe: Annotated[
+        str | None, typer.Option(help=f"{', '.join(OBSERVE)}; default: the recipe's, else the definition's.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Run directory; default: runs/NETWORK-RECIPE-seedN.")] = None,
     resume: Annotated[Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run.")] = None,
     episodes: Episodes = 64,
@@ -131,4 +134,7 @@ def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:
     console.print(evaluation_table(figures))
     for path in draw_run(run, rollouts, env):
         say(f"picture: {path}")
+    if not run.metrics()["env_steps"]:
+        needed = run.config.envs * env.network.episode.horizon
+        say(f"no learning curves, as no episode ended: {run.config.envs} copies need {needed:,} steps")
     say(f"run: {directory}  (figures in evaluation.json; gap to the bound and more: cirl evaluate {directory})")

@@ -12,7 +12,6 @@ from cirl_marl.compartments.model import (
     ContinuousModel,
     DiscreteTimeModel,
     OwnStepModel,
-    PaperScenario,
     RewardState,
 )
 from cirl_marl.errors import CirlError, unknown
@@ -22,7 +21,6 @@ __all__ = [
     "ContinuousModel",
     "DiscreteTimeModel",
     "OwnStepModel",
-    "PaperScenario",
     "RewardState",
     "model_class",
     "models",

@@ -35,7 +35,6 @@ class DeliveryTruck(TransportTruck):
     kind: ClassVar[str] = "delivery_truck"
     state_names: ClassVar[tuple[str, ...]] = ("position_m", "speed_m_s", "destination_m")
     reward_state: ClassVar[RewardState] = "after"
-    paper: ClassVar[None] = None  # type: ignore[assignment]
     context_names: ClassVar[tuple[str, ...]] = ("load_kg",)
 
     load_kg: float = 0.0

@@ -8,7 +8,6 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from cirl_marl.compartments.model import (
-    PaperScenario,
     RewardState,
     check_form,
     check_not_negative,
@@ -19,22 +18,6 @@ from cirl_marl.rowsum import Floats
 
 KELVIN = 273.15
 
-PAPER = PaperScenario(
-    initial_state=(0.0, 0.0, 20.0, 0.0, 0.0, 20.0),
-    input_low=(-1e6,),
-    input_high=(1e6,),
-    horizon=100,
-    inferred_initial=((0.0, 0.0), (0.0, 0.0), (20.0, 20.0), (0.0, 0.0), (0.0, 0.0), (900.0, 1100.0)),
-    # float32 of 20·dt, 1·dt, 20 + 0.84·dt, 4·dt, 3·dt less the same in float64; the last state was float64 throughout
-    reference_start=(
-        float(np.float32(1e-3)) - 1e-3,
-        float(np.float32(5e-5)) - 5e-5,
-        20.0 + (float(np.float32(20.000042)) - 20.000042),
-        float(np.float32(2e-4)) - 2e-4,
-        float(np.float32(1.5e-4)) - 1.5e-4,
-        20.0,
-    ),
-)
 """Incinerator: one step is 5·10⁻⁵ min. Horizon 100 and T_g(0) ~ U[900, 1100] °C are inferred: from the released 20 °C a
 step costs 9.6·10⁵, while the paper's whole episodes cost 3.2·10⁵ to 3.8·10⁵."""
 
@@ -131,7 +114,6 @@ class Incinerator:
     input_names: ClassVar[tuple[str, ...]] = ("heat_taken_kj_min",)
     time_unit: ClassVar[str] = "min"
     reward_state: ClassVar[RewardState] = "after"
-    paper: ClassVar[PaperScenario] = PAPER
 
     form: Literal["published", "energy_balance", "sound"] = "sound"
     feed_kg_min: float = 100.0

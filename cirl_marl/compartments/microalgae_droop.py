@@ -10,19 +10,10 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from cirl_marl.compartments.light import light_response
-from cirl_marl.compartments.model import PaperScenario, RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.compartments.model import RewardState, check_form, check_not_negative, check_positive
 from cirl_marl.compartments.nutrient import draw_down, substeps
 from cirl_marl.rowsum import Floats
 
-PAPER = PaperScenario(
-    initial_state=(26.0, 2.82, 0.0),
-    input_low=(0.0,),
-    input_high=(150.0,),
-    horizon=200,
-    inferred_initial=((26.0, 26.0), (2.82, 2.82), (0.0, 5.0)),
-    # S: solves S + dt(45 − 0.45 S − 26·9.4·S/(S + 0.1)) = float32(0.00225), the published S after one step
-    reference_start=(26.0, float(np.float32(2.82)), -1.1034407672264982e-10),
-)
 """CO2MicroalgaeDroop: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred (mean return 454; the paper's end at 446
 to 473). The light changes the return by no more than 0.1 %."""
 
@@ -58,7 +49,6 @@ class MicroalgaeDroop:
     input_names: ClassVar[tuple[str, ...]] = ("light_umol_m2_s",)
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
-    paper: ClassVar[PaperScenario] = PAPER
 
     form: Literal["published", "sound"] = "sound"
     growth_per_day: float = 1.7

@@ -10,18 +10,10 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from cirl_marl.compartments.light import light_response
-from cirl_marl.compartments.model import PaperScenario, RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.compartments.model import RewardState, check_form, check_not_negative, check_positive
 from cirl_marl.compartments.nutrient import draw_down, substeps
 from cirl_marl.rowsum import Floats
 
-PAPER = PaperScenario(
-    initial_state=(26.0, 0.0),
-    input_low=(0.0,),
-    input_high=(150.0,),
-    horizon=200,
-    inferred_initial=((26.0, 26.0), (1.0, 5.0)),
-    reference_start=(26.0, 0.0),
-)
 """CO2MicroalgaeMonod: one step is 5·10⁻⁵ d. S(0) ~ U[1, 5] µmol/L is inferred: from S = 0 constant darkness, all but
 the best there is, returns 103.4, while the paper reports up to 143.1. At S = 1 darkness returns 143.8, I = 75 114.7 and
 I = 150 95.3, more S at most 0.2 more: the paper's best end, its untrained policies, its DDPG stuck at full light."""
@@ -59,7 +51,6 @@ class MicroalgaeMonod:
     input_names: ClassVar[tuple[str, ...]] = ("light_umol_m2_s",)
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "after"
-    paper: ClassVar[PaperScenario] = PAPER
 
     form: Literal["published", "sound"] = "sound"
     growth_per_day: float = 1.2

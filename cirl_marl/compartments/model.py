@@ -1,4 +1,4 @@
-"""What every compartment model offers, and what is known of a model's environment in the paper.
+"""What every compartment model offers.
 
 A model is frozen parameters and pure functions of arrays that are compartment-major: states (k, B), inputs (c, B),
 results (k, B) or (B,), in float64, contiguous along the batch. Nothing loops over the batch, and every operation is
@@ -8,7 +8,7 @@ elementwise along it, so that a column's bits do not depend on the batch it is i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
@@ -62,8 +62,9 @@ class CompartmentModel(Protocol):
 class ContinuousModel(CompartmentModel, Protocol):
     """ż = f(z, u), integrated by the solver of the network."""
 
-    def derivative(self, state: Floats, inputs: Floats) -> Floats:
-        """Return dz/dt, shape (k, B)."""
+    @property
+    def derivative(self) -> Callable[..., Floats]:
+        """``derivative(state, inputs)`` is dz/dt, shape (k, B); by keyword it is told what ``context_names`` lists."""
         ...
 
 
@@ -92,40 +93,6 @@ class DiscreteTimeModel(CompartmentModel, Protocol):
     def advance(self, state: Floats, inputs: Floats, interval: float) -> Floats:
         """Return the state one step later, shape (k, B)."""
         ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PaperScenario:
-    """One of the paper's environments: explicit Euler steps ``dt`` of the ``published`` form.
-
-    The published classes reset to ``np.float32`` numbers and then add float64 ones, so under NumPy 2 (NEP 50) the first
-    step of the reference trajectories is partly rounded to float32, and every later one is not.
-    ``reference_start`` is the start from which the same first step *in float64* ends where the published one did; it
-    equals ``initial_state`` to the resolution of float32.
-
-    Attributes:
-        initial_state: state after the published ``reset()``. [published]
-        input_low: input at the normalised action −1. [published]
-        input_high: input at the normalised action +1; linear between, actions clipped. [published]
-        dt: Euler step and control interval, in the model's time unit. [published]
-        horizon: steps of an episode. [inferred from the published returns; the published classes never end an episode]
-        inferred_initial: (low, high) per state, drawn uniformly; the start that the paper's *returns* need. [inferred]
-        reference_start: see above. [derived]
-    """
-
-    initial_state: tuple[float, ...]
-    input_low: tuple[float, ...]
-    input_high: tuple[float, ...]
-    horizon: int
-    inferred_initial: tuple[tuple[float, float], ...]
-    reference_start: tuple[float, ...]
-    dt: float = 5e-5
-
-    def inputs(self, action: Floats) -> Floats:
-        """Return the physical inputs of normalised actions in [−1, 1], shape (c, B)."""
-        low, high = (np.array(bound)[:, None] for bound in (self.input_low, self.input_high))
-        inputs: Floats = (np.clip(action, -1.0, 1.0) + 1.0) / 2.0 * (high - low) + low
-        return inputs
 
 
 def check_step(kind: str, interval: float, own: float) -> None:

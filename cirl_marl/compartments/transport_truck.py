@@ -7,17 +7,9 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from cirl_marl.compartments.model import PaperScenario, RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.compartments.model import RewardState, check_form, check_not_negative, check_positive
 from cirl_marl.rowsum import Floats
 
-PAPER = PaperScenario(
-    initial_state=(0.0, 4.0),
-    input_low=(-1e6,),
-    input_high=(1e6,),
-    horizon=200,
-    inferred_initial=((0.0, 500.0), (4.0, 4.0)),
-    reference_start=(float(np.float32(2e-4)) - 2e-4, 4.0),
-)
 """TransportTruck: one step is 5·10⁻⁵ s, an episode 0.01 s. x(0) ~ U[0, 500] m is inferred: from 0 the published
 returns of −1.2·10⁸ are out of reach (the best is −1.99992·10⁸)."""
 
@@ -54,7 +46,6 @@ class TransportTruck:
     input_names: ClassVar[tuple[str, ...]] = ("force_n",)
     time_unit: ClassVar[str] = "s"
     reward_state: ClassVar[RewardState] = "after"
-    paper: ClassVar[PaperScenario] = PAPER
 
     form: Literal["published", "sound"] = "sound"
     truck_kg: float = 3000.0

@@ -38,7 +38,7 @@ class TroposphereTemperature:
 
     kind: ClassVar[str] = "troposphere_temperature"
     state_names: ClassVar[tuple[str, ...]] = ("temperature_k",)
-    input_names: ClassVar[tuple[str, ...]] = ("co2_t",)
+    input_names: ClassVar[tuple[str, ...]] = ()
     context_names: ClassVar[tuple[str, ...]] = ("stock_kg",)
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "after"
@@ -72,15 +72,15 @@ class TroposphereTemperature:
         effective: Floats = self.emissivity - self.greenhouse_m3_mg * (co2_t / self.volume_km3)
         return effective
 
-    def derivative(self, state: Floats, inputs: Floats, *, stock_kg: Floats | None = None) -> Floats:
+    def derivative(self, state: Floats, inputs: Floats, *, stock_kg: Floats) -> Floats:
         """Return Ṫ, K/d, shape (1, B).
 
         Args:
             state: (T,), shape (1, B).
-            inputs: (x₁,) in tonnes, shape (1, B); not used if the stock is given.
-            stock_kg: x₁ as the network holds it, kg, shape (B,).
+            inputs: none, shape (0, B).
+            stock_kg: x₁, the carbon dioxide that the network holds there, kg, shape (B,).
         """
-        co2_t = inputs if stock_kg is None else stock_kg[None] / 1000.0
+        co2_t = stock_kg[None] / 1000.0
         absorbed = self.solar_w_m2 * (1.0 - self.albedo)
         emitted = self.effective_emissivity(co2_t) * self.stefan_boltzmann_w_m2_k4 * np.square(np.square(state))
         rate: Floats = SECONDS_PER_DAY / self.heat_capacity_j_m2_k * (absorbed - emitted)

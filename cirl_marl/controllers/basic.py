@@ -51,9 +51,11 @@ class Constant:
             agent: np.tile(np.full_like(neutral, self._wanted.get(agent, neutral)), (env.num_envs, 1))
             for agent, neutral in env.neutral_action.items()
         }
+        for action in self._actions.values():
+            action.flags.writeable = False
 
     def act(self, observations: Arrays) -> Arrays:
-        """Return the fixed actions."""
+        """Return the fixed actions; their arrays are read-only."""
         return self._actions
 
 

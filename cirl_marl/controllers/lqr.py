@@ -226,6 +226,7 @@ class LQR:
         stocks, self._feed = system.equilibrium()
         self.system, self.gain, self._env, self._goal = system, gain, env, C @ stocks
         self._rows = [env.network.node_index[node] for node in outputs]
+        self._controls = [c for a in system.inputs if (c := env.network.compartments[a].control) is not None]
         self._idle = {a: np.tile(n, (env.num_envs, 1)) for a, n in env.neutral_action.items() if a not in agents}
 
     def demand(self) -> Floats:
@@ -235,9 +236,8 @@ class LQR:
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the actions that set the demanded flows, clipped to the bounds of the controls."""
-        low, high = self.system.bounds[:, :, None]
-        actions = np.clip((2.0 * self.demand() - high - low) / (high - low), -1.0, 1.0)
-        return self._idle | {agent: actions[i, :, None] for i, agent in enumerate(self.system.inputs)}
+        demand = zip(self.system.inputs, self._controls, self.demand(), strict=True)
+        return self._idle | {agent: control.action(flow)[:, None] for agent, control, flow in demand}
 
 
 def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:

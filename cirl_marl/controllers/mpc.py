@@ -38,12 +38,14 @@ class _Plan:
     """What is planned for one copy.
 
     Attributes:
+        episode: of the copy, by its number.
         intervals: of the episode.
         problem: the program.
         solution: its optimum.
         actions: of the first intervals, shape (decisions, entries).
     """
 
+    episode: int
     intervals: range
     problem: Program
     solution: Solution
@@ -160,46 +162,45 @@ class MPC:
         actions = []
         for copy, step in enumerate(env.physical.step.tolist()):
             plan = self._plans[copy]
-            if not 0 <= step - plan.intervals.start < len(plan.actions):
+            if plan.episode != env.episodes[copy]:
+                plan = self._plans[copy] = self._next(copy, None)
+            elif not 0 <= step - plan.intervals.start < len(plan.actions):
                 plan = self._plans[copy] = self._next(copy, plan)
             actions.append(plan.actions[step - plan.intervals.start])
-        stacked = np.stack(actions)
-        ends = np.cumsum([0, *(len(neutral) for neutral in env.neutral_action.values())])
-        return {agent: stacked[:, ends[i] : ends[i + 1]] for i, agent in enumerate(env.neutral_action)}
+        return env.unstack(np.stack(actions, axis=1))
 
     def _next(self, copy: int, last: _Plan | None) -> _Plan:
-        """Plan for one copy from its current stocks, after its ``last`` plan."""
+        """Plan for one copy from its current stocks, after the ``last`` plan of its episode."""
         state, steps = self._env.physical, self._env.network.episode.horizon
-        step, stock = int(state.step[copy]), state.stock[: len(self._env.network.nodes), copy]
+        step = int(state.step[copy])
         if step >= steps:
             raise ControlError(f"MPC: the episode is over after {steps} steps: call reset()")
         rest = range(step, steps)
         window = rest if self._horizon is None else rest[: self._horizon]
         missing = None if self._demanded is None else self._demanded * steps - float(state.service[copy])
-        if last is not None and step < last.intervals.start:  # the next episode has begun
-            last = None
         if len(window) == len(rest):
-            return self._plan(stock, window, missing, last.basis(window) if last else None)
+            return self._plan(copy, window, missing, last.basis(window) if last else None)
         if last is None:
-            self._outlooks[copy] = self._plan(stock, rest, missing, None)
+            self._outlooks[copy] = self._plan(copy, rest, missing, None)
         outlook = self._outlooks[copy]
         after = window.stop - outlook.intervals.start
         if missing is not None:
             missing -= float(outlook.levels()[after:].sum())
-        return self._plan(stock, window, missing, last.basis(window) if last else None, outlook.prices()[after - 1])
+        return self._plan(copy, window, missing, last.basis(window) if last else None, outlook.prices()[after - 1])
 
     def _plan(
-        self, stock: Floats, intervals: range, missing: float | None, basis: Basis | None, prices: Floats | None = None
+        self, copy: int, intervals: range, missing: float | None, basis: Basis | None, prices: Floats | None = None
     ) -> _Plan:
         """Plan some intervals.
 
         Args:
-            stock: at the start, shape (nodes,), mass.
+            copy: whose stocks they start from.
             intervals: to be planned.
             missing: least sum of the service levels of all intervals; None if nothing is demanded.
             basis: from which the solver starts.
             prices: of the stocks at the end, shape (nodes,), in the objective of the episode per mass.
         """
+        stock = self._env.physical.stock[: len(self._env.network.nodes), copy]
         demanded = None if missing is None else max(0.0, missing / len(intervals))
         what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
@@ -215,7 +216,7 @@ class MPC:
         planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
         base = self._admissible.base[intervals.start : intervals.stop][: self._replan]
         actions = normalised_actions(replace(self._admissible, base=base), problem.layout, planned)
-        return _Plan(intervals, problem, solution, actions)
+        return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions)
 
     def _priced(
         self, programs: Programs, stock: Floats, intervals: range, demanded: float | None, prices: Floats | None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Constant
-from cirl_marl.elements import ControlKind
+from cirl_marl.elements import Control, ControlKind
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
 from cirl_marl.vector_env import VectorEnv
@@ -122,7 +122,7 @@ class Scripted:
         """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral."""
         self._constant = Constant(constant)
         self._held = frozenset(constant or ())
-        self._scripts: dict[str, tuple[Script, dict[str, int], float, float]] = {}
+        self._scripts: dict[str, tuple[Script, dict[str, int], Control]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Find the script of each agent and what it reads.
@@ -142,7 +142,7 @@ class Scripted:
             columns = {
                 name.removeprefix(own): i for i, name in enumerate(env.layout.names[agent]) if name.startswith(own)
             }
-            self._scripts[agent] = script, columns, (control.high + control.low) / 2, (control.high - control.low) / 2
+            self._scripts[agent] = script, columns, control
 
     @property
     def scripted(self) -> tuple[str, ...]:
@@ -156,11 +156,11 @@ class Scripted:
             ControlError: if an agent does not see a state that its script needs.
         """
         actions = dict(self._constant.act(observations))
-        for agent, (script, columns, middle, half) in self._scripts.items():
+        for agent, (script, columns, control) in self._scripts.items():
             seen = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}
             try:
                 inputs = script(seen)
             except KeyError as missing:
                 raise ControlError(f"scripted control of '{agent}' needs to see its state {missing}") from None
-            actions[agent] = np.clip((inputs - middle) / half, -1.0, 1.0).T
+            actions[agent] = control.action(inputs).T
         return actions

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from cirl_marl.catalogue import load_network
-from cirl_marl.errors import RunError
+from cirl_marl.errors import RunError, unknown
 from cirl_marl.learners.recipe import Group, Recipe
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
@@ -125,8 +125,9 @@ class RunDirectory:
         Raises:
             RunError: if the directory holds no complete run description.
         """
+        plain = self._json("config.json")
         try:
-            return RunConfig.from_dict(self._json("config.json"))
+            return RunConfig.from_dict(plain)
         except (KeyError, TypeError, ValueError) as error:
             raise RunError(f"{self.path / 'config.json'}: is not a run configuration: {error!r}") from error
 
@@ -217,7 +218,8 @@ class RunDirectory:
     def _json(self, name: str) -> dict[str, Any]:
         path = self.path / name
         if not self.path.is_dir():
-            raise RunError(f"{self.path}: no such run directory")
+            beside = self.path.parent.glob("*/config.json")
+            raise RunError(unknown("run directory", self.path, sorted(str(config.parent) for config in beside)))
         if not path.is_file():
             raise RunError(f"{path}: missing; {self.path} is not a run directory, or it was not written to the end")
         try:

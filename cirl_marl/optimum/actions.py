@@ -51,10 +51,8 @@ def normalised_actions(admissible: Admissible, layout: Layout, planned: Floats) 
 
 def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
     network = admissible.network
-    laws = FlowLaws(network)
-    actuators = Actuators(laws, admissible.agents or None, 1)
+    actuators = Actuators(FlowLaws(network), admissible.agents or None, 1)
     actions = np.zeros((len(valve), len(actuators.acting)))
-    low, high = laws.control_low[actuators.acting], laws.control_high[actuators.acting]
     for agent, entries in actuators.entries.items():
         control = network.compartments[agent].control
         assert control is not None
@@ -66,9 +64,8 @@ def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
             node = network.node_index[agent]
             sets = next(k for k in np.flatnonzero(network.donors == node) if network.arcs[k].law is Law.CONTROLLED)
             values = own[:, sets]
-        actions[:, entries] = values[:, None]
-    normalised: Floats = np.clip((actions - (high + low) / 2) / ((high - low) / 2), -1.0, 1.0)
-    return normalised
+        actions[:, entries] = control.action(values)[:, None]
+    return actions
 
 
 def _ratio(amount: Floats, unit: Floats, otherwise: Floats) -> Floats:

@@ -58,6 +58,17 @@ class Bound:
     certificate: Certificate
     basis: Basis
 
+    def __str__(self) -> str:
+        """Say what is proved, in one line."""
+        mass, demand = self.network.mass_unit, f", service level at least {self.min_service:g}"
+        what = f"λ̄ ≤ {self.objective:.6g} {mass}{'' if self.min_service is None else demand}"
+        if self.service_weight is not None:
+            what = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
+        return (
+            f"bound of {self.network.name} over {self.network.episode.horizon} steps: {what}; "
+            f"its plan promises λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
+        )
+
     def verify(self) -> Verification:
         """Compute the bound again from the program's matrices and the multipliers, without the solver."""
         return verified(self.problem, self.certificate, self.solution)

@@ -59,11 +59,9 @@ class Plan:
             raise ControlError(f"plan: {len(self._plans)} plans for {env.num_envs} copies; give one, or one for each")
         for copy, start in enumerate(starting_states(env)):
             self._check(self._plans[copy % len(self._plans)], env, start, copy)
-        actions = np.stack([plan.actions for plan in self._plans], axis=1)
-        self._actions = np.broadcast_to(actions, (len(actions), env.num_envs, actions.shape[2]))
-        ends = np.cumsum([0, *(len(neutral) for neutral in env.neutral_action.values())])
-        self._entries = {a: slice(ends[i], ends[i + 1]) for i, a in enumerate(env.neutral_action)}
-        self._step = 0
+        actions = np.stack([plan.actions for plan in self._plans], axis=2)
+        self._actions = np.broadcast_to(actions, (*actions.shape[:2], env.num_envs))
+        self._env, self._step = env, 0
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the actions of the next interval.
@@ -75,7 +73,7 @@ class Plan:
             raise ControlError(f"plan: it has {len(self._actions)} steps and all are done; start() begins again")
         actions = self._actions[self._step]
         self._step += 1
-        return {agent: actions[:, entries] for agent, entries in self._entries.items()}
+        return dict(self._env.unstack(actions))
 
     def _check(self, plan: Planned, env: VectorEnv, start: Floats, copy: int) -> None:
         ours, theirs = plan.network, env.network

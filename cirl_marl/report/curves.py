@@ -54,10 +54,10 @@ def save_circularity(
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
     names = list(dict.fromkeys([*runs, *services]))
-    for axes, curves in ((above, runs), (below, services)):
+    for axes, curves, top in ((above, runs, math.inf), (below, services, 1.0)):
         for name, values in curves.items():
-            _draw_mean(axes, time, _matching(name, values, time), name, names.index(name))
-    dressed(above, title="Circularity", ylabel=f"λ / {network.mass_unit}")
+            _draw_mean(axes, time, _matching(name, values, time), name, names.index(name), top=top)
+    dressed(above, title="Circularity: means and their 95 % intervals", ylabel=f"λ / {network.mass_unit}")
     dressed(below, title="Service level", ylabel="service level")
     below.set_ylim(-0.03, 1.06)
     _set_time(below, time, network)
@@ -97,6 +97,8 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
         axes.locator_params(nbins=4)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
+    for axes in panels[: len(shown)][-columns:]:
+        axes.tick_params(labelbottom=True)  # nothing may lie below the last panel of a column
     figure.supxlabel("environment steps", fontsize=9, color=MUTED)
     figure.supylabel("episode return", fontsize=9, color=MUTED)
     if len(returns) > len(shown):
@@ -113,8 +115,10 @@ def save_trajectory(
     circularity: Floats,
     *,
     load: Floats | None = None,
+    service: Floats | None = None,
+    title: str = "",
 ) -> Path:
-    """Save stocks, flows and λ over time as a PNG.
+    """Save stocks, flows, λ and service level over time as a PNG.
 
     Of more than 10 compartments in a panel, those that change most are shown.
 
@@ -126,6 +130,8 @@ def save_trajectory(
         flow: flows, shape (arcs, steps), mass/time.
         circularity: λ, shape (steps,), mass.
         load: masses on batch arcs, shape (batch arcs, steps), mass; None leaves them out.
+        service: service level, shape (steps,); None leaves it out.
+        title: heading.
 
     Returns:
         The path.
@@ -142,13 +148,20 @@ def save_trajectory(
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {arc}" for arc in on_the_way]
         stock = np.concatenate([stock, _shaped("load", load, (len(on_the_way), *steps))])
-    figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
-    above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.25, 0.8))
+    heights = (1.25, 1.25, 0.8) if service is None else (1.25, 1.25, 0.8, 0.5)
+    figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
+    figure.suptitle(title, fontsize=11, fontweight="bold")
+    above, middle, below, *rest = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     _draw_largest(above, time, stock, held, "Stocks", mass)
     _draw_largest(middle, time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}")
     below.plot(time, circularity, color=SERIES[0], linewidth=1.8, marker=_dots(time))
     dressed(below, title="Circularity", ylabel=f"λ / {mass}")
-    _set_time(below, time, network)
+    for last in rest:
+        level = _shaped("service", np.asarray(service), steps)
+        last.plot(time, level, color=SERIES[0], linewidth=1.8, marker=_dots(time))
+        dressed(last, title="Service level", ylabel="service level")
+        last.set_ylim(-0.03, 1.06)
+    _set_time([above, middle, below, *rest][-1], time, network)
     return save(figure, path)
 
 
@@ -178,7 +191,7 @@ def _set_time(axes: Axes, time: Floats, network: Network) -> None:
         axes.set_xlim(float(np.min(time)), float(np.max(time)))
 
 
-def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int) -> None:
+def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, *, top: float) -> None:
     episodes = np.atleast_2d(values)
     count = len(episodes)
     if count == 0:
@@ -188,7 +201,7 @@ def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int) 
     axes.plot(time, mean, color=colour, linestyle=dash, linewidth=1.8, label=spoken(name), marker=_dots(time))
     if count > 1:
         error = episodes.std(axis=0, ddof=1) / math.sqrt(count) * float(stdtrit(count - 1, 0.975))
-        axes.fill_between(time, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
+        axes.fill_between(time, mean - error, np.minimum(mean + error, top), color=colour, alpha=0.2, linewidth=0)
 
 
 def _draw_returns(axes: Axes, steps: Floats, values: Floats) -> None:

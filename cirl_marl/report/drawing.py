@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,7 +52,8 @@ def draw_network(
     """Draw the digraph with its stocks and flows.
 
     A box is filled to stock / (stock + scale), half at the node's reference stock. The width of an arrow is
-    proportional to its flow. Arrows that lower the circularity are vermilion, those that raise it green.
+    proportional to its flow. Arrows that lower the circularity are vermilion, those that raise it green; those of
+    parallel arcs bear their names.
     Networks of more than 60 nodes or 200 arcs are drawn without labels.
 
     Args:
@@ -146,10 +148,13 @@ def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, sha
         autolim=False,
     )
     halo = [withStroke(linewidth=0.25 * em, foreground="white")]
-    for (x, y), value, colour in zip(routes.labels, flow, colours, strict=True):
+    ends = Counter((arc.donor, arc.recipient) for arc in network.arcs)
+    for arc, (x, y), value, colour in zip(network.arcs, routes.labels, flow, colours, strict=True):
         ink = MUTED if colour is NEUTRAL else colour
-        axes.text(x, y, number(value), color=ink, fontsize=0.95 * em, ha="center", va="center", zorder=5,
-                  path_effects=halo)  # fmt: skip
+        parallel = ends[arc.donor, arc.recipient] > 1
+        label = f"{spoken(arc.id)}\n{number(value)}" if parallel else number(value)
+        axes.text(x, y, label, color=ink, fontsize=(0.8 if parallel else 0.95) * em, ha="center", va="center",
+                  zorder=5, path_effects=halo)  # fmt: skip
 
 
 def _arrow(curve: Floats, width: float) -> Floats:

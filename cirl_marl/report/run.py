@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.comparison import compare
-from cirl_marl.errors import RunError
 from cirl_marl.evaluate import Rollout, interval_ends, summary
 from cirl_marl.learners.run import RunDirectory, write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
@@ -62,7 +61,10 @@ def evaluate_run(
 
 
 def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv) -> list[Path]:
-    """Draw the network before and after, λ(t) trained against neutral and random, and the learning curves."""
+    """Draw the network before and after, λ(t) trained against neutral and random, and the learning curves.
+
+    There are no learning curves if no episode ended while training.
+    """
     folder = run.path / "pictures"
     folder.mkdir(exist_ok=True)
     network = env.network
@@ -73,7 +75,7 @@ def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv)
         network,
         (before.final_stock, before.mean_flow),
         (after.final_stock, after.mean_flow),
-        ("neutral", "trained"),
+        ("neutral: mean flows, last stocks", "trained: mean flows, last stocks"),
     )
     time = interval_ends(network)
     circularity = folder / "circularity.png"
@@ -84,12 +86,10 @@ def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv)
         {name: run_.circularity for name, run_ in rollouts.items()},
         {name: run_.service for name, run_ in rollouts.items()},
     )
-    drawn = [flows, circularity]
-    try:
-        metrics = run.metrics()
-    except RunError:
-        return drawn  # no episode ended while training, so there is no curve
-    curves = folder / "learning_curves.png"
-    returns = {agent: np.array(metrics.get(f"return:{agent}", [])) for agent in env.agents}
-    save_learning_curves(curves, np.array(metrics.get("env_steps", [])), returns)
-    return [*drawn, curves]
+    curves, metrics = folder / "learning_curves.png", run.metrics()
+    curves.unlink(missing_ok=True)
+    if not metrics["env_steps"]:
+        return [flows, circularity]
+    returns = {agent: np.array(metrics[f"return:{agent}"]) for agent in env.agents}
+    save_learning_curves(curves, np.array(metrics["env_steps"]), returns)
+    return [flows, circularity, curves]

@@ -1,0 +1,62 @@
+"""What a network is refused for when it is built in Python, before anything stands on it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, NetworkError, Node, Objective, Service
+from cirl_marl.compartments.digester import Digester
+from cirl_marl.compartments.digester_published import DigesterPublished
+from cirl_marl.definition import write_network
+
+A, B = Node(id="a", initial=(10.0, 10.0)), Node(id="b")
+LINK = Arc(id="k", donor="a", recipient="b", rate=0.1)
+DELAYED = Arc(id="k", donor="a", recipient="b", law=Law.BATCH, delay=1.0, batches=((0.0, 1.0),))
+ORDER = Arc(id="k", donor="a", recipient="b", law=Law.CONTROLLED)
+BACKWARD = Control(kind=ControlKind.FLOW, low=-5.0, neutral=0.0, high=5.0)
+VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
+OWED = Service(id="s", provider="b", quantity="stock", low=1.0)
+DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"nodes": (replace(A, control=BACKWARD), B), "arcs": (replace(LINK, law=Law.CONTROLLED, rate=0.0),)},
+            "reverse",
+        ),
+        ({"arcs": (replace(LINK, times=(0.0, 5.0), flow=(1.0, 0.0)),)}, "times = .* law 'donor' takes rate"),
+        ({"arcs": (replace(DELAYED, delay=1e-7),)}, "delay 1e-07 is not a whole number"),
+        ({"arcs": (DELAYED,), "episode": Episode(control_interval=0.0)}, "control_interval 0.0 must be positive"),
+        ({"episode": Episode(control_interval=math.nan, solver="rk4", solver_step=1.0)}, "control_interval nan"),
+        ({"episode": Episode(control_interval=math.inf, solver="rk4", solver_step=1.0)}, "control_interval inf"),
+        ({"episode": Episode(solver="rk4", solver_step=math.nan)}, "positive solver_step, got nan"),
+        ({"services": (OWED, OWED)}, "service 's': the id is used twice"),
+        ({"objective": Objective(tracked=("a", "a"))}, "tracked: names 'a' twice"),
+        ({"nodes": (replace(A, id="Mine 1"), B), "arcs": ()}, "compartment 'Mine 1': an id begins with a letter"),
+        ({"nodes": (replace(A, **DIGESTER), B)}, "'digester' needs a control of kind 'input' for dilution_per_day"),
+        ({"nodes": (replace(A, control=VALVE, **DIGESTER), B)}, "needs a control of kind 'input'.*not rate"),
+        ({"arcs": (replace(LINK, law=Law.COMPARTMENT, by="a"),)}, "solver 'exact' knows no"),
+    ],
+)
+def test_networks_that_cannot_be_simulated(changes: dict[str, Any], said: str) -> None:
+    """Each is refused with what is wrong and where."""
+    network = Network(name="two", nodes=(A, B), arcs=(LINK,))
+    with pytest.raises(NetworkError, match=said):
+        replace(network, **changes)
+
+
+def test_models_that_cannot_be_written(tmp_path: Path) -> None:
+    """A parameter that is itself a model is refused; nothing is written."""
+    inputs = Control(kind=ControlKind.INPUT, low=0.3, neutral=0.5, high=0.7)
+    digester = replace(A, model=DigesterPublished(), inner=((1.0, 1.0),) * 6, control=inputs)
+    network = Network(name="one", nodes=(digester,), arcs=(), episode=Episode(solver="rk4", solver_step=1.0))
+    with pytest.raises(NetworkError, match="compartment 'a': parameter 'process' of its model 'digester_published'"):
+        write_network(network, tmp_path / "one.toml")
+    assert not list(tmp_path.iterdir())
