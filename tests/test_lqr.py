@@ -286,7 +286,8 @@ def test_store_without_outflow_of_its_own() -> None:
         ),
         (
             lambda: LinearSystem.of(
-                chain(out=replace(chain().arcs[2], law=Law.EXOGENOUS, flow=(3.0,))), set_points={"a": 10.0, "b": 4.0}
+                chain(out=replace(chain().arcs[2], law=Law.EXOGENOUS, rate=0.0, flow=(3.0,))),
+                set_points={"a": 10.0, "b": 4.0},
             ).equilibrium(),
             "no equilibrium",
         ),

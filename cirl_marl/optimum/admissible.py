@@ -47,7 +47,7 @@ class Admissible:
         """Read the ranges off ``network`` while ``agents`` act and the others are neutral.
 
         Raises:
-            NoCertificate: for inner physics, batches, a solver that is not exact, or flows that may run backwards.
+            NoCertificate: for inner physics, batches, or a solver that is not exact.
             CirlError: for an unknown agent.
         """
         reasons = list(_uncertified(network))
@@ -65,9 +65,6 @@ class Admissible:
             setter = _setter(network, arc)
             if setter is not None:
                 own[:, k] = _range(setter, acting)
-        if (own < 0).any():
-            arc = network.arcs[int((own < 0).any(axis=0).argmax())]
-            raise NoCertificate(f"network '{network.name}': arc '{arc.id}' may run backwards, so no bound is proved")
         return cls(
             network=network,
             agents=acting,
