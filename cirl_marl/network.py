@@ -247,13 +247,22 @@ class Network:
         return circularity
 
     @cached_property
-    def _circularity_parts(self) -> RowSum:
-        """Rows −Δ·σ_rest and −Δ·σ_env."""
+    def circularity_weights(self) -> Floats:
+        """−Δ·σ_rest and −Δ·σ_env, weights in λ of flows not through and through the environment, shape (2, arcs)."""
         continuous = np.array([arc.law is not Law.BATCH for arc in self.arcs], dtype=bool)
-        counted = np.flatnonzero(self.sustainability * continuous)
-        rows = self.environmental[counted].astype(np.intp)
-        weights = -self.objective.reference_interval * self.sustainability[counted]
-        return RowSum(rows, counted, weights, (2, len(self.arcs)))
+        weights = -self.objective.reference_interval * self.sustainability * continuous
+        return _read_only(np.stack([weights * ~self.environmental, weights * self.environmental]))
+
+    @cached_property
+    def _circularity_parts(self) -> RowSum:
+        rows, arcs = np.nonzero(self.circularity_weights)
+        return RowSum(rows, arcs, self.circularity_weights[rows, arcs], (2, len(self.arcs)))
+
+    def metered(self, service: Service) -> Integers:
+        """Return the arcs whose flows add up to what a service of quantity ``flow`` or ``outflow`` measures."""
+        if service.quantity == "outflow":
+            return np.flatnonzero(self.donors == self.node_index[service.provider])
+        return np.array([self.arc_index[service.provider]])
 
     def _role(self, node: str) -> Role:
         return self.nodes[self.node_index[node]].role

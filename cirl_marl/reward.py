@@ -115,8 +115,7 @@ def _measurement(network: Network, layout: ObservationLayout) -> RowSum:
     rows, columns = [], []
     for row, service in enumerate(network.services):
         if service.quantity == "outflow":
-            provider = network.node_index[service.provider]
-            read = [len(network.nodes) + int(k) for k in np.flatnonzero(network.donors == provider)]
+            read = [len(network.nodes) + int(k) for k in network.metered(service)]
         else:
             read = [layout.row(service.provider, service.quantity, service.measure)]
         rows += [row] * len(read)

@@ -173,12 +173,9 @@ def _measures(bound: Bound) -> tuple[Floats, Floats]:
     for s, service in enumerate(network.services):
         if service.quantity == "stock":
             measure[s, network.node_index[service.provider]] = 1.0
-        elif service.quantity == "outflow":
-            measure[s, nodes:] = network.donors == network.node_index[service.provider]
         else:
-            measure[s, nodes + network.arc_index[service.provider]] = 1.0
-    weights = network.objective.reference_interval * network.sustainability * network.environmental
-    return measure, np.concatenate([np.zeros(nodes), weights])
+            measure[s, nodes + network.metered(service)] = 1.0
+    return measure, np.concatenate([np.zeros(nodes), -network.circularity_weights[1]])
 
 
 def _cost(bound: Bound, size: int, level: int, price: float) -> Floats:
@@ -186,11 +183,11 @@ def _cost(bound: Bound, size: int, level: int, price: float) -> Floats:
     network, steps = bound.network, len(bound.actions)
     nodes, services = len(network.nodes), len(network.services)
     cost = np.zeros(size)
-    counted = network.objective.reference_interval * network.sustainability
+    counted = network.circularity_weights.sum(axis=0)
     if network.objective.net_zero == "abs":
-        counted = counted * ~network.environmental
+        counted = network.circularity_weights[0]
         cost[-1] = 1.0 / steps
-    cost[nodes : nodes + len(counted)] = counted / steps
+    cost[nodes : nodes + len(counted)] = -counted / steps
     if bound.service_weight is not None:
         cost /= network.objective.circularity_scale
         cost[level : level + services] = -price / (steps * max(services, 1))

@@ -20,11 +20,10 @@ def measures(layout: Layout) -> Iterator[Row]:
         if service.quantity == "stock":
             measured = [(layout.end(-1) + network.node_index[service.provider], -1.0)]
         else:
-            outflow = service.quantity == "outflow"
-            arcs = [k for k, arc in enumerate(network.arcs) if (arc.donor if outflow else arc.id) == service.provider]
-            measured = [(layout.flow(i) + k, -1.0 / count) for i in layout.moments for k in arcs]
+            arcs = network.metered(service)
+            measured = [(layout.flow(i) + int(k), -1.0 / count) for i in layout.moments for k in arcs]
         yield [(layout.level + s, service.low), *measured]
-    weights = network.objective.reference_interval * network.sustainability * network.environmental
+    weights = -network.circularity_weights[1]
     counted = [(i, int(k)) for i in layout.moments for k in np.flatnonzero(weights)]
     for sign in (1.0, -1.0):
         flows = [(layout.flow(i) + k, sign * float(weights[k]) / count) for i, k in counted]
@@ -35,9 +34,9 @@ def circularity_weights(layout: Layout) -> Floats:
     """Return the weights of the mean of λ over an interval on its variables, shape (size,), mass."""
     network = layout.network
     weights = np.zeros(layout.size)
-    counted = -network.objective.reference_interval * network.sustainability
+    counted = network.circularity_weights.sum(axis=0)
     if network.objective.net_zero == "abs":
-        counted = counted * ~network.environmental
+        counted = network.circularity_weights[0]
         weights[layout.imbalance] = -1.0
     for i in layout.moments:
         weights[layout.flow(i) : layout.valve(i)] = counted / len(layout.moments)
