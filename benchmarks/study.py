@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.document import made_with, write_sections
+from cirl_marl.catalogue import load_network
 from cirl_marl.comparison import Comparison, Row, compare, yardstick
 from cirl_marl.comparison.compare import starting_stocks
 from cirl_marl.comparison.files import write_comparison
@@ -39,7 +40,7 @@ from cirl_marl.statistics import Aggregate, interquartile_mean, over_episodes, o
 from cirl_marl.vector_env import VectorEnv
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
-PICTURES = DOCUMENT.parent / "pictures"
+SEEDS, EPISODES = 5, 16
 RESULTS = Path(__file__).parent / "results" / "study"
 console = Console(width=None if sys.stdout.isatty() else 140)
 
@@ -100,12 +101,14 @@ class Job:
     directory: Path
 
     def is_done(self) -> bool:
-        """Return whether a complete run is there, of as many steps and by the recipe as it is now."""
+        """Return whether a complete run is there, of as many steps, by the recipe and in the network of now."""
         if not self._note.is_file():
             return False
-        config, now = RunDirectory(self.directory).config, load_recipe(self.recipe)
-        found = (config.steps, config.recipe.learner, config.recipe.environment)
-        return found == (self.steps, now.learner, now.environment)
+        run, now = RunDirectory(self.directory), load_recipe(self.recipe)
+        config = run.config
+        found = (config.steps, config.envs, config.options, config.recipe.learner, config.recipe.match)
+        wanted = (self.steps, now.run.envs, now.environment | dict(self.options), now.learner, now.match)
+        return found == wanted and run.network() == load_network(self.network)
 
     @property
     def _note(self) -> Path:
@@ -135,15 +138,27 @@ def main(
     out: Annotated[Path, typer.Option(help="Where the training runs are kept.")] = Path("runs/study"),
     only: Annotated[list[str] | None, typer.Option(help="Networks; default: all of the study.")] = None,
     recipes: Annotated[list[str] | None, typer.Option("--recipe", help="Recipes; default: all of the study.")] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Training seeds 0, 1, …")] = 5,
+    seeds: Annotated[int, typer.Option(min=1, help="Training seeds 0, 1, …")] = SEEDS,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of every run, for a trial.")] = None,
-    episodes: Annotated[int, typer.Option(min=2, help="Evaluation episodes of each run.")] = 16,
+    episodes: Annotated[int, typer.Option(min=2, help="Evaluation episodes of each run.")] = EPISODES,
     jobs: Annotated[int, typer.Option(min=1, help="Runs at a time.")] = 2,
     table: Annotated[bool, typer.Option("--table", help="Train nothing: only what is complete is compared.")] = False,
-    document: Annotated[Path, typer.Option(help="Whose tables are written.")] = DOCUMENT,
+    write: Annotated[
+        Path | None, typer.Option(help="Folder of the document; default: docs, of a trial OUT/trial.")
+    ] = None,
 ) -> None:
-    """Train what is missing, compare, and write the tables and pictures of the document."""
+    """Train what is missing, compare, and write the tables and pictures of the document.
+
+    With fewer recipes, seeds, steps or episodes than the study has it is a trial, which writes a document of its own.
+    """
     names = only or list(CASES)
+    trial = bool(recipes or steps) or (seeds, episodes) != (SEEDS, EPISODES)
+    folder = write or (out / "trial" if trial else DOCUMENT.parent)
+    results = RESULTS if folder == DOCUMENT.parent else folder / "results"
+    document, pictures = folder / DOCUMENT.name, folder / "pictures"
+    pictures.mkdir(parents=True, exist_ok=True)
+    if not document.exists():
+        shutil.copyfile(DOCUMENT, document)
     chosen = recipes or list(RECIPES)
     for name, known in (*((n, CASES) for n in names), *((r, RECIPES) for r in chosen)):
         if name not in known:
@@ -156,12 +171,12 @@ def main(
     for name in names:
         runs = [job.directory for job in planned if job.network == name and job.is_done()]
         comparison = _compare(name, runs, episodes)
-        write_comparison(comparison, RESULTS / name, seeds=seeds, recipes=chosen)
-        shutil.copyfile(RESULTS / name / "comparison.png", PICTURES / f"study_{name}.png")
+        write_comparison(comparison, results / name, seeds=seeds, recipes=chosen)
+        shutil.copyfile(results / name / "comparison.png", pictures / f"study_{name}.png")
         sections[name] = "\n".join(_table(comparison, runs))
     done = [job for job in credit if job.is_done()]
     if {dict(job.options)["reward"] for job in done} == set(CREDIT):
-        sections["difference"] = "\n".join(_credit_table(done))
+        sections["difference"] = "\n".join(_credit_table(done, pictures))
     if {network for network, *_ in LQR_CASES} <= set(names):
         sections["lqr"] = "\n".join(_lqr_table(episodes))
     sections["made"] = made_with()
@@ -274,10 +289,10 @@ def _lqr_table(episodes: int) -> Iterator[str]:
             yield f"| {name} | {agent} | {label} | {' | '.join(cells)} | {shown} | {_figure(gap, '{:.1%}')} |"
 
 
-def _credit_table(jobs: Sequence[Job]) -> Iterator[str]:
+def _credit_table(jobs: Sequence[Job], pictures: Path) -> Iterator[str]:
     """Compare learning curves of λ̄ under team λ and difference rewards; draw them."""
     curves = {reward: [_curve(job) for job in jobs if dict(job.options)["reward"] == reward] for reward in CREDIT}
-    _draw_credit(curves)
+    _draw_credit(curves, pictures)
     start = interquartile_mean([curve[1][0] for each in curves.values() for curve in each])
     best = max(interquartile_mean([curve[1][-1] for curve in each]) for each in curves.values())
     yield "| reward | λ̄ of the last training episodes (kt) | steps to half of the better one's gain | seeds |"
@@ -304,7 +319,7 @@ def _first(curve: tuple[Floats, Floats], level: float) -> float | None:
     return float(curve[0][reached[0]]) if len(reached) else None
 
 
-def _draw_credit(curves: dict[str, list[tuple[Floats, Floats]]]) -> None:
+def _draw_credit(curves: dict[str, list[tuple[Floats, Floats]]], pictures: Path) -> None:
     drawing = Figure(figsize=(7.0, 3.6), layout="constrained")
     axes = drawing.add_subplot()
     for (reward, each), colour in zip(curves.items(), SERIES, strict=False):
@@ -314,7 +329,7 @@ def _draw_credit(curves: dict[str, list[tuple[Floats, Floats]]]) -> None:
     axes.set_xlabel("environment steps")
     dressed(axes, title="λ̄ while learning, copper_net", ylabel="λ̄ of training episodes (kt)")
     axes.legend(frameon=False, fontsize=8)
-    save(drawing, PICTURES / "study_difference.png")
+    save(drawing, pictures / "study_difference.png")
 
 
 if __name__ == "__main__":

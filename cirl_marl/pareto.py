@@ -223,6 +223,11 @@ def _env(network: Network, recipe: Recipe) -> VectorEnv:
 
 
 def _check_fit(network: Network, recipe: Recipe) -> None:
+    named = recipe.environment.get("scenario", network.scenario_name)
+    if named != network.scenario_name:
+        raise CirlError(
+            f"recipe '{recipe.name}' is for scenario '{named}', the sweep for '{network.scenario_name}': ask for one"
+        )
     env = _env(network, recipe)
     recipe.check(env.network, env.agents)
     if env.reward_mode not in WEIGHED:

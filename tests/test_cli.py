@@ -158,7 +158,7 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     arguments = ["--steps", "6000", "--envs", "32", "--seed", "3", "--out", "run", "--episodes", "4"]
     assert run(monkeypatch, "train", "bottles.toml", *arguments) == 0
     printed = capsys.readouterr().out
-    assert all(word in printed for word in ("joint steps/s", "trained", "neutral", "random", "gain over neutral"))
+    assert all(word in printed for word in ("environment steps/s", "trained", "neutral", "random", "gain over neutral"))
     for name in ("evaluation.json", "metrics.csv", "config.json", "versions.json"):
         assert Path("run", name).is_file()
     pictures = {path.name for path in Path("run/pictures").iterdir()}

@@ -16,7 +16,7 @@ from cirl_marl.comparison import compare
 from cirl_marl.comparison.files import FILES, write_comparison
 from cirl_marl.definition import read_network
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.learners import RunDirectory, train
+from cirl_marl.learners import Progress, RunDirectory, train
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
 from cirl_marl.pareto import pareto
@@ -175,6 +175,22 @@ def test_other_environments_are_refused(bottles: Network, runs: list[Path], tmp_
     assert [row.name for row in both.rows] == ["independent_a2c", f"independent_a2c ({tmp_path / 'seeing'})", "neutral"]
 
 
+def test_unfinished_runs_are_rows_of_their_own(
+    bottles: Network, runs: list[Path], tmp_path: Path, ctrl_c_after: Callable[[int], Callable[[Progress], None]]
+) -> None:
+    """A run that was stopped is no seed of the recipe; its row says how far it came."""
+    with pytest.raises(KeyboardInterrupt):
+        train(
+            bottles, "independent_a2c", directory=tmp_path / "run", seed=3, steps=320, envs=8, report=ctrl_c_after(80)
+        )
+    found = compare([*runs, tmp_path / "run"], ["neutral"], episodes=2, bounds=False)
+    assert [(row.name, len(row.seeds)) for row in found.rows] == [
+        ("independent_a2c", 3),
+        ("independent_a2c, interrupted after 80 of 320 steps", 1),
+        ("neutral", 0),
+    ]
+
+
 def test_bad_input(bottles: Network, runs: list[Path]) -> None:
     """Each mistake has its own message."""
     with pytest.raises(CirlError, match="give a training run or a network"):
@@ -198,3 +214,13 @@ def test_evaluation_has_the_gap(runs: list[Path]) -> None:
     assert gap is not None
     assert figures["controllers"]["trained"]["gap"]["value"] == pytest.approx(float(gap.mean()))
     assert json.loads((runs[1] / "evaluation.json").read_text()) == figures
+
+
+def test_reports_keep_the_gap(runs: list[Path]) -> None:
+    """Drawing a run again without bounds does not throw away what its evaluation found."""
+    evaluate_run(RunDirectory(runs[0]), episodes=2)
+    kept = (runs[0] / "evaluation.json").read_text()
+    assert '"gap"' in kept
+    figures, _, _ = evaluate_run(RunDirectory(runs[0]), episodes=3, bounds=False)
+    assert figures["episodes"] == 3
+    assert (runs[0] / "evaluation.json").read_text() == kept

@@ -10,6 +10,7 @@ import pytest
 
 from cirl_marl.definition import read_network
 from cirl_marl.errors import CirlError, RunError
+from cirl_marl.learners import load_recipe
 from cirl_marl.network import Network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.pareto import FILES, Sweep, pareto
@@ -85,3 +86,13 @@ def test_weight_without_effect_is_refused(bottles: Network, tmp_path: Path) -> N
     with pytest.raises(CirlError, match="the weight of circularity has no part"):
         pareto(bottles, path, directory=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_recipe_of_another_scenario_is_refused(bottles: Network, tmp_path: Path) -> None:
+    """Bounds of one scenario beside policies of another would say nothing."""
+    recipe = load_recipe("independent_a2c")
+    other = recipe.model_copy(update={"environment": recipe.environment | {"scenario": "crisis"}})
+    with pytest.raises(CirlError, match="is for scenario 'crisis', the sweep for 'default'"):
+        pareto(bottles, other, directory=tmp_path, points=2)
+    found = pareto(bottles, other, directory=tmp_path, scenario="crisis", points=2, steps=320, episodes=2)
+    assert {run.config.scenario for run in found.runs} == {"crisis"}

@@ -18,7 +18,7 @@ from cirl_marl import Arc, Control, ControlKind, LearnerError, Network, Node, Ru
 from cirl_marl.controllers.trained import Trained
 from cirl_marl.elements import Episode, Law
 from cirl_marl.learners import Recipe, RunDirectory, Training, resume, train
-from cirl_marl.learners.recipe import Match
+from cirl_marl.learners.recipe import Learner, Match, Run
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.trainee import derived_seed
 from cirl_marl.learners.views import OneAgent
@@ -268,3 +268,30 @@ def test_budgets_are_whole_numbers(options: dict[str, Any], ppo_recipe: Recipe) 
     """Zero, negative and fractional budgets are errors that name the option; none falls back on a default."""
     with pytest.raises(cirl_marl.CirlError, match=f"{next(iter(options))} must be a whole number"):
         train("copper_net", ppo_recipe, **options)
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "SAC", "ARS"])
+def test_schedules_run_from_their_first_value_to_their_last(algorithm: str) -> None:
+    """Each algorithm ends with the learning rate that the recipe ends with, and learns for the steps asked for."""
+    parameters = {
+        "PPO": {"n_steps": 10, "batch_size": 20, "n_epochs": 1},
+        "SAC": {"learning_starts": 10, "buffer_size": 200, "batch_size": 8},
+        "ARS": {"n_delta": 2, "n_top": 1},
+    }[algorithm]
+    seen = []
+
+    class Rates(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_rollout_end(self) -> None:
+            seen.append(self.model.lr_schedule(self.model._current_progress_remaining))
+
+    rate = {"linear_from": 1e-3, "linear_to": 1e-5}
+    learner = Learner(algorithm=algorithm, parameters={**parameters, "learning_rate": rate})
+    recipe = Recipe(name="x", title="x", run=Run(steps=480, envs=2), learner=learner)
+    training = train("copper_net", recipe, agents=["use"], horizon=10, callbacks={"use": Rates()})
+    assert training.joint_steps == 240
+    assert seen == sorted(seen, reverse=True)
+    assert seen[0] == pytest.approx(1e-3, rel=0.05)
+    assert seen[-1] == pytest.approx(1e-5, abs=2e-4)

@@ -77,12 +77,12 @@ def shares() -> Iterator[Callable[[str, float], None]]:
 
 @contextmanager
 def training_bar() -> Iterator[Any]:
-    """Live line of a training: joint steps/s, λ̄ and service level of the last episode; plain lines if no terminal."""
+    """Live line of a training: environment steps/s, λ̄ and service level of the last episode; else plain lines."""
     columns = (
         TextColumn("training"),
         BarColumn(),
         TaskProgressColumn(),
-        TextColumn("{task.fields[speed]:,.0f} joint steps/s"),
+        TextColumn("{task.fields[speed]:,.0f} environment steps/s"),
         TextColumn("λ̄ {task.fields[circularity]}"),
         TextColumn("service {task.fields[service]}"),
         TimeRemainingColumn(),
@@ -118,6 +118,6 @@ def _speed(state: Any) -> float:
 
 def _say(state: Any) -> None:
     console.print(
-        f"{min(state.env_steps, state.total):,}/{state.total:,} steps, {_speed(state):,.0f} joint steps/s, "
+        f"{min(state.env_steps, state.total):,}/{state.total:,} steps, {_speed(state):,.0f} environment steps/s, "
         f"λ {state.circularity:.4g}, service {state.service_level:.3f}"
     )

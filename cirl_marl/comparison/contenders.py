@@ -104,16 +104,20 @@ def _parts(network: Network) -> dict[str, object]:
 
 
 def _trained(runs: Sequence[RunDirectory]) -> Iterator[Contender]:
-    """Yield the policies; runs that differ in their seed alone have one name."""
+    """Yield the policies; runs that differ in their seed alone have one name, and one that is not complete its own."""
     names: dict[str, str] = {}
     seen: dict[tuple[str, int], RunDirectory] = {}
     for run in runs:
         config = run.config
         plain = config.as_dict()
+        status = run.status
         asked = repr([plain[field] for field in ("recipe", "steps", "envs", "options")])
+        name = config.recipe.name
+        if status["state"] != "complete":
+            name += f", {status['state']} after {status['joint_steps'] * config.envs:,} of {config.steps:,} steps"
+            asked += str(run.path)
         if asked not in names:
-            taken = config.recipe.name in names.values()
-            names[asked] = f"{config.recipe.name} ({run.path})" if taken else config.recipe.name
+            names[asked] = f"{name} ({run.path})" if name in names.values() else name
         twin = seen.setdefault((asked, config.seed), run)
         if twin is not run:
             raise RunError(f"{run.path}: the same recipe and seed {config.seed} as {twin.path}; give one of them")

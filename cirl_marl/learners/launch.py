@@ -81,6 +81,7 @@ def train(
     )
     found.check_demonstrations(config.steps)
     training = Training(config, env)
+    training.check_callbacks(callbacks or {})
     if directory is not None:
         training.keep_in(_create(Path(directory), config, env.network))
     training.start(callbacks=callbacks, report=report)

@@ -33,10 +33,12 @@ class Lockstep:
     Attributes:
         env: the joint environment.
         seats: by name of the learner, in the order in which learners are resumed.
-        joint_steps: control intervals done, each in every copy.
+        joint_steps: control intervals done, each in every copy, those of a run that is resumed included.
     """
 
-    def __init__(self, env: VectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None) -> None:
+    def __init__(
+        self, env: VectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None, *, done: int = 0
+    ) -> None:
         """Reset ``env`` with one seed per copy and seat its learners.
 
         Args:
@@ -44,9 +46,10 @@ class Lockstep:
             seeds: of its copies.
             views: what each learner sees, by its name; together they act for every agent once. None: every agent has
                 a learner of its own.
+            done: joint steps done before.
         """
         self.env = env
-        self.joint_steps = 0
+        self.joint_steps = done
         self._hub = greenlet.getcurrent()
         self._own = Streams()
         self._streams: dict[str, Streams] = {}
@@ -91,10 +94,9 @@ class Lockstep:
             while self._learning:
                 self._step_jointly(hook)
                 for name in self.seats:
-                    if name in self._learning and self.joint_steps > budgets[name]:
+                    self._resume(name)
+                    if name in self._learning and self.joint_steps >= budgets[name]:
                         self._stop_learning(name)
-                    else:
-                        self._resume(name)
         finally:
             self._end()
 

@@ -191,7 +191,10 @@ class RunDirectory:
         )
 
     def save_checkpoint(self, joint_steps: int, write: Callable[[Path], None], state: str, reason: str = "") -> None:
-        """Let ``write`` fill a new checkpoint folder, then make it the one that counts and drop the older ones."""
+        """Let ``write`` fill a new checkpoint folder, then make it the one that counts and drop the older ones.
+
+        What a failed learner leaves behind may be of no use: if there is an older checkpoint, that goes on to count.
+        """
         folder = self.path / "checkpoints" / f"{joint_steps:09d}-{state}"
         partial = folder.with_name(folder.name + ".partial")
         shutil.rmtree(partial, ignore_errors=True)
@@ -199,9 +202,11 @@ class RunDirectory:
         write(partial)
         shutil.rmtree(folder, ignore_errors=True)
         partial.replace(folder)
-        self.set_status(state, joint_steps, folder.name, reason)
+        before = self.status["checkpoint"] if state == "failed" else None
+        counts = before or folder.name
+        self.set_status(state, int(counts.partition("-")[0]), counts, reason)
         for other in folder.parent.iterdir():
-            if other != folder:
+            if other.name not in (folder.name, before):
                 shutil.rmtree(other)
 
     def metrics(self) -> dict[str, list[float]]:

@@ -86,13 +86,14 @@ class Trainee:
         with self.streams.active():
             self.env = load_normaliser(folder, self.name, self.spec, self.seat) or self.seat
             self.model = load_model(folder, self.name, self.spec.algorithm, env=self.env)
+            self.model.action_space.seed(self._seed)  # loading seeds it as at the beginning of the run
             replay = folder / f"{self.name}.replay.pkl"
             if isinstance(self.model, OffPolicyAlgorithm) and replay.is_file():
                 self.model.load_replay_buffer(replay)
         return self
 
     def budget(self, steps: int) -> int:
-        """Joint steps after which it is stopped; only ARS, which counts otherwise, does not stop by itself."""
+        """Joint steps after which it is stopped; only ARS, which may be in mid-update then, does not stop by itself."""
         if isinstance(self.model, ARS):
             return math.ceil(steps * self.spec.share_of_steps / self.seat.copies)
         return 2**62
@@ -124,7 +125,10 @@ class Trainee:
             demonstrate(self.model, self.demonstrations, lambda: view.join(leader.act()))
         done = self.model.num_timesteps
         rows = self.seat.num_envs // self.seat.copies
-        total = 10**15 if isinstance(self.model, ARS) else math.ceil(steps * self.spec.share_of_steps) * rows - done
+        total = math.ceil(steps * self.spec.share_of_steps) * rows - done
+        if isinstance(self.model, ARS):
+            # It counts each step of its copies once for every copy, and schedules by this number, done before or not.
+            total = self.budget(steps) * self.seat.num_envs**2
         if total > 0:
             self.model.learn(total, callback=callback, reset_num_timesteps=done == 0)
 

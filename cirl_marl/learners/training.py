@@ -72,7 +72,7 @@ class Training:
         keys: tuple[str | int, ...] = ("copies", self.done) if self.done else ("copies",)
         seeds = [derived_seed(config.seed, *keys, i) for i in range(config.envs)]
         groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
-        self.lockstep = Lockstep(env, seeds, {name: group.view(env) for name, group in groups.items()})
+        self.lockstep = Lockstep(env, seeds, {name: group.view(env) for name, group in groups.items()}, done=self.done)
         self.trainees: dict[str, Trainee] = {}
         for name, seat in self.lockstep.seats.items():
             trainee = Trainee(seat, groups[name].spec, config.seed + self.done)
@@ -120,9 +120,7 @@ class Training:
             KeyboardInterrupt: after Ctrl-C.
         """
         callbacks = callbacks or {}
-        for name in callbacks:
-            if name not in self.trainees:
-                raise CirlError(f"callbacks: {unknown('learner', name, self.trainees)}")
+        self.check_callbacks(callbacks)
         steps = self.config.steps
         try:
             with _one_torch_thread(), self._interruptible():
@@ -130,7 +128,7 @@ class Training:
                     learners={a: _learner(t, steps, callbacks.get(a)) for a, t in self.trainees.items()},
                     actors={a: t.act for a, t in self.trainees.items()},
                     streams={a: t.streams for a, t in self.trainees.items()},
-                    budgets={a: t.budget(steps) - self.done for a, t in self.trainees.items()},
+                    budgets={a: t.budget(steps) for a, t in self.trainees.items()},
                     hook=_Hook(self, report),
                 )
         except Interrupted:
@@ -147,10 +145,16 @@ class Training:
             for trainee in self.trainees.values():
                 trainee.close()
 
+    def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
+        """Raise a ``CirlError`` for callbacks of learners that there are not."""
+        for name in callbacks:
+            if name not in self.trainees:
+                raise CirlError(f"callbacks: {unknown('learner', name, self.trainees)}")
+
     @property
     def joint_steps(self) -> int:
         """Joint steps done, those before a resumption included."""
-        return self.done + self.lockstep.joint_steps
+        return self.lockstep.joint_steps
 
     def after_step(self, seconds: float, infos: Infos, ended: NDArray[np.bool_]) -> None:
         """Record finished episodes, save checkpoints, heed Ctrl-C."""
@@ -221,7 +225,7 @@ class _Hook:
             service = first["episode_service_level"][ended] if episode else first["service_level"]
             self._report(
                 Progress(
-                    training.lockstep.joint_steps * copies,
+                    (training.joint_steps - training.done) * copies,
                     training.config.steps - training.done * copies,
                     seconds,
                     float(circularity.mean()),

@@ -96,13 +96,14 @@ def run_row(row: Row, *, report: Report | None = None, success_episodes: int | N
         seed = EVALUATION_SEEDS + SEED_SPACING * row.seed
         evaluation = evaluate(environment.id, trained.predict, episodes, seed, report, trained.options)
         threads = torch.get_num_threads()
+    window = max(1, min(WINDOW, len(trained.returns) // 2))
     return Result(
         row=row,
         steps_done=trained.steps,
         seconds=trained.seconds,
         episodes=len(trained.returns),
-        start_return=float(np.mean(trained.returns[:WINDOW])),
-        end_return=float(np.mean(trained.returns[-WINDOW:])),
+        start_return=float(np.mean(trained.returns[:window])),
+        end_return=float(np.mean(trained.returns[-window:])),
         curve=thinned(trained.ends, trained.returns),
         evaluation=evaluation,
         settings=trained.settings,

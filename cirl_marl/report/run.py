@@ -35,7 +35,8 @@ def evaluate_run(
         progress: called with what is being done and the share of all that is done.
 
     Returns:
-        The figures, which are also written to ``evaluation.json``, the rollouts by controller, and the environment.
+        The figures, which are also written to ``evaluation.json`` unless that holds an evaluation and ``bounds`` is
+        false, the rollouts by controller, and the environment.
 
     Raises:
         CirlError: if ``episodes`` or ``seed`` cannot be used.
@@ -56,7 +57,8 @@ def evaluate_run(
         figures["no_bound"] = comparison.yardstick.reason
     config = run.config
     figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": comparison.first_seed}
-    write_json(run.path / "evaluation.json", figures)
+    if bounds or not (run.path / "evaluation.json").is_file():
+        write_json(run.path / "evaluation.json", figures)
     return figures, rollouts, env
 
 

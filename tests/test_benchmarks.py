@@ -1,0 +1,38 @@
+"""The study: what counts as done, and that a trial leaves the published tables alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks import study
+from cirl_marl import load_network
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run is made again if its steps, options, recipe or network are no longer those of the study."""
+    job = study.Job("copper_net", "independent_a2c", 0, 320, (("reward", "team"),), tmp_path / "run")
+    assert not job.is_done()
+    assert job.run() > 0
+    assert job.is_done()
+    assert job.run() == 0
+    assert not replace(job, steps=640).is_done()
+    assert not replace(job, options=()).is_done()
+    assert not replace(job, recipe="independent_ppo").is_done()
+    shorter = load_network("copper_net").with_options(episode={"horizon": 3})
+    monkeypatch.setattr(study, "load_network", lambda name: shorter)
+    assert not job.is_done()
+
+
+def test_a_trial_writes_a_document_of_its_own(tmp_path: Path) -> None:
+    """Fewer recipes, seeds or steps than the study has change nothing that is published."""
+    published = {path: path.read_bytes() for path in (ROOT / "docs" / "study.md", *study.RESULTS.rglob("*.json"))}
+    study.main(out=tmp_path, only=["net_zero"], recipes=["shared_ppo"], seeds=1, steps=320, episodes=2, jobs=1)
+    assert all(path.read_bytes() == text for path, text in published.items())
+    assert "| shared_ppo |" in (tmp_path / "trial" / "study.md").read_text()
+    assert (tmp_path / "trial" / "results" / "net_zero" / "summary.json").is_file()
+    assert (tmp_path / "trial" / "pictures" / "study_net_zero.png").is_file()

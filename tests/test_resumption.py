@@ -1,0 +1,63 @@
+"""Runs that fail or are stopped: what is kept of them, and how they go on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+
+from cirl_marl import CirlError, LearnerError
+from cirl_marl.learners import Recipe, RunDirectory, resume, train
+from cirl_marl.learners.recipe import Learner, Run
+
+
+class FailsAt(BaseCallback):
+    """Fails at a step of its learner."""
+
+    def __init__(self, step: int) -> None:
+        """Fail at ``step``."""
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        if self.n_calls == self.step:
+            raise ValueError("no more")
+        return True
+
+
+def test_a_failed_learner_does_not_take_the_good_checkpoint_with_it(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """What was saved before goes on to count, the run can be resumed from it, and the step is that of the run."""
+    directory = tmp_path / "run"
+    with pytest.raises(LearnerError, match="failed at joint step 30"):
+        train("copper_net", ppo_recipe, directory=directory, horizon=5, callbacks={"use": FailsAt(30)})
+    run = RunDirectory(directory)
+    assert run.status == {"state": "failed", "joint_steps": 28, "checkpoint": "000000028-running"} | {
+        "reason": run.status["reason"]
+    }
+    assert sorted(path.name for path in (directory / "checkpoints").iterdir()) == [
+        "000000028-running",
+        "000000030-failed",
+    ]
+    assert resume(directory).joint_steps >= 40
+    assert RunDirectory(directory).status["state"] == "complete"
+
+
+def test_resumed_exploration_is_fresh(tmp_path: Path, ctrl_c_after: Any) -> None:
+    """Before it learns, SAC draws its actions; after a resumption it does not draw the same ones again."""
+    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
+    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
+    model = resume(tmp_path).trainees["use"].model
+    drawn = model.replay_buffer.actions[:40, 0, 0]  # type: ignore[attr-defined]
+    assert len(np.unique(drawn)) == 40
+
+
+def test_misspelt_callbacks_leave_nothing_behind(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """The check comes before the run directory, so that the same call can be made again."""
+    with pytest.raises(CirlError, match="Did you mean 'mine'"):
+        train("copper_net", ppo_recipe, directory=tmp_path / "run", callbacks={"mime": None})  # type: ignore[dict-item]
+    assert not (tmp_path / "run").exists()
