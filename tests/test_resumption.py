@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
-from cirl_marl import CirlError, LearnerError
+from cirl_marl import CirlError, LearnerError, RunError
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners.recipe import Learner, Run
 
@@ -61,3 +62,15 @@ def test_misspelt_callbacks_leave_nothing_behind(tmp_path: Path, ppo_recipe: Rec
     with pytest.raises(CirlError, match="Did you mean 'mine'"):
         train("copper_net", ppo_recipe, directory=tmp_path / "run", callbacks={"mime": None})  # type: ignore[dict-item]
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"nothing")])
+def test_lost_experience_is_an_error(damage: Callable[[Path], None], tmp_path: Path, ctrl_c_after: Any) -> None:
+    """A replay buffer that is gone, or no longer one, is named instead of begun anew."""
+    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
+    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
+    damage(RunDirectory(tmp_path).checkpoint / "use.replay.pkl")
+    with pytest.raises(RunError, match=r"use\.replay\.pkl: cannot be read"):
+        resume(tmp_path)

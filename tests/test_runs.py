@@ -100,13 +100,48 @@ def test_missing_or_damaged_normaliser_is_an_error(tmp_path: Path, ppo_recipe: R
         Trained(directory)
 
 
-@pytest.mark.parametrize(("name", "text"), [("config.json", "{}"), ("status.json", "{}"), ("status.json", "[]")])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("config.json", "{}"),
+        ("status.json", "{}"),
+        ("status.json", "[]"),
+        ("status.json", '{"state": "done", "joint_steps": 1, "checkpoint": null}'),
+        ("status.json", '{"state": "complete", "joint_steps": null, "checkpoint": "000000040-complete"}'),
+        ("status.json", '{"state": "complete", "joint_steps": 40, "checkpoint": 5}'),
+    ],
+)
 def test_files_that_say_something_else_are_refused(tmp_path: Path, name: str, text: str, ppo_recipe: Recipe) -> None:
     """A readable file with the wrong contents is named."""
     train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
     (tmp_path / "run" / name).write_text(text)
     with pytest.raises(RunError, match=name):
         Trained(tmp_path / "run")
+
+
+@pytest.mark.parametrize(("key", "value"), [("seed", "x"), ("steps", 1.5), ("envs", None), ("options", {"horzon": 5})])
+def test_configurations_of_something_else_are_refused(
+    tmp_path: Path, key: str, value: object, ppo_recipe: Recipe
+) -> None:
+    """A wrong value is found when it is read, not in the middle of a run."""
+    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
+    path = tmp_path / "run" / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(RunError, match=r"config\.json: is not a run configuration: .*(seed|steps|envs|horzon)"):
+        Trained(tmp_path / "run")
+
+
+def test_policies_of_others_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """A policy for other observations, or its normaliser, does not act."""
+    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
+    folder = RunDirectory(tmp_path / "run").checkpoint
+    for file in ("{}.zip", "{}.normaliser.pkl"):
+        own = (folder / file.format("mine")).read_bytes()
+        shutil.copyfile(folder / file.format("use"), folder / file.format("mine"))
+        with pytest.raises(RunError, match="'mine' is for other observations"):
+            Trained(tmp_path / "run")
+        (folder / file.format("mine")).write_bytes(own)
+    Trained(tmp_path / "run")
 
 
 def test_metrics_survive_a_crash(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:

@@ -12,7 +12,7 @@ from cirl_marl.controllers.basic import Arrays
 from cirl_marl.errors import RunError
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.learners.trainee import load_model, load_normaliser
-from cirl_marl.learners.views import unseen_state
+from cirl_marl.learners.views import View, unseen_state
 from cirl_marl.vector_env import VectorEnv
 
 
@@ -32,8 +32,18 @@ class Trained:
         self._views = {group.name: group.view(env) for group in groups}
         self._models = {group.name: load_model(folder, group.name, group.spec.algorithm) for group in groups}
         self._normalisers = {group.name: load_normaliser(folder, group.name, group.spec) for group in groups}
+        for name, view in self._views.items():
+            self._check(name, folder, self._models[name], view)
+            if (normaliser := self._normalisers[name]) is not None:
+                self._check(name, folder, normaliser, view)
         self._memory: dict[str, Any] = {}
         self._starts = np.ones(1, dtype=bool)
+
+    def _check(self, name: str, folder: Path, loaded: Any, view: View) -> None:
+        """Refuse a policy or normaliser that is for something else."""
+        shapes = getattr(loaded, "observation_space", None), getattr(loaded, "action_space", None)
+        if shapes != (view.observation_space, view.action_space):
+            raise RunError(f"{folder}: the policy or normaliser of '{name}' is for other observations or actions")
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Forget the last episode.

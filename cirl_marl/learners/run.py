@@ -30,7 +30,7 @@ from typing import Any
 
 from cirl_marl.catalogue import load_network
 from cirl_marl.errors import RunError, unknown
-from cirl_marl.learners.recipe import Group, Recipe
+from cirl_marl.learners.recipe import OPTIONS, Group, Recipe
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
 
@@ -86,8 +86,19 @@ class RunConfig:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> RunConfig:
-        """Read what ``as_dict`` returned."""
-        return cls(**{**plain, "agents": tuple(plain["agents"]), "recipe": Recipe.model_validate(plain["recipe"])})
+        """Read what ``as_dict`` returned.
+
+        Raises:
+            KeyError, TypeError, ValueError: if it is something else.
+        """
+        found = cls(**{**plain, "agents": tuple(plain["agents"]), "recipe": Recipe.model_validate(plain["recipe"])})
+        for name in ("seed", "steps", "envs"):
+            if type(getattr(found, name)) is not int:
+                raise ValueError(f"{name} is {getattr(found, name)!r}, not a whole number")
+        for name in found.options:
+            if name not in OPTIONS:
+                raise ValueError(unknown("option", name, OPTIONS))
+        return found
 
 
 class RunDirectory:
@@ -139,7 +150,9 @@ class RunDirectory:
             RunError: if the file is missing or says something else.
         """
         status = self._json("status.json")
-        if not isinstance(status, dict) or not {"state", "joint_steps", "checkpoint"} <= set(status):
+        fits = isinstance(status, dict) and {"state", "joint_steps", "checkpoint"} <= set(status)
+        fits = fits and status["state"] in STATES and type(status["joint_steps"]) is int
+        if not fits or not isinstance(status["checkpoint"], str | None):
             raise RunError(f"{self.path / 'status.json'}: is not the status of a run: {status!r}")
         return status
 
@@ -229,7 +242,7 @@ class RunDirectory:
             raise RunError(f"{path}: missing; {self.path} is not a run directory, or it was not written to the end")
         try:
             value: dict[str, Any] = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
+        except ValueError as error:
             raise RunError(f"{path}: cannot be read: {error}") from error
         return value
 
@@ -248,7 +261,10 @@ class MetricsFile:
         columns = ["joint_step", "env_steps", "seconds", "circularity", "service_level"]
         rows = [columns + [f"return:{agent}" for agent in agents]]
         if path.is_file():
-            rows += [row for row in _complete_rows(path)[1:] if float(row[0]) <= done]
+            try:
+                rows += [row for row in _complete_rows(path)[1:] if float(row[0]) <= done]
+            except (ValueError, IndexError) as error:
+                raise RunError(f"{path}: cannot be read: {error}") from error
         text = "".join(",".join(row) + "\n" for row in rows)
         write_atomically(path, lambda temporary: temporary.write_text(text))
         self._file = path.open("a", newline="")

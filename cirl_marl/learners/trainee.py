@@ -25,6 +25,12 @@ from cirl_marl.learners.run import write_atomically
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams, global_streams_kept
 
+UNREADABLE = (
+    OSError, EOFError, pickle.UnpicklingError, ImportError,
+    AssertionError, AttributeError, IndexError, TypeError, ValueError,
+)  # fmt: skip
+"""What a damaged file, or one of something else, raises when it is unpickled."""
+
 
 def derived_seed(seed: int, *names: str | int) -> int:
     """Return a seed below 2³¹ that depends on ``seed`` and ``names`` only, not on who else learns.
@@ -82,14 +88,22 @@ class Trainee:
         return self
 
     def load(self, folder: Path) -> Trainee:
-        """Go on with the algorithm saved in ``folder``."""
+        """Go on with the algorithm saved in ``folder``, and what it has seen.
+
+        Raises:
+            RunError: if a file is missing or cannot be read.
+        """
         with self.streams.active():
             self.env = load_normaliser(folder, self.name, self.spec, self.seat) or self.seat
             self.model = load_model(folder, self.name, self.spec.algorithm, env=self.env)
             self.model.action_space.seed(self._seed)  # loading seeds it as at the beginning of the run
-            replay = folder / f"{self.name}.replay.pkl"
-            if isinstance(self.model, OffPolicyAlgorithm) and replay.is_file():
-                self.model.load_replay_buffer(replay)
+            if isinstance(self.model, OffPolicyAlgorithm):
+                replay = folder / f"{self.name}.replay.pkl"
+                try:
+                    with replay.open("rb") as file:
+                        self.model.load_replay_buffer(file)
+                except UNREADABLE as error:
+                    raise RunError(f"{replay}: cannot be read: {error}; it holds what '{self.name}' saw") from error
         return self
 
     def budget(self, steps: int) -> int:
@@ -186,7 +200,7 @@ def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = Non
     with global_streams_kept():
         try:
             return algorithm_class(algorithm).load(path, env=env, device="cpu")
-        except (OSError, ValueError, KeyError, RuntimeError, EOFError) as error:
+        except (*UNREADABLE, KeyError, RuntimeError) as error:
             raise RunError(f"{path}: cannot be read: {error}") from error
 
 
@@ -204,6 +218,6 @@ def load_normaliser(folder: Path, name: str, spec: Learner, seat: Seat | None = 
             return VecNormalize.load(str(path), seat)
         with path.open("rb") as file:
             normaliser: VecNormalize = pickle.load(file)
-    except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError, IndexError, ValueError) as error:
+    except UNREADABLE as error:
         raise RunError(f"{path}: cannot be read: {error}; without it the policy of '{name}' is useless") from error
     return normaliser
