@@ -288,7 +288,8 @@ def test_schedules_run_from_their_first_value_to_their_last(algorithm: str) -> N
             seen.append(self.model.lr_schedule(self.model._current_progress_remaining))
 
     rate = {"linear_from": 1e-3, "linear_to": 1e-5}
-    learner = Learner(algorithm=algorithm, parameters={**parameters, "learning_rate": rate})
+    policy = "LinearPolicy" if algorithm == "ARS" else "MlpPolicy"
+    learner = Learner(algorithm=algorithm, policy=policy, parameters={**parameters, "learning_rate": rate})
     recipe = Recipe(name="x", title="x", run=Run(steps=480, envs=2), learner=learner)
     training = train("copper_net", recipe, agents=["use"], horizon=10, callbacks={"use": Rates()})
     assert training.joint_steps == 240

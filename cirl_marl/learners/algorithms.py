@@ -93,7 +93,7 @@ def checked_policy(name: str, policy: str) -> None:
         RecipeError: naming the nearest that it has.
     """
     aliases = algorithm_class(name).policy_aliases
-    known = [alias for alias in aliases if alias.startswith("Mlp")]
+    known = [alias for alias in aliases if not alias.startswith(("Cnn", "MultiInput"))]
     if aliases.get("MultiInputPolicy") is MultiInputActorCriticPolicy:
         known.append(CENTRAL_CRITIC)
     if policy not in known:

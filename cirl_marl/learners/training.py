@@ -123,7 +123,7 @@ class Training:
         self.check_callbacks(callbacks)
         steps = self.config.steps
         try:
-            with _one_torch_thread(), self._interruptible():
+            with one_torch_thread(), self._interruptible():
                 self.lockstep.run(
                     learners={a: _learner(t, steps, callbacks.get(a)) for a, t in self.trainees.items()},
                     actors={a: t.act for a, t in self.trainees.items()},
@@ -241,8 +241,8 @@ def _learner(trainee: Trainee, steps: int, callback: BaseCallback | None) -> Cal
 
 
 @contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Small networks learn fastest on one thread."""
+def one_torch_thread() -> Iterator[None]:
+    """Small networks learn fastest on one thread, and trainings may run side by side."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

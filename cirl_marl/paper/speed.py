@@ -8,10 +8,11 @@ import numpy as np
 from rich.table import Table
 
 from cirl_marl.learners import load_recipe
+from cirl_marl.learners.training import one_torch_thread
 from cirl_marl.paper.published import HARDWARE, environment_of
 from cirl_marl.paper.results import WINDOW, Row
 from cirl_marl.paper.table import number
-from cirl_marl.paper.training import Report, Trained, one_torch_thread, train_published
+from cirl_marl.paper.training import Report, Trained, train_published
 from cirl_marl.paper.tuned import train_tuned
 
 ENVIRONMENT = "CopperNet"

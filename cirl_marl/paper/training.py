@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -27,6 +26,7 @@ from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluate import EVALUATION_SEEDS, SEED_SPACING
 from cirl_marl.learners.algorithms import algorithm_class
 from cirl_marl.learners.run import versions
+from cirl_marl.learners.training import one_torch_thread
 from cirl_marl.paper.published import PaperEnvironment, environment_of
 from cirl_marl.paper.results import WINDOW, Evaluation, Result, Row, thinned
 
@@ -252,17 +252,6 @@ def stopwatch() -> Callable[[], tuple[float, float]]:
     """Start to measure; the function returned gives wall time and processor time since then, in seconds."""
     wall, cpu = time.perf_counter(), time.process_time()
     return lambda: (time.perf_counter() - wall, time.process_time() - cpu)
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Small networks learn fastest on one thread, and rows may run side by side."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _silent(what: str, done: int, total: int) -> None:
