@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from cirl_marl.catalogue import load_network
 from cirl_marl.cli.common import (
     Episodes,
     MinService,
@@ -98,7 +99,7 @@ def pareto(
     """
     from cirl_marl.pareto import pareto as swept
 
-    folder = folder_for(out or Path("runs") / f"pareto-{Path(network).stem}", "--out")
+    folder = folder_for(out or Path("runs") / f"pareto-{load_network(network).name}", "--out")
     try:
         with shares() as progress:
             found = swept(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from cirl_marl.catalogue import load_network
 from cirl_marl.cli.common import Episodes, RunPath, Scenario, Seed, app, console, say, shares, training_bar
 from cirl_marl.elements import OBSERVE, REWARDS
 from cirl_marl.errors import CirlError
@@ -36,7 +37,9 @@ def train(
         raise CirlError("train needs either NETWORK or --resume RUN")
     if resume is not None:
         _only_resume(context)
-    directory = resume or out or Path("runs") / f"{Path(str(network)).stem}-{Path(agents).stem}-seed{seed}"
+    directory = resume or out
+    if directory is None:
+        directory = Path("runs") / f"{load_network(str(network)).name}-{Path(agents).stem}-seed{seed}"
     with training_bar() as report:
         try:
             if resume is not None:
