@@ -16,6 +16,7 @@ import cirl_marl
 from cirl_marl import RunError
 from cirl_marl.controllers.trained import Trained
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
+from cirl_marl.learners.recipe import Learner, Normalisation, Run
 
 
 def test_run_directory_holds_what_is_needed(tmp_path: Path, ppo_recipe: Recipe) -> None:
@@ -129,6 +130,30 @@ def test_configurations_of_something_else_are_refused(
     path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
     with pytest.raises(RunError, match=r"config\.json: is not a run configuration: .*(seed|steps|envs|horzon)"):
         Trained(tmp_path / "run")
+
+
+def test_recurrent_policies_remember_within_an_episode_and_forget_after_it(tmp_path: Path) -> None:
+    """A run's LSTM is fed its state from step to step, from nothing at each start."""
+    parameters = {"n_steps": 10, "batch_size": 10, "n_epochs": 1, "policy_kwargs": {"lstm_hidden_size": 8}}
+    normalise = Normalisation(observation=False, reward=False)
+    learner = Learner(algorithm="RecurrentPPO", policy="MlpLstmPolicy", parameters=parameters, normalise=normalise)
+    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=2), learner=learner)
+    training = train("copper_net", recipe, agents=["use"], directory=tmp_path / "run", horizon=5)
+    env = RunDirectory(tmp_path / "run").make_env(2)
+    controller, model = Trained(tmp_path / "run"), training.trainees["use"].model
+    for seed in (0, 1):
+        seen = env.reset(seed=seed)
+        controller.start(env, 0)
+        state, begins = None, np.ones(2, dtype=bool)
+        for _ in range(5):
+            expected, state = model.predict(seen["use"], state, begins, deterministic=True)
+            forgetful = model.predict(seen["use"], None, np.ones(2, dtype=bool), deterministic=True)[0]
+            np.testing.assert_array_equal(controller.act(seen)["use"], expected)
+            assert begins.all() or not np.array_equal(expected, forgetful)
+            begins = np.zeros(2, dtype=bool)
+            seen = env.step({"use": expected})[0]
+    with pytest.raises(RunError, match=r"trained \['use'\], not \['mine'\]"):
+        controller.start(cirl_marl.vector_env("copper_net", num_envs=2, agents=["mine"]), 0)
 
 
 def test_policies_of_others_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> None:
