@@ -13,16 +13,17 @@ import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
-from cirl_marl.learners import Recipe
-from cirl_marl.paper import published, session
+from cirl_marl.learners import Recipe, Training, train
+from cirl_marl.paper import published, session, training, tuned
 from cirl_marl.paper.plan import planned, study
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
 from cirl_marl.paper.results import Evaluation, Result, Results, Row, thinned
 from cirl_marl.paper.table import markdown, table_rows
-from cirl_marl.paper.training import run_row
+from cirl_marl.paper.training import Trained, evaluate, run_row
 from cirl_marl.paper.tuned import train_tuned
 
 COPPER = ENVIRONMENTS["CopperNet"]
@@ -279,6 +280,66 @@ def test_tuned_network_counts_steps_and_episodes_over_the_copies() -> None:
         train_tuned(COPPER, row, lambda *_: None, recipe("PPO", {"reward": "circularity"}))
     with pytest.raises(RecipeError, match="uses SAC, but the row says PPO"):
         train_tuned(COPPER, row, lambda *_: None, recipe("SAC"))
+
+
+def test_tuned_policy_is_measured_behind_its_normaliser(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the final policy is shown is what it was trained on, scaled by what training saw."""
+    kept: list[Training] = []
+
+    def keeping(*arguments: Any, **options: Any) -> Training:
+        kept.append(train(*arguments, **options))
+        return kept[-1]
+
+    monkeypatch.setattr(tuned, "train", keeping)
+    row = Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=200)
+    trained = train_tuned(COPPER, row, lambda *_: None, recipe("PPO", n_steps=50, batch_size=100))
+    (trainee,) = kept[0].trainees.values()
+    assert isinstance(trainee.env, VecNormalize)
+    seen = np.random.default_rng(0).uniform(50, 2000, (3, 6)).astype(np.float32)
+    chosen = trained.predict(seen, None, np.ones(3, dtype=bool))[0]
+    expected = trainee.model.predict(np.asarray(trainee.env.normalize_obs(seen)), deterministic=True)[0]
+    np.testing.assert_array_equal(chosen, expected)
+    assert not np.array_equal(chosen, trainee.model.predict(seen, deterministic=True)[0])
+
+
+def test_final_policies_play_their_quota_on_episodes_of_their_own() -> None:
+    """23 episodes in 20 copies: one each and a second one for the last three, from the seed given on."""
+    id_, first = ENVIRONMENTS["CO2MicroalgaeMonod"].id, 2**31 + 7
+    returns = []
+    for copy in range(20):
+        env = gymnasium.make(id_)
+        for episode in range(2 if copy >= 17 else 1):
+            env.reset(seed=first + copy if episode == 0 else None)
+            returns.append(sum(float(env.step(np.ones(1, dtype=np.float32))[1]) for _ in range(200)))
+
+    def full_light(observation: Any, state: Any, starts: Any) -> tuple[NDArray[Any], None]:
+        return np.ones((len(observation), 1), dtype=np.float32), None
+
+    found = evaluate(id_, full_light, 23, first, lambda *_: None, {})
+    assert (found.episodes, found.success) == (23, None)
+    assert found.mean == pytest.approx(np.mean(returns), rel=1e-9)
+    assert found.deviation == pytest.approx(np.std(returns), rel=1e-9)
+
+
+@pytest.mark.parametrize(("episodes", "window"), [(300, 100), (150, 75), (3, 1), (1, 1)])
+def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """r_s and r_e are means over 100 episodes each, or over half of those that there were."""
+    returns = list(np.random.default_rng(0).normal(size=episodes))
+    done = Trained(
+        predict=lambda *_: (np.zeros((20, 1), dtype=np.float32), None),
+        ends=[50 * (i + 1) for i in range(episodes)],
+        returns=returns,
+        steps=50 * episodes,
+        seconds=1.0,
+        cpu_seconds=1.0,
+        settings={},
+        options={},
+    )
+    monkeypatch.setattr(training, "train_published", lambda *_: done)
+    monkeypatch.setattr(training, "EVALUATION_EPISODES", 20)
+    found = run_row(Row(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
+    assert found.start_return == pytest.approx(np.mean(returns[:window]))
+    assert found.end_return == pytest.approx(np.mean(returns[-window:]))
 
 
 def test_tuned_robot_trains_in_copies(toy: PaperEnvironment) -> None:
