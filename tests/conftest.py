@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,7 @@ from cirl_marl import (
     Role,
     Service,
 )
+from cirl_marl.definition import read_network
 from cirl_marl.simulate import Dynamics
 
 if TYPE_CHECKING:
@@ -41,8 +43,18 @@ settings.register_profile(
 settings.register_profile("thorough", settings.get_profile("cirl_marl"), max_examples=1000, derandomize=False)
 settings.load_profile("cirl_marl")
 
+GUIDE = Path(__file__).parent.parent / "envs" / "README.md"
 ROLES = list(Role)
 LAWS = [law for law in Law if law is not Law.COMPARTMENT]
+
+
+@pytest.fixture(scope="session")
+def bottles(tmp_path_factory: pytest.TempPathFactory) -> Network:
+    """Return the small network of the guide, for a fortnight."""
+    text = GUIDE.read_text().split("```toml\n")[1].split("```")[0]
+    path = tmp_path_factory.mktemp("definition") / "bottles.toml"
+    path.write_text(text.replace("horizon = { value = 60", "horizon = { value = 14"))
+    return read_network(path)
 
 
 @pytest.fixture

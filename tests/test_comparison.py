@@ -14,7 +14,6 @@ import pytest
 from cirl_marl.catalogue import load_network
 from cirl_marl.comparison import compare
 from cirl_marl.comparison.files import FILES, write_comparison
-from cirl_marl.definition import read_network
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners import Progress, RunDirectory, train
 from cirl_marl.network import Network
@@ -23,17 +22,6 @@ from cirl_marl.pareto import pareto
 from cirl_marl.report.run import evaluate_run
 from cirl_marl.results import published
 from cirl_marl.statistics import interquartile_mean
-
-GUIDE = Path(__file__).parent.parent / "envs" / "README.md"
-
-
-@pytest.fixture(scope="module")
-def bottles(tmp_path_factory: pytest.TempPathFactory) -> Network:
-    """Return the small network of the guide, for a fortnight."""
-    text = GUIDE.read_text().split("```toml\n")[1].split("```")[0]
-    path = tmp_path_factory.mktemp("definition") / "bottles.toml"
-    path.write_text(text.replace("horizon = { value = 60", "horizon = { value = 14"))
-    return read_network(path)
 
 
 @pytest.fixture(scope="module")

@@ -8,23 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cirl_marl.definition import read_network
+from cirl_marl.catalogue import folder
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners import load_recipe
 from cirl_marl.network import Network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.pareto import FILES, Sweep, pareto
-
-GUIDE = Path(__file__).parent.parent / "envs" / "README.md"
-
-
-@pytest.fixture(scope="module")
-def bottles(tmp_path_factory: pytest.TempPathFactory) -> Network:
-    """Return the small network of the guide, for a fortnight."""
-    text = GUIDE.read_text().split("```toml\n")[1].split("```")[0]
-    path = tmp_path_factory.mktemp("definition") / "bottles.toml"
-    path.write_text(text.replace("horizon = { value = 60", "horizon = { value = 14"))
-    return read_network(path)
 
 
 def swept(network: Network, directory: Path, **options: object) -> Sweep:
@@ -80,7 +69,7 @@ def test_network_without_certificate(tmp_path: Path) -> None:
 
 def test_weight_without_effect_is_refused(bottles: Network, tmp_path: Path) -> None:
     """A reward in which the weight has no part cannot be swept; nothing is trained."""
-    recipe = (GUIDE.parent.parent / "agents" / "independent_a2c.toml").read_text()
+    recipe = (folder("agents") / "independent_a2c.toml").read_text()
     path = tmp_path / "team.toml"
     path.write_text(recipe + '\n[environment]\nreward = "circularity"\n')
     with pytest.raises(CirlError, match="the weight of circularity has no part"):
