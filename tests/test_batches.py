@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv
 from cirl_marl.compartments import RewardState, model_class
-from cirl_marl.elements import Episode, Law, Service
+from cirl_marl.elements import Episode, Law, Objective, Service
 from cirl_marl.network import Floats
 
 INTERVAL = 0.04
@@ -260,3 +260,21 @@ def test_the_clock_of_a_model_is_that_of_the_network() -> None:
     """A model in discrete time refuses another control interval."""
     with pytest.raises(NetworkError, match=r"model 'belt' moves in steps of 0\.04 s; the control interval is 0\.08 s"):
         replace(network(), episode=Episode(control_interval=0.08, solver="rk4", solver_step=0.08))
+
+
+@pytest.mark.parametrize(("net_zero", "circularity"), [("signed", 10.0), ("abs", -10.0)])
+def test_over_removal_in_batches_is_no_merit_under_abs(net_zero: str, circularity: float) -> None:
+    """A batch taken out of the environment counts like a continuous flow: by its absolute value if so asked."""
+    arc = Arc(id="taken", donor="air", recipient="store", law=Law.BATCH, delay=1.0, batches=((0.0, 10.0),))
+    network = Network(
+        name="removal",
+        nodes=(Node(id="air", role=Role.ENVIRONMENT, initial=(50.0, 50.0)), Node(id="store")),
+        arcs=(arc,),
+        episode=Episode(horizon=3),
+        objective=Objective(net_zero=net_zero),
+    )
+    env = VectorEnv(network, num_envs=2)
+    env.reset(seed=0)
+    outcome = env.advance(np.empty((0, 2)))
+    np.testing.assert_allclose(outcome.circularity, circularity)
+    np.testing.assert_allclose(outcome.circularity_mean, circularity)
