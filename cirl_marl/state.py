@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats, Integers, Network
 
 
@@ -58,6 +59,14 @@ class Snapshot:
     network: Network
     elapsed: int = 0
 
+    def check(self, network: Network, copies: int, agents: tuple[str, ...]) -> None:
+        """Raise a ``ControlError`` unless so many copies of ``network``, in which ``agents`` act, can go back to this."""
+        theirs, ours = _described(self.network, len(self.streams), self.agents), _described(network, copies, agents)
+        if theirs != ours:
+            raise ControlError(f"the snapshot does not fit: it is of {theirs}; this is {ours}")
+        if self.network != network:
+            raise ControlError(f"the snapshot does not fit: it is of another definition of {ours}")
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -84,3 +93,10 @@ class Outcome:
     flow: Floats
     truncated: NDArray[np.bool_]
     success: Mapping[str, NDArray[np.bool_]]
+
+
+def _described(network: Network, copies: int, agents: tuple[str, ...]) -> str:
+    return (
+        f"network '{network.name}', scenario '{network.scenario_name}', {network.episode.horizon} steps, "
+        f"{copies} copies, agents {', '.join(agents)}"
+    )

@@ -250,12 +250,7 @@ class VectorEnv:
         Raises:
             ControlError: if the snapshot is of another network, horizon, batch size or choice of agents.
         """
-        theirs = _described(snapshot.network, len(snapshot.streams), snapshot.agents)
-        ours = _described(self.network, self.num_envs, self.agents)
-        if theirs != ours:
-            raise ControlError(f"the snapshot does not fit: it is of {theirs}; this is {ours}")
-        if snapshot.network != self.network:
-            raise ControlError(f"the snapshot does not fit: it is of another definition of {ours}")
+        snapshot.check(self.network, self.num_envs, self.agents)
         self._starts.restore_streams(snapshot.streams)
         self._state = snapshot.state.copied()
         self.episodes = self.episodes + 1
@@ -353,13 +348,6 @@ class VectorEnv:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
         return self.layout.observe(quantities, time, self.scoring.levels(quantities))
-
-
-def _described(network: Network, copies: int, agents: Sequence[str]) -> str:
-    return (
-        f"network '{network.name}', scenario '{network.scenario_name}', {network.episode.horizon} steps, "
-        f"{copies} copies, agents {', '.join(agents)}"
-    )
 
 
 def _share(weight: float) -> float:

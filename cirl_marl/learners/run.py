@@ -226,7 +226,7 @@ class RunDirectory:
         """Return the columns of ``metrics.csv``."""
         path = self.path / "metrics.csv"
         if not path.is_file():
-            raise RunError(f"{path}: missing; no episode ended in this run")
+            raise RunError(f"{path}: missing; the run directory is incomplete")
         header, *rows = _complete_rows(path)
         try:
             return {name: [float(row[i]) for row in rows] for i, name in enumerate(header)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,8 +36,8 @@ def evaluate_run(
         progress: called with what is being done and the share of all that is done.
 
     Returns:
-        The figures, which are also written to ``evaluation.json`` unless that holds an evaluation and ``bounds`` is
-        false, the rollouts by controller, and the environment.
+        The figures, which are also written to ``evaluation.json``, the rollouts by controller, and the environment. An
+        evaluation of the same checkpoint in the same episodes is left there if this one has no bounds.
 
     Raises:
         CirlError: if ``episodes`` or ``seed`` cannot be used.
@@ -57,9 +58,17 @@ def evaluate_run(
         figures["no_bound"] = comparison.yardstick.reason
     config = run.config
     figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": comparison.first_seed}
-    if bounds or not (run.path / "evaluation.json").is_file():
+    figures["checkpoint"] = run.checkpoint.name
+    if bounds or not _is_evaluated(run, figures):
         write_json(run.path / "evaluation.json", figures)
     return figures, rollouts, env
+
+
+def _is_evaluated(run: RunDirectory, figures: Mapping[str, Any]) -> bool:
+    """Whether ``evaluation.json`` is of the same checkpoint and episodes as ``figures``."""
+    path = run.path / "evaluation.json"
+    found = json.loads(path.read_text()) if path.is_file() else {}
+    return all(found.get(name) == figures[name] for name in ("checkpoint", "episodes", "first_seed"))
 
 
 def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv) -> list[Path]:
