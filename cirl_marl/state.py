@@ -60,7 +60,7 @@ class Snapshot:
     elapsed: int = 0
 
     def check(self, network: Network, copies: int, agents: tuple[str, ...]) -> None:
-        """Raise a ``ControlError`` unless so many copies of ``network``, in which ``agents`` act, can go back to this."""
+        """Raise a ``ControlError`` unless ``copies`` of ``network``, in which ``agents`` act, can go back to this."""
         theirs, ours = _described(self.network, len(self.streams), self.agents), _described(network, copies, agents)
         if theirs != ours:
             raise ControlError(f"the snapshot does not fit: it is of {theirs}; this is {ours}")
