@@ -21,7 +21,7 @@ import numpy as np
 
 from cirl_marl.elements import Law, Role
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.rowsum import RowSum
+from cirl_marl.rowsum import RowSum, disposable
 
 if TYPE_CHECKING:
     from cirl_marl.inner import InnerPhysics
@@ -160,7 +160,7 @@ class Batches:
         if not mass.any():
             return np.zeros((2, stock.shape[1]))
         asked, left = -self._departure(mass), self._departure.add_to(stock.copy(), mass)
-        share = np.divide(stock * (1.0 - 1e-12), asked, out=np.ones_like(asked), where=left < 0)
+        share = np.divide(disposable(stock, len(mass)), asked, out=np.ones_like(asked), where=left < 0)
         mass = mass * share.take(self._sent_donor, axis=0)
         self._departure.add_to(stock, mass)
         # the slot that is read at the end of the last interval of the delay

@@ -1,4 +1,4 @@
-"""Weighted row sums over a batch, the one sparse operation of the library."""
+"""Weighted row sums over a batch, the one sparse operation of the library, and what their rounding leaves to spend."""
 
 from __future__ import annotations
 
@@ -12,6 +12,14 @@ from scipy import sparse
 from scipy.sparse._sparsetools import csc_matvec, csc_matvecs
 
 Floats = NDArray[np.float64]
+
+NOTHING = 1e-290
+"""Stock that gives nothing away: emptied again and again it would become subnormal, which does not round well."""
+
+
+def disposable(stock: Floats, parts: int) -> Floats:
+    """Return the mass that a stock can give away in so many parts without their rounding overdrawing it."""
+    return np.where(stock > NOTHING, stock * (1.0 - max(1e-12, 4.0 * np.finfo(float).eps * parts)), 0.0)
 
 
 class RowSum:

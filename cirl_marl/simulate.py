@@ -14,16 +14,13 @@ from cirl_marl.errors import CirlError
 from cirl_marl.flows import FlowLaws
 from cirl_marl.inner import InnerPhysics
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.rowsum import RowSum
+from cirl_marl.rowsum import RowSum, disposable
 
 MAX_TURNOVER = 1.0
 """Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
 
 MAX_SUBSTEPS = 10_000
 """Solver steps per control interval beyond which a rate is taken for a mistake."""
-
-NOTHING = 1e-290
-"""Stock that no recipient can pull: emptied again and again it would become subnormal, which does not round well."""
 
 TRUNCATION = 1e-13
 """Bound on the first neglected term of the exact solver's series, relative to the mass in the network."""
@@ -94,8 +91,7 @@ class Dynamics(FlowLaws):
         self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
         shape = (self.unit + 1, len(network.arcs))
         self._outgoing = RowSum(network.donors, np.arange(shape[1]), np.ones(shape[1]), shape)
-        busiest = int(np.bincount(network.donors, minlength=1).max())
-        self._all_but = 1.0 - max(1e-12, 4.0 * np.finfo(float).eps * busiest)  # more than a sum of outflows rounds
+        self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._pulls = Law.RECIPIENT in laws
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
@@ -308,7 +304,7 @@ class Dynamics(FlowLaws):
         after = self.incidence.add_to(stock.copy(), moved)
         if after.min() >= 0:
             return after, moved, rate
-        held = np.where(stock > NOTHING, stock * self._all_but, 0.0)
+        held = disposable(stock, self._busiest)
         settled = np.full_like(moved, np.nan)
         while after.min() < 0:
             out = self._outgoing(moved)

@@ -181,6 +181,30 @@ def test_a_batch_arrives_after_its_delay() -> None:
     assert sorter[-2:] == [400.0, 400.0]
 
 
+@given(
+    stocks=st.lists(st.floats(0.0, 50.0) | st.floats(0.0, 1e-320), min_size=1, max_size=4),
+    asked=st.lists(st.floats(1e-3, 40.0), min_size=1, max_size=12),
+)
+def test_an_empty_donor_sends_what_it_has(stocks: list[float], asked: list[float]) -> None:
+    """Batches asked of one donor never overdraw it, however little it holds; what it holds otherwise goes, or stays."""
+    network = Network(
+        name="rush",
+        nodes=(Node(id="store", initial=(0.0, 0.0)), Node(id="market")),
+        arcs=tuple(
+            Arc(id=f"lot_{i}", donor="store", recipient="market", law=Law.BATCH, delay=1.0, batches=((0.0, mass),))
+            for i, mass in enumerate(asked)
+        ),
+    )
+    env = VectorEnv(network, num_envs=len(stocks))
+    env.reset(seed=0)
+    stock = env.physical.stock.copy()
+    stock[0] = stocks
+    env.dynamics.batches.dispatch(stock, env.physical.step)
+    assert (stock >= 0.0).all()
+    np.testing.assert_allclose(stock[:-1].sum(axis=0), stocks, rtol=1e-13)
+    np.testing.assert_allclose(stock[0], np.maximum(np.array(stocks) - sum(asked), 0.0), rtol=1e-9, atol=1e-10)
+
+
 def test_load_makes_the_truck_slower() -> None:
     """The same force moves a truck with 400 kg less far than an empty one, by the ratio of the masses."""
     env = VectorEnv(network(nth=1), num_envs=1)
