@@ -13,7 +13,7 @@ import cirl_marl
 from cirl_marl import DefinitionError, RecipeError
 from cirl_marl.catalogue import folder
 from cirl_marl.learners import load_recipe, train
-from cirl_marl.learners.algorithms import algorithms, parameters_of
+from cirl_marl.learners.algorithms import algorithms, checked_parameters, parameters_of
 from cirl_marl.learners.recipe import recipe_schema
 
 GOOD = """
@@ -78,6 +78,10 @@ def test_published_schema_is_up_to_date() -> None:
         ("[learner]", "[run]\nsteps = 0\n[learner]", "run.steps: Input should be greater than 0, got 0"),
         ("[learner]", '[learner]\npolicy = "MlpPolcy"', "unknown policy of PPO for vectors 'MlpPolcy'. Did you mean"),
         ("n_steps = 8", "learning_rate = { linear_from = 1e-3 }", "learning_rate: needs a number, or linear_from and"),
+        ("n_steps = 8", 'batch_size = "a"', "parameters.batch_size: PPO needs int, got 'a'"),
+        ("n_steps = 8", "n_epochs = 2.5", "parameters.n_epochs: PPO needs int, got 2.5"),
+        ("n_steps = 8", "gamma = true", "parameters.gamma: PPO needs float, got True"),
+        ("n_steps = 8", "target_kl = [1.0]", "parameters.target_kl: PPO needs float | None, got [1.0]"),
     ],
 )
 def test_mistakes_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -95,7 +99,7 @@ def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
     path = write(tmp_path, GOOD + '[[match]]\nagents = ["mien"]\nalgorithm = "A2C"\n')
     with pytest.raises(RecipeError, match=r"unknown agent 'mien'\. Did you mean 'mine'"):
         train("copper_net", path, directory=tmp_path / "run")
-    for refused in ("n_steps = 1", 'batch_size = "a"', "policy_kwargs = { net_ach = [8] }"):
+    for refused in ("n_steps = 1", "batch_size = 0", "policy_kwargs = { net_ach = [8] }"):
         path = write(tmp_path, GOOD.replace("n_steps = 8", refused))
         with pytest.raises(RecipeError, match="agent 'refinery': PPO refuses its parameters"):
             train("copper_net", path, envs=1, directory=tmp_path / "run")
@@ -109,3 +113,5 @@ def test_parameters_are_those_of_the_library() -> None:
     assert {"learning_rate", "gamma", "n_steps"} <= set(parameters_of("PPO"))
     assert not {"env", "seed", "device"} & set(parameters_of("SAC"))
     assert {"PPO", "A2C", "SAC", "TD3", "DDPG", "TQC", "ARS", "TRPO"} <= set(algorithms())
+    for name in algorithms():
+        checked_parameters(name, {key: parameter.default for key, parameter in parameters_of(name).items()})

@@ -71,6 +71,16 @@ def test_lost_experience_is_an_error(damage: Callable[[Path], None], tmp_path: P
     recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
-    damage(RunDirectory(tmp_path).checkpoint / "use.replay.pkl")
-    with pytest.raises(RunError, match=r"use\.replay\.pkl: cannot be read"):
+    damage(RunDirectory(tmp_path).checkpoint / "use.replay.pkl.gz")
+    with pytest.raises(RunError, match=r"use\.replay\.pkl\.gz: cannot be read"):
         resume(tmp_path)
+
+
+def test_room_in_a_replay_buffer_costs_little(tmp_path: Path, ctrl_c_after: Any) -> None:
+    """A checkpoint is not as large as the buffer may become, but as what is in it."""
+    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 1_000_000})
+    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
+    saved = RunDirectory(tmp_path).checkpoint / "use.replay.pkl.gz"
+    assert saved.stat().st_size < 1e6

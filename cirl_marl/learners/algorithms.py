@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -59,31 +60,45 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     return known[name]
 
 
-def parameters_of(name: str) -> list[str]:
+def parameters_of(name: str) -> dict[str, inspect.Parameter]:
     """Return the constructor parameters that a recipe may set."""
     signature = inspect.signature(algorithm_class(name).__init__)
-    return [parameter for parameter in signature.parameters if parameter not in RESERVED]
+    return {name: parameter for name, parameter in signature.parameters.items() if name not in RESERVED}
 
 
 def checked_parameters(name: str, parameters: Mapping[str, Any]) -> None:
-    """Refuse parameters that the algorithm does not have.
+    """Refuse parameters that the algorithm does not have, and values of another type than its constructor states.
 
     Raises:
-        RecipeError: naming the parameter and the nearest that exists.
+        RecipeError: naming the parameter, and the nearest that exists or the type that it needs.
     """
     known = parameters_of(name)
-    for parameter in parameters:
+    for parameter, value in parameters.items():
         if parameter not in known:
             raise RecipeError(f"parameters: {unknown(f'parameter of {name}', parameter, known)}")
-    rate = parameters.get("learning_rate")
-    if isinstance(rate, Mapping) and not (set(rate) == {"linear_from", "linear_to"} and _are_numbers(rate.values())):
-        raise RecipeError(f"parameters.learning_rate: needs a number, or linear_from and linear_to, got {rate!r}")
-    noise = parameters.get("action_noise")
-    if noise is not None:
-        if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"} or not _are_numbers([noise["sigma"]]):
-            raise RecipeError(f"parameters.action_noise: needs kind and a number sigma, got {noise!r}")
-        if noise["kind"] not in NOISES:
-            raise RecipeError(f"parameters.action_noise: {unknown('kind', noise['kind'], NOISES)}")
+        if parameter == "learning_rate" and isinstance(value, Mapping):
+            if not (set(value) == {"linear_from", "linear_to"} and _are_numbers(value.values())):
+                raise RecipeError(f"parameters.learning_rate: needs a number, or linear_from and linear_to: {value!r}")
+        elif parameter == "action_noise" and value is not None:
+            _check_noise(value)
+        else:
+            _check_type(name, known[parameter], value)
+
+
+def _check_noise(noise: object) -> None:
+    if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"} or not _are_numbers([noise["sigma"]]):
+        raise RecipeError(f"parameters.action_noise: needs kind and a number sigma, got {noise!r}")
+    if noise["kind"] not in NOISES:
+        raise RecipeError(f"parameters.action_noise: {unknown('kind', noise['kind'], NOISES)}")
+
+
+def _check_type(name: str, parameter: inspect.Parameter, value: object) -> None:
+    stated = TypeAdapter(parameter.annotation, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
+    try:
+        stated.validate_python(value)
+    except ValidationError:
+        needs = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
+        raise RecipeError(f"parameters.{parameter.name}: {name} needs {needs}, got {value!r}") from None
 
 
 def checked_policy(name: str, policy: str) -> None:

@@ -7,8 +7,8 @@
       network.toml         the definition that was trained on
       versions.json        of Python and of every package that matters
       status.json          state, joint steps, the checkpoint that counts; rewritten last, atomically
-      checkpoints/NNN/     LEARNER.zip (policy and optimiser), LEARNER.normaliser.pkl, LEARNER.replay.pkl; an
-                           independent learner has the name of its agent
+      checkpoints/NNN/     LEARNER.zip (policy and optimiser), LEARNER.normaliser.pkl,
+                           LEARNER.replay.pkl.gz; an independent learner has the name of its agent
       metrics.csv          one row an episode: λ̄, service level, return of each agent
       tensorboard/LEARNER/ learning curves of each learner
       evaluation.json      written by an evaluation

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import math
 import pickle
 import zlib
@@ -21,12 +23,11 @@ from cirl_marl.errors import RecipeError, RunError
 from cirl_marl.learners.algorithms import algorithm_class, build
 from cirl_marl.learners.demonstrations import Demonstrator, demonstrate
 from cirl_marl.learners.recipe import Learner
-from cirl_marl.learners.run import write_atomically
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams, global_streams_kept
 
 UNREADABLE = (
-    OSError, EOFError, pickle.UnpicklingError, ImportError,
+    OSError, EOFError, zlib.error, pickle.UnpicklingError, ImportError,
     AssertionError, AttributeError, IndexError, TypeError, ValueError,
 )  # fmt: skip
 """What a damaged file, or one of something else, raises when it is unpickled."""
@@ -98,9 +99,9 @@ class Trainee:
             self.model = load_model(folder, self.name, self.spec.algorithm, env=self.env)
             self.model.action_space.seed(self._seed)  # loading seeds it as at the beginning of the run
             if isinstance(self.model, OffPolicyAlgorithm):
-                replay = folder / f"{self.name}.replay.pkl"
+                replay = folder / f"{self.name}.replay.pkl.gz"
                 try:
-                    with replay.open("rb") as file:
+                    with gzip.open(replay, "rb") as packed, io.BufferedReader(packed) as file:
                         self.model.load_replay_buffer(file)
                 except UNREADABLE as error:
                     raise RunError(f"{replay}: cannot be read: {error}; it holds what '{self.name}' saw") from error
@@ -163,7 +164,9 @@ class Trainee:
         if isinstance(self.env, VecNormalize):
             self.env.save(str(folder / f"{self.name}.normaliser.pkl"))
         if replay and isinstance(self.model, OffPolicyAlgorithm) and self.model.replay_buffer is not None:
-            write_atomically(folder / f"{self.name}.replay.pkl", self.model.save_replay_buffer)
+            path = folder / f"{self.name}.replay.pkl.gz"  # packed, as a buffer has room for much more than it holds
+            with gzip.open(path, "wb", compresslevel=1) as packed, io.BufferedWriter(packed) as file:
+                self.model.save_replay_buffer(file)
 
     def close(self) -> None:
         """Close the log files."""
