@@ -354,7 +354,7 @@ def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
         (["train"], "needs either NETWORK or --resume RUN"),
         (["train", "--resume", "nowhere"], "unknown run directory 'nowhere'"),
-        (["train", "--resume", "nowhere", "--steps", "5", "--seed", "1"], "leave out --steps, --seed"),
+        (["train", "--resume", "nowhere", "--envs", "5", "--seed", "1"], "leave out --envs, --seed"),
         (["show", "copper_net", "--picture", "picture.pdf"], "needs the name of a .png file"),
         (["evaluate", "nowhere"], "unknown run directory 'nowhere'"),
         (["simulate", "copper_net", "--control", "nutral"], "Did you mean 'neutral'?"),

@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl import CirlError, LearnerError, RunError
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners.recipe import Learner, Run
+from cirl_marl.learners.trainee import load_model
 
 
 class FailsAt(BaseCallback):
@@ -84,3 +85,37 @@ def test_room_in_a_replay_buffer_costs_little(tmp_path: Path, ctrl_c_after: Any)
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
     saved = RunDirectory(tmp_path).checkpoint / "use.replay.pkl.gz"
     assert saved.stat().st_size < 1e6
+
+
+def test_a_complete_run_goes_on_to_more_steps(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:
+    """It learns on from where it was, by the schedule of a run of so many steps, and can be interrupted again."""
+    with_schedule = ppo_recipe.learner.parameters | {"learning_rate": {"linear_from": 1e-2, "linear_to": 0.0}}
+    learner = ppo_recipe.learner.model_copy(update={"parameters": with_schedule})
+    recipe = ppo_recipe.model_copy(update={"learner": learner})
+    train("copper_net", recipe, directory=tmp_path, horizon=5)
+    run = RunDirectory(tmp_path)
+    before = run.metrics()
+    with pytest.raises(KeyboardInterrupt):
+        resume(tmp_path, steps=160, report=ctrl_c_after(50))
+    policy = load_model(run.checkpoint, "mine", "PPO").policy
+    assert policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-2 * (1 - 120 / 160))
+    model = resume(tmp_path).trainees["mine"].model
+    assert (run.status["state"], run.status["joint_steps"], run.config.steps) == ("complete", 85, 160)
+    assert 160 <= model.num_timesteps <= 170  # the rollout that was interrupted is begun anew
+    after = run.metrics()
+    assert after["joint_step"][: len(before["joint_step"])] == before["joint_step"]
+    assert after["joint_step"][-1] == 85
+    for steps in (None, 160, 170):
+        with pytest.raises(CirlError, match=r"complete \(170 environment steps\)|at least 171"):
+            resume(tmp_path, steps=steps)
+    assert run.config.steps == 160
+
+
+def test_what_needs_its_past_does_not_go_on_without(tmp_path: Path) -> None:
+    """A complete run has no replay buffers; it says so, and stays what it was."""
+    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
+    recipe = Recipe(name="x", title="x", run=Run(steps=20, envs=1), learner=learner)
+    train("copper_net", recipe, agents=["use"], directory=tmp_path)
+    with pytest.raises(RunError, match=r"keep no replay buffers, without which \['use'\] cannot go on"):
+        resume(tmp_path, steps=40)
+    assert (RunDirectory(tmp_path).status["state"], RunDirectory(tmp_path).config.steps) == ("complete", 20)

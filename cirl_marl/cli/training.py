@@ -27,7 +27,9 @@ def train(
         str | None, typer.Option(help=f"{', '.join(OBSERVE)}; default: the recipe's, else the definition's.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Run directory; default: runs/NETWORK-RECIPE-seedN.")] = None,
-    resume: Annotated[Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run; with --steps, to so many.")
+    ] = None,
     episodes: Episodes = 64,
 ) -> None:
     """Train one learner per compartment, all at once, then evaluate them and draw what changed."""
@@ -43,7 +45,7 @@ def train(
     with training_bar() as report:
         try:
             if resume is not None:
-                training = learners.resume(resume, report=report)
+                training = learners.resume(resume, steps=steps, report=report)
             else:
                 training = learners.train(
                     str(network),
@@ -119,7 +121,7 @@ def _only_resume(context: typer.Context) -> None:
     given = [
         f"--{name}"
         for name in context.params
-        if name not in ("resume", "network", "episodes")
+        if name not in ("resume", "network", "episodes", "steps")
         and getattr(context.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT"
     ]
     if given:

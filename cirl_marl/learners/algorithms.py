@@ -115,14 +115,19 @@ def checked_policy(name: str, policy: str) -> None:
         raise RecipeError(f"policy: {unknown(f'policy of {name} for vectors', policy, known)}")
 
 
+def has_replay_buffer(name: str) -> bool:
+    """Return whether the algorithm learns from what it keeps of the past."""
+    return issubclass(algorithm_class(name), OffPolicyAlgorithm)
+
+
 def checked_off_policy(name: str) -> None:
     """Refuse an algorithm that has no replay buffer to keep demonstrations in.
 
     Raises:
         RecipeError: naming those that have one.
     """
-    if not issubclass(algorithm_class(name), OffPolicyAlgorithm):
-        fit = [other for other, found in algorithms().items() if issubclass(found, OffPolicyAlgorithm)]
+    if not has_replay_buffer(name):
+        fit = [other for other in algorithms() if has_replay_buffer(other)]
         raise RecipeError(f"demonstrations: {name} has no replay buffer to keep them in; use one of {', '.join(fit)}")
 
 

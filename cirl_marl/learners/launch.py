@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl.catalogue import load_network
 from cirl_marl.definition import write_network
 from cirl_marl.errors import CirlError, RunError, unknown
+from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.recipe import OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run import RunConfig, RunDirectory
 from cirl_marl.learners.training import Progress, Training
@@ -88,20 +89,39 @@ def train(
     return training
 
 
-def resume(directory: str | Path, *, report: Callable[[Progress], None] | None = None) -> Training:
-    """Go on with an interrupted run from its last checkpoint, with fresh episodes and fresh random streams.
+def resume(
+    directory: str | Path, *, steps: int | None = None, report: Callable[[Progress], None] | None = None
+) -> Training:
+    """Go on with an interrupted run from its last checkpoint, or with a complete one to more steps than it has.
 
-    Checkpoints of unfinished runs hold the replay buffers, so that demonstrations are not lost; a learner that was in
-    the middle of them gets the rest.
+    Episodes and random streams are fresh. Checkpoints of unfinished runs hold the replay buffers, so that
+    demonstrations are not lost; a learner that was in the middle of them gets the rest. Schedules of learning rates go
+    on as if the run had been meant to have ``steps`` from the beginning.
+
+    Args:
+        directory: the run.
+        steps: environment steps of the whole run, summed over the copies; None takes what was first asked for.
+        report: called after every joint step.
 
     Raises:
-        RunError: if the run is complete, or its directory is not.
+        CirlError: if the run has ``steps`` behind it.
+        RunError: if nothing is left to do, if a complete run no longer has the replay buffers that it needs, or if its
+            directory is not whole.
     """
     run = RunDirectory(directory)
     config, status = run.config, run.status
-    if status["state"] == "complete":
-        raise RunError(f"{run.path}: the run is complete ({status['joint_steps']} joint steps); nothing is left to do")
+    done, complete = status["joint_steps"] * config.envs, status["state"] == "complete"
+    if steps is not None:
+        config = replace(config, steps=_whole("steps", steps, done + 1))
+    elif complete:
+        raise RunError(f"{run.path}: the run is complete ({done:,} environment steps); give more steps to go on")
+    if complete:
+        buffered = [group.name for group in run.groups() if has_replay_buffer(group.spec.algorithm)]
+        if buffered:
+            raise RunError(f"{run.path}: complete runs keep no replay buffers, without which {buffered} cannot go on")
     training = Training(config, run.make_env(config.envs), run)
+    if steps is not None:
+        run.extend(config)
     training.keep_in(run)
     training.start(report=report)
     return training

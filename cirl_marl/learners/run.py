@@ -161,6 +161,12 @@ class RunDirectory:
         status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "reason": reason}
         write_json(self.path / "status.json", status)
 
+    def extend(self, config: RunConfig) -> None:
+        """Let the run go on to the steps of ``config``, which is the run's but for these."""
+        write_json(self.path / "config.json", config.as_dict())
+        status = self.status
+        self.set_status("running", status["joint_steps"], status["checkpoint"])
+
     @property
     def checkpoint(self) -> Path:
         """The newest complete checkpoint.
