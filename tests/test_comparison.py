@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from cirl_marl.catalogue import load_network
 from cirl_marl.comparison import compare
+from cirl_marl.comparison.contenders import differences
 from cirl_marl.comparison.files import FILES, write_comparison
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners import Progress, RunDirectory, train
@@ -22,6 +26,7 @@ from cirl_marl.pareto import pareto
 from cirl_marl.report.run import evaluate_run
 from cirl_marl.results import published
 from cirl_marl.statistics import interquartile_mean
+from cirl_marl.vector_env import VectorEnv
 
 
 @pytest.fixture(scope="module")
@@ -213,3 +218,41 @@ def test_reports_keep_the_gap(runs: list[Path]) -> None:
     assert (runs[0] / "evaluation.json").read_text() == kept
     figures, _, _ = evaluate_run(RunDirectory(runs[0]), episodes=3, bounds=False)
     assert json.loads((runs[0] / "evaluation.json").read_text()) == figures
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"episode": {"horizon": 7}}, r"^horizon 7, not \d+$"),
+        ({"episode": {"control_interval": 2.0}}, r"^episode Episode\(control_interval=2\.0, "),
+        ({"episode": {"solver": "rk4", "solver_step": 0.05}}, r"^episode .*solver='rk4'"),
+        ({"objective": {"reference_interval": 2.0}}, r"^reference interval 2\.0, not 1\.0$"),
+        ({"objective": {"net_zero": "abs"}}, r"^net_zero 'abs', not 'signed'$"),
+        ({"objective": {"circularity_weight": 0.9}}, None),
+        ({"objective": {"reward": "local"}}, None),
+        ({"observation": {"mode": "full"}}, None),
+    ],
+)
+def test_what_makes_another_episode_is_named(changes: dict[str, dict[str, object]], message: str | None) -> None:
+    """One change, one reason; rewards and observations are no reason not to compare."""
+    network = load_network("copper_net")
+    env, other = (VectorEnv(n, num_envs=1) for n in (network.with_options(**changes), network))
+    found = list(differences(env, other))
+    assert not found if message is None else len(found) == 1 and re.search(message, found[0])
+
+
+def test_other_parts_and_agents_make_another_episode() -> None:
+    """Compartments and services that differ are named, as are those who act, and no more than five of them."""
+    network = load_network("copper_net")
+    env = VectorEnv(network, num_envs=1)
+    fewer = VectorEnv(network, num_envs=1, agents=["mine"])
+    assert list(differences(fewer, env)) == [f"agents ['mine'], not {list(env.agents)}"]
+    for part in ("nodes", "arcs", "services"):
+        first, *rest = getattr(network, part)
+        field = "low" if part == "services" else "scale"
+        other: Any = {part: (replace(first, **{field: 3.0 * getattr(first, field)}), *rest)}
+        changed = replace(network, **other)
+        assert list(differences(VectorEnv(changed, num_envs=1), env)) == [f"the definition of '{first.id}'"]
+    nodes = tuple(replace(node, scale=3.0 * node.scale) for node in network.nodes)
+    (many,) = differences(VectorEnv(replace(network, nodes=nodes), num_envs=1), env)
+    assert re.fullmatch(r"the definition of ('\w+', ){4}'\w+' and others", many)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -209,6 +210,63 @@ def test_different_rollouts_and_shares_finish_cleanly(ppo_recipe: Recipe) -> Non
     assert steps["use"] == 24
     assert steps["refinery"] == 80
     assert training.lockstep.joint_steps == 42
+
+
+def test_who_has_learnt_enough_acts_without_exploring(ppo_recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Past its share a learner's actions are the mean of its policy; before, they are drawn."""
+    match = Match(agents=["use"], algorithm="A2C", parameters={"n_steps": 4}, share_of_steps=0.5)
+    seen, done = VectorEnv("copper_net", num_envs=2, horizon=20).reset(seed=0)["use"], []
+    step = VectorEnv.step
+
+    def recorded(env: VectorEnv, actions: Any) -> Any:
+        nonlocal seen
+        done.append((seen, actions["use"].copy()))
+        result = step(env, actions)
+        seen = result[0]["use"].copy()
+        return result
+
+    monkeypatch.setattr(VectorEnv, "step", recorded)
+    training = train("copper_net", ppo_recipe.model_copy(update={"match": [match]}), horizon=20)
+    model, normaliser = training.trainees["use"].model, training.trainees["use"].env
+    assert model.num_timesteps == 40
+    assert isinstance(normaliser, VecNormalize)
+    means = [model.predict(normaliser.normalize_obs(shown), deterministic=True)[0] for shown, _ in done]
+    same = [np.array_equal(mean, actions) for mean, (_, actions) in zip(means, done, strict=True)]
+    assert same == [False] * 20 + [True] * 20
+
+
+NAME: ContextVar[str] = ContextVar("NAME", default="nobody")
+
+
+class Signs(BaseCallback):
+    """A callback that may set a context variable, as libraries do, and notes what it reads at every step."""
+
+    def __init__(self, name: str | None) -> None:
+        """Take the value to set; None sets none."""
+        super().__init__()
+        self.name = name
+        self.read: set[str] = set()
+
+    def _on_training_start(self) -> None:
+        if self.name is not None:
+            NAME.set(self.name)
+
+    def _on_step(self) -> bool:
+        self.read.add(NAME.get())
+        return True
+
+
+def test_learners_have_contexts_of_their_own(ppo_recipe: Recipe) -> None:
+    """Learners begin with the caller's context; what one sets in its own no other sees, nor who called."""
+    callbacks = {"mine": Signs("mine"), "use": Signs("use"), "refinery": Signs(None)}
+    token = NAME.set("caller")
+    try:
+        train("copper_net", ppo_recipe, callbacks=callbacks)
+        assert NAME.get() == "caller"
+    finally:
+        NAME.reset(token)
+    read = {name: callback.read for name, callback in callbacks.items()}
+    assert read == {"mine": {"mine"}, "use": {"use"}, "refinery": {"caller"}}
 
 
 class Explodes(BaseCallback):
