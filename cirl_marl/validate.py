@@ -108,7 +108,7 @@ def _node_problems(network: Network, node: Node) -> Iterator[str]:
         yield f"node '{node.id}': initial range [{low}, {high}] is empty or not finite"
     elif low < 0 and network.episode.solver != "euler":
         yield f"node '{node.id}': initial stock {low} is negative"
-    yield from _common_problems(f"node '{node.id}'", node, network.episode)
+    yield from _common_problems(f"node '{node.id}'", node, network)
 
 
 def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
@@ -141,7 +141,7 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
         yield f"{where}: control.kind 'flow' needs law 'controlled', not '{arc.law}'"
     if arc.control and arc.control.kind is ControlKind.RATE and arc.law is Law.CONTROLLED:
         yield f"{where}: law 'controlled' needs control.kind 'flow', not 'rate'"
-    yield from _common_problems(where, arc, network.episode)
+    yield from _common_problems(where, arc, network)
 
 
 def _model_flow_problems(where: str, arc: Arc, network: Network) -> Iterator[str]:
@@ -195,7 +195,7 @@ def _whole(ratio: float) -> bool:
     return math.isfinite(ratio) and math.isclose(ratio, round(ratio), rel_tol=1e-9, abs_tol=1e-9)
 
 
-def _common_problems(where: str, compartment: Compartment, episode: Episode) -> Iterator[str]:
+def _common_problems(where: str, compartment: Compartment, network: Network) -> Iterator[str]:
     if not math.isfinite(compartment.scale) or compartment.scale <= 0:
         yield f"{where}: scale {compartment.scale} must be positive and finite"
     if compartment.set_point is not None and not math.isfinite(compartment.set_point):
@@ -219,17 +219,18 @@ def _common_problems(where: str, compartment: Compartment, episode: Episode) -> 
         return
     if control.kind is ControlKind.INPUT and not inputs:
         yield f"{where}: control.kind 'input' needs a model with inputs"
-    if control.kind is ControlKind.FLOW and control.low < 0 and episode.solver != "euler":
-        yield f"{where}: control.low {control.low} would reverse the flow; use a second arc"
+    unit = f" {network.mass_unit}/{network.time_unit}" if control.kind is ControlKind.FLOW else ""
+    if control.kind is ControlKind.FLOW and control.low < 0 and network.episode.solver != "euler":
+        yield f"{where}: control.low {control.low:g}{unit} would reverse the flow; use a second arc"
     if not all(map(math.isfinite, (control.low, control.neutral, control.high))):
         yield f"{where}: control bounds must be finite"
     elif not control.low <= control.neutral <= control.high or control.low == control.high:
         yield (
             f"{where}: control needs low <= neutral <= high and low < high, "
-            f"got {control.low}, {control.neutral}, {control.high}"
+            f"got {control.low:g}, {control.neutral:g}, {control.high:g}{unit}"
         )
     if control.kind is ControlKind.RATE and control.low < 0:
-        yield f"{where}: control.low {control.low} is negative; a valve cannot reverse a flow"
+        yield f"{where}: control.low {control.low:g} is negative; a valve cannot reverse a flow"
 
 
 def _service_problems(service: Service, network: Network, nodes: Mapping[str, Node]) -> Iterator[str]:

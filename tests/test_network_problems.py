@@ -29,8 +29,9 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
     [
         (
             {"nodes": (replace(A, control=BACKWARD), B), "arcs": (replace(LINK, law=Law.CONTROLLED, rate=0.0),)},
-            "reverse",
+            "low -5 kg/day would reverse the flow",
         ),
+        ({"nodes": (replace(A, control=replace(VALVE, neutral=3.0)), B)}, "neutral <= high .*, got 0, 3, 2$"),
         ({"arcs": (replace(LINK, times=(0.0, 5.0), flow=(1.0, 0.0)),)}, "times = .* law 'donor' takes rate"),
         ({"arcs": (replace(DELAYED, delay=1e-7),)}, "delay 1e-07 is not a whole number"),
         ({"arcs": (DELAYED,), "episode": Episode(control_interval=0.0)}, "control_interval 0.0 must be positive"),
