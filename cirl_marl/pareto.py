@@ -229,7 +229,7 @@ def _check_fit(network: Network, recipe: Recipe) -> None:
             f"recipe '{recipe.name}' is for scenario '{named}', the sweep for '{network.scenario_name}': ask for one"
         )
     env = _env(network, recipe)
-    recipe.check(env.network, env.agents)
+    recipe.check_agents(env.agents)
     if env.reward_mode not in WEIGHED:
         raise CirlError(
             f"recipe '{recipe.name}' is paid by '{env.reward_mode}', in which the weight of circularity has no part; "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import pytest
@@ -12,9 +13,9 @@ import pytest
 import cirl_marl
 from cirl_marl import DefinitionError, RecipeError
 from cirl_marl.catalogue import folder
-from cirl_marl.learners import load_recipe, train
+from cirl_marl.learners import Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import algorithms, checked_parameters, parameters_of
-from cirl_marl.learners.recipe import recipe_schema
+from cirl_marl.learners.recipe import Learner, Normalisation, recipe_schema
 
 GOOD = """
 name = "mine"
@@ -40,7 +41,7 @@ def test_catalogue_is_valid(name: str) -> None:
     document = tomllib.loads((folder("agents") / f"{name}.toml").read_text())
     jsonschema.validate(document, recipe_schema())
     for network in map(cirl_marl.load_network, cirl_marl.networks()):
-        recipe.check(network, network.agents)
+        recipe.check_agents(network.agents)
         assert all(recipe.learner_of(agent, network).algorithm in algorithms() for agent in network.agents)
 
 
@@ -106,6 +107,36 @@ def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
     with pytest.raises(cirl_marl.CirlError, match=r"unknown option 'observ'\. Did you mean 'observe'"):
         train("copper_net", write(tmp_path, GOOD), observ="full")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"environment": {"rewrad": "local"}}, "unknown option 'rewrad'. Did you mean 'reward'"),
+        ({"environment": {"num_envs": 3}}, "unknown option 'num_envs'"),
+        ({"learner": Learner(algorithm="SAC", policy="CentralCriticPolicy")}, "unknown policy of SAC"),
+        (
+            {
+                "learner": Learner(
+                    algorithm="PPO", policy="CentralCriticPolicy", normalise=Normalisation(observation=False)
+                )
+            },
+            "sees physical units",
+        ),
+        ({"learner": Learner(algorithm="PPP")}, "unknown algorithm 'PPP'"),
+    ],
+)
+def test_recipes_of_python_are_checked_like_files(changes: dict[str, Any], message: str, ppo_recipe: Recipe) -> None:
+    """A recipe object with a mistake is refused by name, before anything is trained."""
+    with pytest.raises(RecipeError, match=message):
+        train("copper_net", ppo_recipe.model_copy(update=changes))
+
+
+def test_lists_stand_for_tuples() -> None:
+    """TOML has no tuples; the library takes some parameters as such."""
+    checked_parameters("SAC", {"train_freq": [1, "episode"]})
+    with pytest.raises(RecipeError, match=r"train_freq: SAC needs int \| tuple\[int, str\]"):
+        checked_parameters("SAC", {"train_freq": ["episode", 1]})
 
 
 def test_parameters_are_those_of_the_library() -> None:

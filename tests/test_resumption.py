@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
-from cirl_marl import CirlError, LearnerError, RunError
-from cirl_marl.learners import Recipe, RunDirectory, resume, train
-from cirl_marl.learners.recipe import Learner, Run
+from cirl_marl import CirlError, LearnerError, RecipeError, RunError
+from cirl_marl.learners import Progress, Recipe, RunDirectory, resume, train
+from cirl_marl.learners.recipe import Demonstrations, Learner, Run
 from cirl_marl.learners.trainee import load_model
 
 
@@ -101,7 +101,7 @@ def test_a_complete_run_goes_on_to_more_steps(tmp_path: Path, ppo_recipe: Recipe
     assert policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-2 * (1 - 120 / 160))
     model = resume(tmp_path).trainees["mine"].model
     assert (run.status["state"], run.status["joint_steps"], run.config.steps) == ("complete", 85, 160)
-    assert 160 <= model.num_timesteps <= 170  # the rollout that was interrupted is begun anew
+    assert model.num_timesteps == 160  # the rollout that was interrupted is begun anew
     after = run.metrics()
     assert after["joint_step"][: len(before["joint_step"])] == before["joint_step"]
     assert after["joint_step"][-1] == 85
@@ -119,3 +119,97 @@ def test_what_needs_its_past_does_not_go_on_without(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"keep no replay buffers, without which \['use'\] cannot go on"):
         resume(tmp_path, steps=40)
     assert (RunDirectory(tmp_path).status["state"], RunDirectory(tmp_path).config.steps) == ("complete", 20)
+
+
+def test_an_interrupted_rollout_is_begun_anew(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:
+    """Steps whose rollout was lost do not count as learnt, however often the run is interrupted."""
+    parameters = ppo_recipe.learner.parameters | {"n_steps": 40}
+    learner = ppo_recipe.learner.model_copy(update={"parameters": parameters})
+    recipe = ppo_recipe.model_copy(update={"learner": learner, "run": Run(steps=160, envs=2)})
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", recipe, directory=tmp_path, report=ctrl_c_after(100))
+    for _ in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            resume(tmp_path, report=ctrl_c_after(60))
+    for trainee in resume(tmp_path).trainees.values():
+        assert trainee.model.num_timesteps == 160
+        assert trainee.model._n_updates == 2 * 2  # rollouts and epochs
+    assert RunDirectory(tmp_path).status["joint_steps"] == 50 + 3 * 30 + 40
+
+
+def test_a_run_is_trained_by_one_at_a_time(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """Neither do two trainings share a directory, nor the random streams of a process."""
+    train("copper_net", ppo_recipe, directory=tmp_path)
+    with RunDirectory(tmp_path).claimed(), pytest.raises(RunError, match="is being trained by another process"):
+        resume(tmp_path, steps=160)
+    refused = []
+
+    def nested(_: Progress) -> None:
+        with pytest.raises(CirlError, match="another training is under way in this process"):
+            train("copper_net", ppo_recipe)
+        refused.append(True)
+
+    resume(tmp_path, steps=160, report=nested)
+    assert len(refused) == 40
+
+
+def test_demonstrations_have_room_in_a_run_that_goes_on(tmp_path: Path, ctrl_c_after: Any) -> None:
+    """A run is not cut so short that nobody would learn from what is shown."""
+    shown = Demonstrations(controller="neutral", steps=60)
+    learner = Learner(algorithm="SAC", parameters={"buffer_size": 100}, demonstrations=shown)
+    recipe = Recipe(name="x", title="x", run=Run(steps=100, envs=1), learner=learner)
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
+    with pytest.raises(RecipeError, match="60 is more than the 30 steps"):
+        resume(tmp_path, steps=30)
+    assert RunDirectory(tmp_path).config.steps == 100
+
+
+def test_the_experience_of_another_learner_is_refused(tmp_path: Path, ctrl_c_after: Any) -> None:
+    """Replay buffers that were mixed up are found out before anybody learns from them."""
+    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
+    for name, observe in (("a", "local"), ("b", "full")):
+        options: dict[str, Any] = {"observe": observe}
+        recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), environment=options, learner=learner)
+        with pytest.raises(KeyboardInterrupt):
+            train("copper_net", recipe, agents=["use"], directory=tmp_path / name, report=ctrl_c_after(20))
+    kept = [RunDirectory(tmp_path / name).checkpoint / "use.replay.pkl.gz" for name in "ab"]
+    kept[0].replace(kept[1])
+    with pytest.raises(RunError, match=r"use\.replay\.pkl\.gz: holds what another learner saw"):
+        resume(tmp_path / "b")
+
+
+@pytest.mark.parametrize("algorithm", ["TD3", "SAC"])
+def test_a_policy_that_breaks_is_a_failure(algorithm: str, tmp_path: Path) -> None:
+    """Learners whose weights overflow end the run as failed, with a reason of one line."""
+    parameters = {"learning_starts": 2, "buffer_size": 100, "batch_size": 4, "learning_rate": 1e30}
+    recipe = Recipe(
+        name="x", title="x", run=Run(steps=40, envs=1), learner=Learner(algorithm=algorithm, parameters=parameters)
+    )
+    with pytest.raises(LearnerError, match="failed at joint step"):
+        train("copper_net", recipe, agents=["use"], directory=tmp_path)
+    status = RunDirectory(tmp_path).status
+    assert status["state"] == "failed"
+    assert "failed at joint step" in status["reason"]
+    assert "\n" not in status["reason"]
+
+
+def test_what_cannot_be_kept_is_refused_before_anything_is_written(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """Recipes of Python objects train in memory; a directory needs plain values."""
+    parameters = ppo_recipe.learner.parameters | {"learning_rate": lambda left: 1e-3 * left}
+    recipe = ppo_recipe.model_copy(update={"learner": Learner(algorithm="PPO", parameters=parameters)})
+    with pytest.raises(RunError, match="needs a recipe of plain values"):
+        train("copper_net", recipe, directory=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    assert train("copper_net", recipe).joint_steps == 40
+    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=np.int64(5))
+    assert RunDirectory(tmp_path / "run").config.options["horizon"] == 5
+
+
+def test_the_clock_goes_on(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """Training times of a run that went on add up."""
+    train("copper_net", ppo_recipe, directory=tmp_path, horizon=5)
+    resume(tmp_path, steps=160)
+    seconds = RunDirectory(tmp_path).metrics()["seconds"]
+    assert len(seconds) == 16
+    assert seconds == sorted(seconds)

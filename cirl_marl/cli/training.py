@@ -60,7 +60,7 @@ def train(
                     report=report,
                 )
         except KeyboardInterrupt:
-            console.print(f"\nstopped; everything learnt is saved. Go on with: cirl train --resume {directory}")
+            console.print(f"\nstopped; {_kept(directory)}", soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None
     assert training.run is not None
     _evaluate_and_draw(training.run.path, episodes, 0)
@@ -126,6 +126,19 @@ def _only_resume(context: typer.Context) -> None:
     ]
     if given:
         raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(given)}")
+
+
+def _kept(directory: Path) -> str:
+    """Say what a training that was stopped has left."""
+    from cirl_marl.learners.run import RunDirectory
+
+    run = RunDirectory(directory)
+    if not (directory / "status.json").is_file() or run.status["checkpoint"] is None:
+        return "nothing was learnt yet that could be saved"
+    status, go_on = run.status, f"Go on with: cirl train --resume {directory}"
+    if status["state"] == "interrupted":
+        return f"everything learnt is saved. {go_on}"
+    return f"what was learnt in the first {status['joint_steps'] * run.config.envs:,} steps is saved. {go_on}"
 
 
 def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:

@@ -95,10 +95,15 @@ def _check_noise(noise: object) -> None:
 def _check_type(name: str, parameter: inspect.Parameter, value: object) -> None:
     stated = TypeAdapter(parameter.annotation, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
     try:
-        stated.validate_python(value)
+        stated.validate_python(_as_tuple(value))
     except ValidationError:
         needs = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
         raise RecipeError(f"parameters.{parameter.name}: {name} needs {needs}, got {value!r}") from None
+
+
+def _as_tuple(value: Any) -> Any:
+    """Return what the library takes for a list of TOML, which knows no tuples."""
+    return tuple(value) if isinstance(value, list) else value
 
 
 def checked_policy(name: str, policy: str) -> None:
@@ -150,7 +155,7 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         RecipeError: for unknown parameters or values that the algorithm refuses.
     """
     checked_parameters(name, parameters)
-    arguments = copy.deepcopy(dict(parameters))  # the library writes into policy_kwargs
+    arguments = {key: _as_tuple(value) for key, value in copy.deepcopy(dict(parameters)).items()}
     rate = arguments.get("learning_rate")
     if isinstance(rate, Mapping):
         arguments["learning_rate"] = LinearSchedule(rate["linear_from"], rate["linear_to"], 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.recipe import OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run import RunConfig, RunDirectory
+from cirl_marl.learners.streams import global_streams_claimed
 from cirl_marl.learners.training import Progress, Training
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
@@ -60,15 +62,17 @@ def train(
         LearnerError: if a learner fails; what was learnt is saved first.
     """
     found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
+    found.check()
     for option in options:
         if option not in OPTIONS:
             raise CirlError(unknown("option", option, OPTIONS))
-    settings = found.environment | {name: value for name, value in options.items() if value is not None}
+    given = {name: value for name, value in options.items() if value is not None}
+    settings = found.environment | {n: v.item() if isinstance(v, np.generic) else v for n, v in given.items()}
     copies = found.run.envs if envs is None else _whole("envs", envs, 1)
     env = VectorEnv(network, num_envs=copies, agents=agents, **settings)
     if not env.agents:
         raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
-    found.check(env.network, env.agents)
+    found.check_agents(env.agents)
     settings.pop("scenario", None)
     config = RunConfig(
         network=env.network.name,
@@ -81,50 +85,69 @@ def train(
         options=settings,
     )
     found.check_demonstrations(config.steps)
-    training = Training(config, env)
-    training.check_callbacks(callbacks or {})
-    if directory is not None:
-        training.keep_in(_create(Path(directory), config, env.network))
-    training.start(callbacks=callbacks, report=report)
+    with ExitStack() as claims:
+        claims.enter_context(global_streams_claimed())
+        training = Training(config, env)
+        training.check_callbacks(callbacks or {})
+        if directory is not None:
+            run = _create(Path(directory), config, env.network)
+            claims.enter_context(run.claimed())
+            training.keep_in(run)
+        training.start(callbacks=callbacks, report=report)
     return training
 
 
 def resume(
-    directory: str | Path, *, steps: int | None = None, report: Callable[[Progress], None] | None = None
+    directory: str | Path,
+    *,
+    steps: int | None = None,
+    callbacks: Mapping[str, BaseCallback] | None = None,
+    report: Callable[[Progress], None] | None = None,
 ) -> Training:
     """Go on with an interrupted run from its last checkpoint, or with a complete one to more steps than it has.
 
-    Episodes and random streams are fresh. Checkpoints of unfinished runs hold the replay buffers, so that
-    demonstrations are not lost; a learner that was in the middle of them gets the rest. Schedules of learning rates go
-    on as if the run had been meant to have ``steps`` from the beginning.
+    Episodes and random streams are fresh, and a rollout that was under way is begun anew. Checkpoints of unfinished
+    runs hold the replay buffers, so that demonstrations are not lost; a learner that was in the middle of them gets the
+    rest. Schedules of learning rates go on as if the run had been meant to have ``steps`` from the beginning.
 
     Args:
         directory: the run.
         steps: environment steps of the whole run, summed over the copies; None takes what was first asked for.
+        callbacks: Stable-Baselines3 callbacks by name of the learner; a run does not keep those that it began with.
         report: called after every joint step.
 
     Raises:
         CirlError: if the run has ``steps`` behind it.
-        RunError: if nothing is left to do, if a complete run no longer has the replay buffers that it needs, or if its
-            directory is not whole.
+        RunError: if nothing is left to do, if a complete run no longer has the replay buffers that it needs, if it is
+            being trained, or if its directory is not whole.
     """
     run = RunDirectory(directory)
-    config, status = run.config, run.status
+    config = run.config
+    with global_streams_claimed(), run.claimed():
+        config = _extended(run, config, steps)
+        training = Training(config, run.make_env(config.envs), run)
+        training.check_callbacks(callbacks or {})
+        if steps is not None:
+            run.extend(config)
+        training.keep_in(run)
+        training.start(callbacks=callbacks, report=report)
+    return training
+
+
+def _extended(run: RunDirectory, config: RunConfig, steps: int | None) -> RunConfig:
+    """Return the configuration by which a run goes on."""
+    status = run.status
     done, complete = status["joint_steps"] * config.envs, status["state"] == "complete"
     if steps is not None:
         config = replace(config, steps=_whole("steps", steps, done + 1))
+        config.recipe.check_demonstrations(config.steps)
     elif complete:
         raise RunError(f"{run.path}: the run is complete ({done:,} environment steps); give more steps to go on")
     if complete:
         buffered = [group.name for group in run.groups() if has_replay_buffer(group.spec.algorithm)]
         if buffered:
             raise RunError(f"{run.path}: complete runs keep no replay buffers, without which {buffered} cannot go on")
-    training = Training(config, run.make_env(config.envs), run)
-    if steps is not None:
-        run.extend(config)
-    training.keep_in(run)
-    training.start(report=report)
-    return training
+    return config
 
 
 def _create(directory: Path, config: RunConfig, network: Network) -> RunDirectory:

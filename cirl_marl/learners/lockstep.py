@@ -14,7 +14,7 @@ from greenlet import GreenletExit, greenlet
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from cirl_marl.errors import LearnerError
+from cirl_marl.errors import ControlError, LearnerError
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.views import Arrays, OneAgent, View
@@ -122,7 +122,10 @@ class Lockstep:
         for seat in self.seats.values():
             assert seat.action is not None
             actions.update(seat.view.act(seat.action))
-        observations, rewards, _, truncations, infos = self.env.step(actions)
+        try:
+            observations, rewards, _, truncations, infos = self.env.step(actions)
+        except ControlError as error:
+            raise LearnerError(f"a learner failed at joint step {self.joint_steps}: {error}") from error
         self.joint_steps += 1
         done = next(iter(truncations.values()))
         self._returns += list(rewards.values())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,6 +25,9 @@ from cirl_marl.learners.views import Scheme, View, view_of
 from cirl_marl.mistakes import mistakes_of
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
+
+OPTIONS = ("reward", "observe", "circularity", "circularity_weight", "horizon", "scenario")
+"""What a recipe may say of the environment."""
 
 
 class _Table(BaseModel):
@@ -75,6 +78,18 @@ class Learner(_Table):
     demonstrations: Demonstrations | None = Field(
         None, description="of an off-policy learner: whose transitions fill its replay buffer before it acts itself"
     )
+
+    def check(self) -> None:
+        """Refuse algorithms, parameters and policies that there are not.
+
+        Raises:
+            RecipeError: naming the key, the value and the nearest that there is.
+        """
+        algorithm_class(self.algorithm)
+        checked_parameters(self.algorithm, self.parameters)
+        checked_policy(self.algorithm, self.policy)
+        if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
+            raise RecipeError(f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true")
 
     def check_demonstrations(self, steps: int) -> None:
         """Refuse demonstrations that the algorithm cannot keep, or that a run of ``steps`` has no room for.
@@ -175,7 +190,17 @@ class Recipe(_Table):
             found[name] = Group(name, (*members, agent), spec)
         return tuple(found.values())
 
-    def check(self, network: Network, agents: Sequence[str]) -> None:
+    def check(self) -> None:
+        """Refuse what is wrong whatever the network and the number of steps.
+
+        Raises:
+            RecipeError: naming every mistake.
+        """
+        mistakes = list(self.mistakes())
+        if mistakes:
+            raise RecipeError(f"recipe '{self.name}': {'; '.join(mistakes)}")
+
+    def check_agents(self, agents: Sequence[str]) -> None:
         """Refuse matches that name agents which do not act.
 
         Raises:
@@ -198,6 +223,17 @@ class Recipe(_Table):
             except RecipeError as error:
                 raise RecipeError(f"recipe '{self.name}': {where}.{error}") from None
 
+    def mistakes(self) -> Iterator[str]:
+        """Yield what is wrong whatever the network and the number of steps: key, value and the nearest valid name."""
+        for key in self.environment:
+            if key not in OPTIONS:
+                yield f"environment: {unknown('option', key, OPTIONS)}"
+        for where, learner in self.learners():
+            try:
+                learner.check()
+            except RecipeError as error:
+                yield f"{where}.{error}"
+
     def learners(self) -> tuple[tuple[str, Learner], ...]:
         """Return every learner and what messages call its table."""
         return ("learner", self.learner), *((f"match.{i}", match) for i, match in enumerate(self.match))
@@ -212,9 +248,6 @@ def recipe_schema() -> dict[str, Any]:
     return schema
 
 
-OPTIONS = ("reward", "observe", "circularity", "circularity_weight", "horizon", "scenario")
-
-
 def load_recipe(name: str | Path) -> Recipe:
     """Read a recipe of the catalogue, or of a file if ``name`` ends in ``.toml``.
 
@@ -227,20 +260,12 @@ def load_recipe(name: str | Path) -> Recipe:
         recipe = Recipe.model_validate(document)
     except ValidationError as error:
         raise DefinitionError(str(path), mistakes_of(error, Recipe)) from None
-    mistakes = []
-    for key in recipe.environment:
-        if key not in OPTIONS:
-            mistakes.append(f"environment: {unknown('option', key, OPTIONS)}")
-    for where, learner in recipe.learners():
+    mistakes = list(recipe.mistakes())
+    if not mistakes:
         try:
-            algorithm_class(learner.algorithm)
-            checked_parameters(learner.algorithm, learner.parameters)
-            checked_policy(learner.algorithm, learner.policy)
-            if learner.policy == CENTRAL_CRITIC and not learner.normalise.observation:
-                raise RecipeError(f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true")
-            learner.check_demonstrations(recipe.run.steps)
+            recipe.check_demonstrations(recipe.run.steps)
         except RecipeError as error:
-            mistakes.append(f"{where}.{error}")
+            mistakes.append(str(error))
     if mistakes:
         raise DefinitionError(str(path), mistakes)
     return recipe

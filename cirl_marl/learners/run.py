@@ -22,11 +22,14 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from cirl_marl.catalogue import load_network
 from cirl_marl.errors import RunError, unknown
@@ -117,17 +120,39 @@ class RunDirectory:
         """Start a run in a new or empty directory.
 
         Raises:
-            RunError: if the directory already holds something.
+            RunError: if the directory already holds something, or the configuration cannot be written to a file.
         """
         run = cls(path)
         if run.path.exists() and (not run.path.is_dir() or any(run.path.iterdir())):
             raise RunError(f"{run.path}: already exists and is not empty; choose another directory, or resume it")
+        try:
+            plain = config.as_dict()
+            json.dumps(plain)
+        except (TypeError, ValueError) as error:
+            raise RunError(f"{run.path}: a run on disk needs a recipe of plain values: {error}") from error
         run.path.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(definition, run.path / "network.toml")
         write_json(run.path / "versions.json", versions())
-        write_json(run.path / "config.json", config.as_dict())
+        write_json(run.path / "config.json", plain)
         run.set_status("running", 0, None)
         return run
+
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Keep other processes from training this run at the same time.
+
+        Raises:
+            RunError: if one does.
+        """
+        lock = FileLock(self.path / ".lock", blocking=False)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise RunError(f"{self.path}: is being trained by another process") from None
+        try:
+            yield
+        finally:
+            lock.release()
 
     @property
     def config(self) -> RunConfig:
@@ -260,15 +285,21 @@ def _complete_rows(path: Path) -> list[list[str]]:
 
 
 class MetricsFile:
-    """Appends one row per joint episode to ``metrics.csv``."""
+    """Appends one row per joint episode to ``metrics.csv``.
+
+    Attributes:
+        seconds: training time of the rows that were there.
+    """
 
     def __init__(self, path: Path, agents: Sequence[str], done: int) -> None:
         """Open the file; rows past joint step ``done``, which a resumed run will repeat, are dropped."""
         columns = ["joint_step", "env_steps", "seconds", "circularity", "service_level"]
         rows = [columns + [f"return:{agent}" for agent in agents]]
+        self.seconds = 0.0
         if path.is_file():
             try:
                 rows += [row for row in _complete_rows(path)[1:] if float(row[0]) <= done]
+                self.seconds = float(rows[-1][2]) if len(rows) > 1 else 0.0
             except (ValueError, IndexError) as error:
                 raise RunError(f"{path}: cannot be read: {error}") from error
         text = "".join(",".join(row) + "\n" for row in rows)

@@ -8,6 +8,7 @@ switch, so that a learner computes exactly what it would compute alone.
 from __future__ import annotations
 
 import random
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -15,6 +16,10 @@ import numpy as np
 import torch
 from numpy.random.mtrand import get_bit_generator, set_bit_generator
 from stable_baselines3.common.utils import set_random_seed
+
+from cirl_marl.errors import CirlError
+
+_IN_USE = threading.Lock()
 
 
 class Streams:
@@ -75,3 +80,18 @@ def global_streams_kept() -> Iterator[None]:
     finally:
         before._enter()
         random.setstate(python)
+
+
+@contextmanager
+def global_streams_claimed() -> Iterator[None]:
+    """Keep the global streams of this process for one training.
+
+    Raises:
+        CirlError: if another training, in another thread or in a callback, has them.
+    """
+    if not _IN_USE.acquire(blocking=False):
+        raise CirlError("another training is under way in this process and draws from its random streams; use another")
+    try:
+        yield
+    finally:
+        _IN_USE.release()

@@ -17,6 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cirl_marl.errors import RecipeError, RunError
@@ -36,7 +37,9 @@ UNREADABLE = (
 def derived_seed(seed: int, *names: str | int) -> int:
     """Return a seed below 2³¹ that depends on ``seed`` and ``names`` only, not on who else learns.
 
-    >>> derived_seed(0, "mine") == derived_seed(0, "mine") != derived_seed(0, "use")
+    Up to three names, zeros at the end do not count, so that what begins at step 0 needs no number.
+
+    >>> derived_seed(0, "mine") == derived_seed(0, "mine", 0) != derived_seed(0, "use")
     True
     """
     keys = [name if isinstance(name, int) else zlib.crc32(name.encode()) for name in names]
@@ -60,13 +63,16 @@ class Trainee:
     env: VecEnv
     demonstrator: Demonstrator | None = None
 
-    def __init__(self, seat: Seat, spec: Learner, seed: int) -> None:
-        """Give the learner its streams; ``build`` or ``load`` makes the algorithm."""
+    def __init__(self, seat: Seat, spec: Learner, seed: int, *, done: int = 0) -> None:
+        """Give the learner its streams, others after each number of joint steps ``done`` before.
+
+        ``build`` or ``load`` makes the algorithm.
+        """
         self.name = seat.name
         self.spec = spec
         self.seat = seat
         seat.bootstrap = spec.bootstrap
-        self._seed = derived_seed(seed, seat.name)
+        self._seed = derived_seed(seed, seat.name, done)
         noisy = spec.parameters.get("action_noise") is not None
         self.streams = Streams(self._seed, keep_gaussian=noisy)
 
@@ -91,21 +97,32 @@ class Trainee:
     def load(self, folder: Path) -> Trainee:
         """Go on with the algorithm saved in ``folder``, and what it has seen.
 
+        A rollout that was under way is lost, so its steps are not behind the learner but before it.
+
         Raises:
-            RunError: if a file is missing or cannot be read.
+            RunError: if a file is missing, cannot be read, or is of another learner.
         """
         with self.streams.active():
             self.env = load_normaliser(folder, self.name, self.spec, self.seat) or self.seat
             self.model = load_model(folder, self.name, self.spec.algorithm, env=self.env)
             self.model.action_space.seed(self._seed)  # loading seeds it as at the beginning of the run
+            if isinstance(self.model, OnPolicyAlgorithm):
+                self.model.num_timesteps -= self.model.num_timesteps % (self.model.n_steps * self.seat.num_envs)
             if isinstance(self.model, OffPolicyAlgorithm):
-                replay = folder / f"{self.name}.replay.pkl.gz"
-                try:
-                    with gzip.open(replay, "rb") as packed, io.BufferedReader(packed) as file:
-                        self.model.load_replay_buffer(file)
-                except UNREADABLE as error:
-                    raise RunError(f"{replay}: cannot be read: {error}; it holds what '{self.name}' saw") from error
+                self._load_replay_buffer(self.model, folder / f"{self.name}.replay.pkl.gz")
         return self
+
+    def _load_replay_buffer(self, model: OffPolicyAlgorithm, path: Path) -> None:
+        try:
+            with gzip.open(path, "rb") as packed, io.BufferedReader(packed) as file:
+                model.load_replay_buffer(file)
+        except UNREADABLE as error:
+            raise RunError(f"{path}: cannot be read: {error}; it holds what '{self.name}' saw") from error
+        buffer = model.replay_buffer
+        assert buffer is not None
+        found = (buffer.observation_space, buffer.action_space.shape, buffer.n_envs)
+        if found != (self.env.observation_space, self.env.action_space.shape, self.seat.num_envs):
+            raise RunError(f"{path}: holds what another learner saw: {buffer.observation_space}, {buffer.n_envs} rows")
 
     def budget(self, steps: int) -> int:
         """Joint steps after which it is stopped; only ARS, which may be in mid-update then, does not stop by itself."""

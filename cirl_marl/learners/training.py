@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from cirl_marl.errors import CirlError, LearnerError, unknown
+from cirl_marl.errors import CirlError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.lockstep import Interrupted, Lockstep
 from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
@@ -69,13 +69,12 @@ class Training:
         self.done = 0
         if resumed is not None and resumed.status["checkpoint"] is not None:
             checkpoint, self.done = resumed.checkpoint, int(resumed.status["joint_steps"])
-        keys: tuple[str | int, ...] = ("copies", self.done) if self.done else ("copies",)
-        seeds = [derived_seed(config.seed, *keys, i) for i in range(config.envs)]
+        seeds = [derived_seed(config.seed, "copies", i, self.done) for i in range(config.envs)]
         groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
         self.lockstep = Lockstep(env, seeds, {name: group.view(env) for name, group in groups.items()}, done=self.done)
         self.trainees: dict[str, Trainee] = {}
         for name, seat in self.lockstep.seats.items():
-            trainee = Trainee(seat, groups[name].spec, config.seed + self.done)
+            trainee = Trainee(seat, groups[name].spec, config.seed, done=self.done)
             self.trainees[name] = trainee.load(checkpoint) if checkpoint else trainee.build()
         self._appoint_demonstrators()
         self._log()
@@ -92,7 +91,7 @@ class Training:
         for trainee in self.trainees.values():
             asked = trainee.spec.demonstrations
             if asked is not None and trainee.demonstrations:
-                seed = derived_seed(self.config.seed + self.done, "demonstrations", asked.controller)
+                seed = derived_seed(self.config.seed, "demonstrations", asked.controller, self.done)
                 known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
                 trainee.follow(known[asked.controller])
 
@@ -109,7 +108,7 @@ class Training:
     ) -> None:
         """Train to the end of the budget.
 
-        Ctrl-C, and an error in a learner, save what was learnt before they are raised.
+        Ctrl-C and errors save what was learnt before they are raised.
 
         Args:
             callbacks: Stable-Baselines3 callbacks by name of the learner.
@@ -134,8 +133,8 @@ class Training:
         except Interrupted:
             self._save("interrupted", "stopped by the user")
             raise KeyboardInterrupt from None
-        except LearnerError as error:
-            self._save("failed", str(error))
+        except Exception as error:
+            self._save("failed", str(error).partition("\n")[0] or repr(error))
             raise
         else:
             self._save("complete")
@@ -165,7 +164,7 @@ class Training:
                 [
                     self.joint_steps,
                     self.joint_steps * self.env.num_envs,
-                    seconds,
+                    self._metrics.seconds + seconds,
                     float(first["episode_circularity"][ended].mean()),
                     float(first["episode_service_level"][ended].mean()),
                     *returns,
