@@ -29,6 +29,7 @@ from cirl_marl.paper.published import environment_of
 from cirl_marl.paper.results import Results, Row
 from cirl_marl.paper.session import live_bar
 from cirl_marl.paper.table import markdown, result_line
+from cirl_marl.paper.training import outdated
 
 console = Console(width=None if sys.stdout.isatty() else 140)
 processes = get_context("spawn")
@@ -47,7 +48,7 @@ def main(
     table: Annotated[bool, typer.Option("--table", help="Run nothing, only write the tables.")] = False,
     speed: Annotated[bool, typer.Option("--speed", help="Only compare training times on CopperNet.")] = False,
     write: Annotated[
-        Path | None, typer.Option(help="The tables; default: docs/paper_tables.md, with --only or --steps in OUT.")
+        Path | None, typer.Option(help="The tables; default: docs/paper_tables.md, of a part or a trial in OUT.")
     ] = None,
 ) -> None:
     """Run what is missing, then write the tables."""
@@ -56,21 +57,26 @@ def main(
     if speed:
         _compare_speed(steps or 200_000)
         return
+    failed: list[Row] = []
     if not table:
         if only:
             choices = [_names(name) for name in only]
-            rows = [row for names in choices for row in planned(*names, steps=steps, seeds=seeds or 1, recipe=recipe)]
+            found = (row for names in choices for row in planned(*names, steps=steps, seeds=seeds or 1, recipe=recipe))
+            rows = list(dict.fromkeys(found))
         else:
             rows = study(steps=steps, seeds=seeds, recipe=recipe)
         try:
-            Study(results, rows, jobs, episodes).run()
+            failed = Study(results, rows, jobs, episodes).run()
         except KeyboardInterrupt:
             message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
             console.print(message, soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None
-    path = write or (out / DOCUMENT.name if only or steps else DOCUMENT)
+    path = write or (out / DOCUMENT.name if only or steps or seeds or episodes or recipe else DOCUMENT)
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(markdown(results.all()), encoding="utf-8")
     console.print(f"tables: {path}", soft_wrap=True)
+    if failed:
+        raise typer.Exit(1)
 
 
 @dataclass(slots=True)
@@ -89,14 +95,20 @@ class Study:
     def __init__(self, results: Results, rows: list[Row], jobs: int, episodes: int | None) -> None:
         """Leave out the rows that are done."""
         self._results, self._jobs, self._episodes = results, jobs, episodes
-        self._queue = deque(row for row in rows if not results.has(row))
+        self._queue = deque(row for row in rows if not self._is_done(row))
         self._failed: list[Row] = []
         self._again = True
         self._running: list[Job] = []
         console.print(f"{len(rows)} rows, {len(rows) - len(self._queue)} done, results in {results.path}")
 
-    def run(self) -> None:
-        """Run every row.
+    def _is_done(self, row: Row) -> bool:
+        again = outdated(self._results.read(row), self._episodes) if self._results.has(row) else ""
+        if again:
+            console.print(f"{row}: once more, as {again}", soft_wrap=True, highlight=False)
+        return self._results.has(row) and not again
+
+    def run(self) -> list[Row]:
+        """Run every row and return those that failed twice.
 
         Raises:
             KeyboardInterrupt: after Ctrl-C, when the rows that ran are stopped.
@@ -124,6 +136,7 @@ class Study:
                 for job in self._running:
                     job.process.terminate()
                     job.process.join()
+        return self._failed
 
     def _start(self, row: Row, bars: Progress) -> None:
         log = self._results.log(row)
@@ -138,7 +151,7 @@ class Study:
         job.process.join()
         self._running.remove(job)
         bars.remove_task(job.bar)
-        if self._results.has(job.row):
+        if job.process.exitcode == 0:
             console.print(result_line(self._results.read(job.row)), soft_wrap=True, highlight=False)
             return
         self._failed.append(job.row)

@@ -116,7 +116,7 @@ def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:
     else:
         chosen = tuple(agents)
     for agent in chosen:
-        if agent not in network.controllable:
+        if agent not in network.control_rows:
             raise CirlError(f"network '{network.name}': {unknown('agent', agent, network.controllable)}")
     if (agents is not None and not chosen) or len(set(chosen)) != len(chosen):
         raise CirlError(f"network '{network.name}': agents {list(chosen)} must be distinct and at least one")

@@ -6,7 +6,7 @@ import inspect
 import math
 from typing import Any
 
-from cirl_marl.compartments import model_class
+from cirl_marl.compartments import CompartmentModel, model_class
 from cirl_marl.elements import (
     Arc,
     Control,
@@ -111,14 +111,15 @@ class Converter:
     def _node(self, id_: str, node: NodeTable) -> Node:
         where = f"nodes.{id_}"
         scale = self._factor(node.initial.unit, "mass", f"{where}.initial")
+        model = self._model(node.model, f"{where}.model")
         return Node(
             id=id_,
             role=node.role,
             initial=(node.initial.low * scale, node.initial.high * scale),
             set_point=self._optional(node.set_point, "mass", f"{where}.set_point"),
             scale=self._value(node.scale or self.table.scales.stock, "mass", f"{where}.scale"),
-            control=self._control(node.control, f"{where}.control"),
-            **self._model(node.model, f"{where}.model"),
+            control=self._control(node.control, model.get("model"), f"{where}.control"),
+            **model,
         )
 
     def _arc(self, id_: str, arc: ArcTable) -> Arc:
@@ -137,6 +138,7 @@ class Converter:
         if arc.batches is not None:
             batches = self._batches(arc.batches, f"{where}.batches")
         batch = arc.law is Law.BATCH
+        model = self._model(arc.model, f"{where}.model")
         rate_kind = {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}.get(arc.law, "rate")
         default = self.table.scales.stock if batch else self.table.scales.flow
         return Arc(
@@ -154,8 +156,8 @@ class Converter:
             set_point=self._optional(arc.set_point, "flow", f"{where}.set_point"),
             scale=self._value(arc.scale or default, "mass" if batch else "flow", f"{where}.scale"),
             pollutant=arc.pollutant,
-            control=self._control(arc.control, f"{where}.control"),
-            **self._model(arc.model, f"{where}.model"),
+            control=self._control(arc.control, model.get("model"), f"{where}.control"),
+            **model,
         )
 
     def _check_law(self, arc: ArcTable, where: str) -> None:
@@ -215,13 +217,13 @@ class Converter:
             "reward_scale": 1.0 if scale is None else scale,
         }
 
-    def _control(self, control: ControlTable | None, where: str) -> Control | None:
+    def _control(self, control: ControlTable | None, model: CompartmentModel | None, where: str) -> Control | None:
         if control is None:
             return None
+        target = "flow" if control.kind is ControlKind.FLOW else "1"
         if control.kind is ControlKind.INPUT:
-            unit = 1.0  # the name of the model's input carries the unit
-        else:
-            unit = self._factor(control.unit, "flow" if control.kind is ControlKind.FLOW else "1", where)
+            target = getattr(model, "input_unit", control.unit)
+        unit = self._factor(control.unit, target, where)
         return Control(
             kind=control.kind,
             low=control.low * unit,
@@ -236,9 +238,10 @@ class Converter:
         return None if quantity is None else self._value(quantity, kind, where)
 
     def _factor(self, unit: str, kind: str, where: str) -> float:
+        """Return what converts ``unit`` to the network's unit of a kind, or to the unit ``kind`` if it is none."""
         if (unit, kind) not in self.factors:
             try:
-                self.factors[unit, kind] = factor(unit, self.targets[kind])
+                self.factors[unit, kind] = factor(unit, self.targets.get(kind, kind))
             except CirlError as error:
                 self.mistakes.append(f"{where}: {error}")
                 return 1.0

@@ -88,7 +88,7 @@ class Credit:
     def _counterfactuals(self, state: State, controls: Floats) -> Floats:
         """λ had each agent in turn been neutral, re-simulated from the same state, shape (agents, B)."""
         dynamics, batch = self._dynamics, controls.shape[1]
-        chunk = max(1, CELLS // (state.stock.size + state.inner.size))
+        chunk = max(1, CELLS // max(state.stock.size + state.inner.size, state.flow.size))
         results = []
         for start in range(0, len(self._agents), chunk):
             agents = self._agents[start : start + chunk]

@@ -83,7 +83,7 @@ def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, An
     merged = {key: value for key, value in base.items() if key != "scenarios"}
     for key, value in override.items():
         old = merged.get(key)
-        whole = isinstance(old, Mapping) and "source" in old
+        whole = isinstance(old, Mapping) and isinstance(old.get("source"), str)
         nested = isinstance(value, Mapping) and isinstance(old, Mapping) and not whole
         merged[key] = _merge(old, value) if nested and isinstance(old, Mapping) else value
     return merged

@@ -182,14 +182,16 @@ class Network:
         """σ_k of each arc: the sign with which its flow counts as finite-time sustainable, shape (arcs,).
 
         +1 if material leaves a non-renewable reservoir or enters a landfill, an incinerator or, as a pollutant, the
-        environment; −1 if it leaves the environment or returns to a reservoir; 0 otherwise or if both hold.
+        environment; −1 if it leaves the environment or returns to a reservoir; 0 otherwise or if both hold. What goes
+        from one compartment of the environment to another neither enters nor leaves it.
         """
         signs = []
         for arc in self.arcs:
             donor, recipient = self._role(arc.donor), self._role(arc.recipient)
-            enters = recipient in SINKS and (recipient is not Role.ENVIRONMENT or arc.pollutant)
+            within = donor is recipient is Role.ENVIRONMENT
+            enters = recipient in SINKS and not within and (recipient is not Role.ENVIRONMENT or arc.pollutant)
             lost = donor is Role.NONRENEWABLE_RESERVOIR or enters
-            regained = donor is Role.ENVIRONMENT or recipient is Role.NONRENEWABLE_RESERVOIR
+            regained = (donor is Role.ENVIRONMENT and not within) or recipient is Role.NONRENEWABLE_RESERVOIR
             signs.append(float(lost) - float(regained))
         return _read_only(np.array(signs))
 

@@ -3,15 +3,76 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
-from cirl_marl.network import Network
+import numpy as np
+
+from cirl_marl.elements import ControlKind, Law, Role
+from cirl_marl.network import Floats, Network
+from cirl_marl.vector_env import VectorEnv
+
+COARSE = 0.01
+"""Share of its largest value by which a state may depend on the step of the solver."""
+
+INTERVALS = 200
+"""Control intervals over which this is looked at."""
 
 
 def remarks(network: Network) -> Iterator[str]:
-    """Yield what whoever wrote ``network`` may not have meant.
+    """Yield what whoever wrote ``network`` may not have meant: idle agents and debtors, and steps that are too long."""
+    yield from _without_effect(network)
+    yield from _unpaid(network)
+    yield from _coarse(network)
 
-    A shortfall of a service lowers the local reward of those who owe it. If none of them acts, or some do not, the
-    agents are paid for stopping what the service is there to keep up.
+
+def _without_effect(network: Network) -> Iterator[str]:
+    """Yield valves and pollutants that change nothing."""
+    scaled = {arc.donor for arc in network.arcs if arc.law is not Law.BATCH}
+    for node in network.nodes:
+        if node.control is not None and node.control.kind is ControlKind.RATE and node.id not in scaled:
+            yield f"node '{node.id}': its valve scales no flow, as nothing but batches leaves it"
+    for arc in network.arcs:
+        recipient = network.nodes[network.node_index[arc.recipient]]
+        if not arc.pollutant and recipient.role is not Role.ENVIRONMENT:
+            yield f"arc '{arc.id}': pollutant = false says nothing here, as '{arc.recipient}' is no environment"
+
+
+def _coarse(network: Network) -> Iterator[str]:
+    """Yield what neutral control brings about otherwise if the solver takes half the step."""
+    step = network.episode.solver_step
+    if step is None:
+        return
+    shown = [_neutral_states(each) for each in (network, network.with_options(episode={"solver_step": step / 2}))]
+    with np.errstate(invalid="ignore"):
+        size = np.maximum(np.abs(shown[1]).max(axis=0), 1e-9)
+        apart = np.abs(shown[0] - shown[1]).max(axis=0) / size
+    if not (apart <= COARSE).all():
+        worst = int(np.nan_to_num(apart, nan=np.inf).argmax())
+        name = VectorEnv(network, num_envs=1).state_names[worst]
+        yield (
+            f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, neutral control gives another "
+            f"{name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
+        )
+
+
+def _neutral_states(network: Network) -> Floats:
+    """Return what neutral control makes of the state, shape (intervals, states)."""
+    env, nodes = VectorEnv(network, num_envs=1), len(network.nodes)
+    env.reset(seed=0)
+    neutral = env.dynamics.neutral[:, None]
+    state, rows = env.physical, []
+    for step in range(min(network.episode.horizon, INTERVALS)):
+        after = env.dynamics.advance(state.stock, state.inner, neutral, np.array([step]))
+        state = replace(state, stock=after.stock, inner=after.inner)
+        rows.append(np.concatenate([after.stock[:nodes, 0], after.inner[:, 0], after.stock[nodes:-1, 0]]))
+    return np.array(rows)
+
+
+def _unpaid(network: Network) -> Iterator[str]:
+    """Yield services whose shortfall nobody who acts feels.
+
+    A shortfall lowers the local reward of those who owe the service. If none of them acts, or some do not, the agents
+    are paid for stopping what the service is there to keep up.
     """
     if not network.agents:
         return

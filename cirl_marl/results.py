@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def provenance(network: Network, runs: Sequence[RunDirectory] = (), **options: A
     """Return what a result depends on, ready for JSON.
 
     Args:
-        network: under its scenario; the hash is of its definition with every default written out.
+        network: under its scenario.
         runs: training runs that it draws on.
         **options: what else was asked for.
     """
@@ -58,11 +59,16 @@ def provenance(network: Network, runs: Sequence[RunDirectory] = (), **options: A
             "name": network.name,
             "scenario": network.scenario_name,
             "file_sha256": None if network.source is None else _hash(network.source.read_bytes()),
-            "definition_sha256": _hash(definition_of(network).encode()),
+            "definition_sha256": fingerprint(network),
         },
         "options": options,
         "runs": [_run(run) for run in runs],
     }
+
+
+def fingerprint(network: Network) -> str:
+    """Return a hash of the network under its scenario, of its definition with every default and no title."""
+    return _hash(definition_of(replace(network, title="")).encode())
 
 
 def _run(run: RunDirectory) -> dict[str, Any]:

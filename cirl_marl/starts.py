@@ -33,6 +33,7 @@ class Starts:
         """
         inner = dynamics.inner
         self.names = (*network.node_index, *inner.names)
+        self._rows = {name: row for row, name in enumerate(self.names)}
         self.streams = [np.random.default_rng() for _ in range(num_envs)]
         self._network = network
         self._array_order = tuple(order)
@@ -128,9 +129,9 @@ class Starts:
         return checked
 
     def _row(self, id_: str) -> int:
-        if id_ not in self.names:
+        if id_ not in self._rows:
             raise ControlError(f"initial_state: {unknown('node or inner state', id_, self.names)}")
-        return self.names.index(id_)
+        return self._rows[id_]
 
     def _initial(self, id_: str, values: ArrayLike) -> Floats:
         stock = _numbers(f"initial_state of '{id_}'", values)

@@ -28,6 +28,7 @@ def _registry() -> pint.UnitRegistry[float]:
     return registry
 
 
+@cache
 def factor(unit: str, target: str) -> float:
     """Return the number by which values in ``unit`` are multiplied to be in ``target``.
 

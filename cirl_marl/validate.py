@@ -25,7 +25,7 @@ from cirl_marl.elements import (
     Service,
     ranged_states,
 )
-from cirl_marl.errors import unknown
+from cirl_marl.errors import CirlError, unknown
 from cirl_marl.units import factor
 
 if TYPE_CHECKING:
@@ -51,6 +51,13 @@ OWN = {f.name: f.default for f in fields(Arc) if any(f.name in taken for taken i
 
 def problems(network: Network) -> Iterator[str]:
     """Yield every reason why ``network`` cannot be simulated."""
+    if not re.match(IDENTIFIER, network.name):
+        yield f"name '{network.name}': begins with a letter and has lower-case letters, digits and underscores only"
+    for key, unit, base in (("mass", network.mass_unit, "kg"), ("time", network.time_unit, "s")):
+        try:
+            factor(unit, base)
+        except CirlError as error:
+            yield f"units.{key}: {error}"
     if not network.nodes:
         yield "nodes: a network needs at least one"
     compartments = [c.id for c in (*network.nodes, *network.arcs)]
@@ -80,7 +87,7 @@ def problems(network: Network) -> Iterator[str]:
     for service in network.services:
         yield from _service_problems(service, network, nodes)
     yield from _setting_problems(network)
-    acting = [c.id for c in (*network.nodes, *network.arcs) if c.control is not None]
+    acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.acting:
         if agent not in acting:
             yield f"agents: {unknown('acting compartment', agent, acting)}"
@@ -209,6 +216,7 @@ def _common_problems(where: str, compartment: Compartment, network: Network) -> 
         if not (math.isfinite(low) and math.isfinite(high)) or low > high:
             yield f"{where}: initial range [{low}, {high}] of an inner state is empty or not finite"
     control = compartment.control
+    yield from _bound_problems(where, compartment)
     inputs = compartment.model.input_names if compartment.model is not None else ()
     if compartment.model is not None and inputs and (control is None or control.kind is not ControlKind.INPUT):
         yield (
@@ -231,6 +239,21 @@ def _common_problems(where: str, compartment: Compartment, network: Network) -> 
         )
     if control.kind is ControlKind.RATE and control.low < 0:
         yield f"{where}: control.low {control.low:g} is negative; a valve cannot reverse a flow"
+
+
+def _bound_problems(where: str, compartment: Compartment) -> Iterator[str]:
+    """Yield starts and controls beyond what the equations of a compartment's model hold for."""
+    model, control = compartment.model, compartment.control
+    if model is None:
+        return
+    states = ranged_states(model)
+    ranges = dict(zip(states, compartment.inner, strict=True)) if len(states) == len(compartment.inner) else {}
+    if control is not None:
+        ranges |= dict.fromkeys(model.input_names, (control.low, control.high))
+    for name, (low, high) in getattr(model, "bounds", {}).items():
+        if name in ranges and not (low <= ranges[name][0] and ranges[name][1] <= high):
+            given = f"[{ranges[name][0]:g}, {ranges[name][1]:g}]"
+            yield f"{where}: model '{model.kind}' holds for {name} in [{low:g}, {high:g}], not for {given}"
 
 
 def _service_problems(service: Service, network: Network, nodes: Mapping[str, Node]) -> Iterator[str]:

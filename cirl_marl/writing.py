@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from cirl_marl.elements import Arc, Compartment, Control, ControlKind, Law, Node, ranged_states
+from cirl_marl.elements import Arc, Compartment, ControlKind, Law, Node, ranged_states
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
 
@@ -31,6 +31,8 @@ def _lines(network: Network) -> Iterator[str]:
     yield f"title = {_text(network.title or network.name)}"
     yield 'material = "not stated"'
     yield f"agents = {_list(network.acting)}"
+    if not network.arcs:
+        yield "arcs = {}"
     yield f"[units]\nmass = {_text(mass)}\ntime = {_text(time)}"
     yield f"[scales]\nstock = {_quantity(1.0, mass)}\nflow = {_quantity(1.0, _flow(network))}"
     yield f"[episode]\nsolver = {_text(episode.solver)}"
@@ -108,11 +110,15 @@ def _common(network: Network, compartment: Compartment, unit: str) -> Iterator[s
     if compartment.model is not None:
         yield f"model = {_model(compartment)}"
     if compartment.control is not None:
-        yield f"control = {_control(network, compartment.control)}"
+        yield f"control = {_control(network, compartment)}"
 
 
-def _control(network: Network, control: Control) -> str:
+def _control(network: Network, compartment: Compartment) -> str:
+    control = compartment.control
+    assert control is not None
     unit = _flow(network) if control.kind is ControlKind.FLOW else "1"
+    if control.kind is ControlKind.INPUT:
+        unit = getattr(compartment.model, "input_unit", "1")
     return (
         f"{{ kind = {_text(control.kind.value)}, low = {float(control.low)!r}, neutral = {float(control.neutral)!r}, "
         f"high = {float(control.high)!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
@@ -122,12 +128,14 @@ def _control(network: Network, control: Control) -> str:
 def _model(compartment: Compartment) -> str:
     model: Any = compartment.model
     values = {each.name: getattr(model, each.name) for each in dataclasses.fields(model)}
+    same = [each.name for each in dataclasses.fields(model) if _is_default(each, values[each.name])]
     form = f"form = {_text(values.pop('form'))}, " if "form" in values else ""
     for name, value in values.items():
-        if not isinstance(value, int | float):
+        if not isinstance(value, int | float) and name not in same:
             problem = f"parameter '{name}' of its model '{model.kind}' is no number, which a definition cannot say"
             raise NetworkError(f"compartment '{compartment.id}'", [problem])
-    parameters = ", ".join(f"{name} = {float(value)!r}" for name, value in values.items())
+    numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
+    parameters = ", ".join(f"{name} = {float(value)!r}" for name, value in numbers.items())
     initial = ", ".join(
         f"{name} = {{ low = {float(low)!r}, high = {float(high)!r}, source = {_text(SOURCE)} }}"
         for name, (low, high) in zip(ranged_states(model), compartment.inner, strict=True)
@@ -137,6 +145,12 @@ def _model(compartment: Compartment) -> str:
         f"{{ kind = {_text(model.kind)}, {form}parameters = {{ {parameters} }}, source = {_text(SOURCE)}, "
         f"initial = {{ {initial} }}, reward_scale = {scale} }}"
     )
+
+
+def _is_default(field: dataclasses.Field[Any], value: object) -> bool:
+    if field.default_factory is not dataclasses.MISSING:
+        return bool(field.default_factory() == value)
+    return bool(field.default == value)
 
 
 def _flow(network: Network) -> str:

@@ -1,4 +1,4 @@
-"""The study: what counts as done, and that a trial leaves the published tables alone."""
+"""The study and the paper's tables: what counts as done, and that a trial leaves what is published alone."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import typer
 
-from benchmarks import study
+from benchmarks import paper, study
 from cirl_marl import load_network
 
 ROOT = Path(__file__).parent.parent
@@ -36,3 +37,24 @@ def test_a_trial_writes_a_document_of_its_own(tmp_path: Path) -> None:
     assert "| shared_ppo |" in (tmp_path / "trial" / "study.md").read_text()
     assert (tmp_path / "trial" / "results" / "net_zero" / "summary.json").is_file()
     assert (tmp_path / "trial" / "pictures" / "study_net_zero.png").is_file()
+
+
+def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A row that fails has a second try, the others are kept, and the command fails; a part has tables of its own."""
+    published = paper.DOCUMENT.read_bytes()
+    only = ["CopperNet:A2C", "CopperNet:A2C"]
+    with pytest.raises(typer.Exit) as ended:
+        paper.main(out=tmp_path, only=only, recipe="published", steps=20)
+    assert ended.value.exit_code == 1
+    said = capsys.readouterr().out
+    assert "1 rows, 0 done" in said
+    assert said.count("no training episode ended") == 2
+    paper.main(out=tmp_path, only=only, recipe="published", steps=60)
+    assert "1 rows, 1 done" not in capsys.readouterr().out
+    paper.main(out=tmp_path, only=only, recipe="published", steps=60)
+    assert "1 rows, 1 done" in capsys.readouterr().out
+    paper.main(out=tmp_path / "new", only=["CopperNet"], table=True)
+    assert (tmp_path / "new" / "paper_tables.md").is_file()
+    assert paper.DOCUMENT.read_bytes() == published

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -15,8 +16,9 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from cirl_marl import cli
+from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, cli
 from cirl_marl.catalogue import folder
+from cirl_marl.definition import write_network
 from cirl_marl.learners import train
 from cirl_marl.optimum import search_each
 
@@ -117,6 +119,44 @@ def test_check_remarks_on_services_that_nobody_owes(
         printed = capsys.readouterr().out
         assert ("remark" in printed) == bool(said)
         assert said in printed
+
+
+def test_check_remarks_on_what_has_no_effect(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A valve on a node that only batches leave, and a pollutant that enters no environment."""
+    write_network(idle_network(), Path("idle.toml"))
+    assert run(monkeypatch, "check", "idle.toml") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "node 'depot': its valve scales no flow, as nothing but batches leaves it" in printed
+    assert "arc 'burn': pollutant = false says nothing here, as 'depot' is no environment" in printed
+
+
+def idle_network() -> Network:
+    """Return a network whose only valve is in vain."""
+    valve = Control(kind=ControlKind.RATE, low=0.0, neutral=0.5, high=1.0)
+    return Network(
+        name="idle",
+        nodes=(Node(id="depot", initial=(5.0, 5.0), control=valve), Node(id="shop")),
+        arcs=(
+            Arc(id="send", donor="depot", recipient="shop", law=Law.BATCH, delay=1.0, batches=((0.0, 1.0),)),
+            Arc(id="burn", donor="shop", recipient="depot", rate=0.1, pollutant=False),
+        ),
+    )
+
+
+@pytest.mark.parametrize(("step", "said"), [("0.0125", False), ("0.125", True), ("0.25", True)])
+def test_check_remarks_on_steps_that_are_too_long(
+    step: str, said: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Fast inner physics do not show in the turnover of stocks; half the step shows them."""
+    text = (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
+    found = re.search(r"solver_step = \{ value = [0-9.]+", text)
+    assert found is not None
+    Path("long.toml").write_text(text.replace(found.group(), f"solver_step = {{ value = {step}"))
+    assert run(monkeypatch, "check", "long.toml") == 0
+    printed = capsys.readouterr().out
+    assert ("remark on scenario 'default': episode.solver_step" in printed) == said
 
 
 def test_short_trainings_say_that_there_are_no_curves(

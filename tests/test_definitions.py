@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -12,9 +13,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cirl_marl import CirlError, DefinitionError, Network, VectorEnv, load_network, networks, parallel_env
+from cirl_marl import (
+    Arc,
+    CirlError,
+    DefinitionError,
+    Network,
+    Node,
+    Role,
+    VectorEnv,
+    load_network,
+    networks,
+    parallel_env,
+)
 from cirl_marl.catalogue import folder
-from cirl_marl.definition import read_network
+from cirl_marl.definition import read_network, write_network
 from cirl_marl.elements import ControlKind
 from cirl_marl.schema import json_schema
 from cirl_marl.units import factor
@@ -269,6 +281,70 @@ def test_units_are_converted(tmp_path: Path) -> None:
     path.write_text(yearly, encoding="utf-8")
     arc = load_network(path).arcs[load_network(path).arc_index["refinery_to_fabrication"]]
     assert arc.rate == pytest.approx(0.82, rel=1e-14)
+
+
+@pytest.mark.parametrize(("unit", "share"), [("1/day", 1.0), ("1/hour", 1 / 24), ("1/week", 7.0)])
+def test_inputs_of_models_are_converted(tmp_path: Path, unit: str, share: float) -> None:
+    """Bounds of an input control are in the unit of the model's inputs, whatever they are written in."""
+    text = (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
+    written = 'low = 0.3, neutral = 0.5, high = 0.7, unit = "1/day"'
+    assert written in text
+    path = tmp_path / "net_zero.toml"
+    bounds = f'low = {0.3 * share}, neutral = {0.5 * share}, high = {0.7 * share}, unit = "{unit}"'
+    path.write_text(text.replace(written, bounds), encoding="utf-8")
+    control = load_network(path).compartments["digester"].control
+    assert control is not None
+    assert (control.low, control.neutral, control.high) == pytest.approx((0.3, 0.5, 0.7), rel=1e-12)
+    for other in ("N", "banana"):
+        path.write_text(text.replace(written, written.replace("1/day", other)), encoding="utf-8")
+        with pytest.raises(CirlError, match=rf"nodes.digester.control: unit '{other}'"):
+            load_network(path)
+
+
+def test_a_compartment_may_be_called_source(tmp_path: Path) -> None:
+    """Scenarios replace a quantity whole, known by its source; a table with a member of that name is none."""
+    text = COPPER.replace("[nodes.mine]", "[nodes.source]").replace('"mine"', '"source"')
+    path = tmp_path / "copper.toml"
+    path.write_text(text + "\n[scenarios.poor.nodes.source.initial]\nlow = 1\nhigh = 2\nunit = 'kt'\nsource = 'x'\n")
+    usual, poor = load_network(path), load_network(path, scenario="poor")
+    assert [node.id for node in poor.nodes] == [node.id for node in usual.nodes]
+    first = usual.nodes[usual.node_index["source"]]
+    assert poor.nodes[poor.node_index["source"]] == replace(first, initial=(1.0, 2.0))
+
+
+@pytest.mark.parametrize(("name", "scenario"), [(name, each) for name in networks() for each in scenarios(name)])
+def test_what_is_written_reads_back(name: str, scenario: str, tmp_path: Path) -> None:
+    """Every network of the catalogue, to the last bit, as the default scenario of its own file."""
+    network = load_network(name, scenario=scenario)
+    write_network(network, tmp_path / "written.toml")
+    assert load_network(tmp_path / "written.toml") == replace(network, scenario_name="default", scenarios={})
+
+
+ROLE = {role.value: role for role in Role}
+SIGNS = {
+    ("nonrenewable_reservoir", "nonrenewable_reservoir"): (0, 0),
+    ("nonrenewable_reservoir", "technosphere"): (1, 1),
+    ("nonrenewable_reservoir", "environment"): (1, 1),
+    ("technosphere", "nonrenewable_reservoir"): (-1, -1),
+    ("technosphere", "technosphere"): (0, 0),
+    ("technosphere", "landfill"): (1, 1),
+    ("technosphere", "incinerator"): (1, 1),
+    ("technosphere", "environment"): (1, 0),
+    ("environment", "nonrenewable_reservoir"): (-1, -1),
+    ("environment", "technosphere"): (-1, -1),
+    ("environment", "landfill"): (0, 0),
+    ("environment", "environment"): (0, 0),
+    ("landfill", "technosphere"): (0, 0),
+}
+
+
+@pytest.mark.parametrize(("roles", "signs"), SIGNS.items())
+def test_what_counts_as_finite_time_sustainable(roles: tuple[str, str], signs: tuple[int, int]) -> None:
+    """σ by the roles of donor and recipient: of a pollutant, and of what is none."""
+    nodes = (Node(id="a", role=ROLE[roles[0]], initial=(1.0, 1.0)), Node(id="b", role=ROLE[roles[1]]))
+    for pollutant, sign in zip((True, False), signs, strict=True):
+        arc = Arc(id="k", donor="a", recipient="b", rate=0.1, pollutant=pollutant)
+        assert Network(name="two", nodes=nodes, arcs=(arc,)).sustainability.tolist() == [sign]
 
 
 def test_missing_file(tmp_path: Path) -> None:

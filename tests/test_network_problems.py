@@ -9,7 +9,19 @@ from typing import Any
 
 import pytest
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, NetworkError, Node, Objective, Service
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    NetworkError,
+    Node,
+    Objective,
+    Service,
+    load_network,
+)
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.definition import write_network
@@ -20,6 +32,7 @@ DELAYED = Arc(id="k", donor="a", recipient="b", law=Law.BATCH, delay=1.0, batche
 ORDER = Arc(id="k", donor="a", recipient="b", law=Law.CONTROLLED)
 BACKWARD = Control(kind=ControlKind.FLOW, low=-5.0, neutral=0.0, high=5.0)
 VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
+DILUTION = Control(kind=ControlKind.INPUT, low=0.3, neutral=0.5, high=0.7)
 OWED = Service(id="s", provider="b", quantity="stock", low=1.0)
 DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
 
@@ -43,6 +56,17 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
         ({"nodes": (replace(A, id="Mine 1"), B), "arcs": ()}, "compartment 'Mine 1': an id begins with a letter"),
         ({"nodes": (replace(A, **DIGESTER), B)}, "'digester' needs a control of kind 'input' for dilution_per_day"),
         ({"nodes": (replace(A, control=VALVE, **DIGESTER), B)}, "needs a control of kind 'input'.*not rate"),
+        (
+            {"nodes": (replace(A, control=replace(DILUTION, low=-0.7), **DIGESTER), B)},
+            r"holds for dilution_per_day",
+        ),
+        (
+            {"nodes": (replace(A, control=DILUTION, model=Digester(), inner=((-1.0, 1.0),) * 6), B)},
+            r"in \[0, inf\], not for \[-1, 1\]",
+        ),
+        ({"name": "Glass-2030"}, "name 'Glass-2030': begins with a letter"),
+        ({"mass_unit": "pieces"}, "units.mass: unit 'pieces' cannot be read"),
+        ({"time_unit": "kg"}, "units.time: unit 'kg' is inconsistent"),
         ({"arcs": (replace(LINK, law=Law.COMPARTMENT, by="a"),)}, "solver 'exact' knows no"),
     ],
 )
@@ -54,10 +78,16 @@ def test_networks_that_cannot_be_simulated(changes: dict[str, Any], said: str) -
 
 
 def test_models_that_cannot_be_written(tmp_path: Path) -> None:
-    """A parameter that is itself a model is refused; nothing is written."""
+    """A parameter that is itself a model is refused unless it is the default; nothing is written."""
     inputs = Control(kind=ControlKind.INPUT, low=0.3, neutral=0.5, high=0.7)
     digester = replace(A, model=DigesterPublished(), inner=((1.0, 1.0),) * 6, control=inputs)
-    network = Network(name="one", nodes=(digester,), arcs=(), episode=Episode(solver="rk4", solver_step=1.0))
+    episode = Episode(control_interval=0.1, solver="rk4", solver_step=0.1)
+    usual = Network(name="one", nodes=(digester,), arcs=(), episode=episode)
+    write_network(usual, tmp_path / "usual.toml")
+    assert load_network(tmp_path / "usual.toml").nodes == usual.nodes
+    (tmp_path / "usual.toml").unlink()
+    other = replace(digester, model=DigesterPublished(process=Digester(released_share=0.1)))
+    network = replace(usual, nodes=(other,))
     with pytest.raises(NetworkError, match="compartment 'a': parameter 'process' of its model 'digester_published'"):
         write_network(network, tmp_path / "one.toml")
     assert not list(tmp_path.iterdir())

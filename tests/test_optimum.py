@@ -460,6 +460,13 @@ def test_networks_without_certificate(name: str, scenario: str | None, said: str
         bound(name, scenario=scenario)
 
 
+def test_networks_too_large_for_a_certificate() -> None:
+    """What would not fit into memory is said before it is tried."""
+    nodes = [Node(id=f"n{i}", initial=(1.0, 1.0)) for i in range(1001)]
+    with pytest.raises(NoCertificate, match="1,001 nodes are more than the 1,000"):
+        bound(small(nodes, [Arc(id="f", donor="n0", recipient="n1", rate=0.1)], horizon=2))
+
+
 def test_pull_beyond_the_stock_has_no_certificate() -> None:
     """A recipient that may empty its donor makes the solver cut flows, which is no linear law."""
     pull = Arc(id="pull", donor="reserve", recipient="use", law=Law.RECIPIENT, rate=0.5)

@@ -17,13 +17,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
-from cirl_marl.learners import Recipe, Training, train
+from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.paper import published, session, training, tuned
 from cirl_marl.paper.plan import planned, study
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
 from cirl_marl.paper.results import Evaluation, Result, Results, Row, thinned
 from cirl_marl.paper.table import markdown, table_rows
-from cirl_marl.paper.training import Trained, evaluate, run_row
+from cirl_marl.paper.training import Trained, described, evaluate, outdated, run_row
 from cirl_marl.paper.tuned import train_tuned
 
 COPPER = ENVIRONMENTS["CopperNet"]
@@ -245,6 +245,36 @@ def test_names_choose_rows() -> None:
     assert [row.algorithm for row in planned("FetchWasteSorting", None)] == list(ENVIRONMENTS["FetchWasteSorting"].runs)
     assert [row.seed for row in planned("CopperNet", "ARS", seeds=3)] == [0, 1, 2]
     assert len(planned(None, "SAC")) == 7
+    assert [row.environment for row in planned(None, "SAC", recipe="tuned")] == ["Reacher"]
+    assert [row.algorithm for row in planned("FetchWasteSorting", "TQC-HER", recipe=None)] == ["TQC-HER"] * 2
+    with pytest.raises(CirlError, match=r"unknown algorithm of the paper 'PP0'\. Did you mean 'PPO'"):
+        planned(None, "PP0", recipe="tuned")
+    with pytest.raises(CirlError, match=r"no tuned recipe .* for A2C"):
+        planned(None, "A2C", recipe="tuned")
+
+
+def test_results_that_answer_another_question_are_outdated() -> None:
+    """Other evaluation episodes, definitions or recipes are named; what is not on record is not held against it."""
+    kept = result()
+    assert outdated(kept) == ""
+    assert "played 50 episodes, not 100" in outdated(replace(kept, evaluation=replace(kept.evaluation, episodes=50)))
+    now = described(COPPER)
+    assert outdated(replace(kept, settings=now)) == ""
+    assert "definition" in outdated(replace(kept, settings=now | {"definition_sha256": "0" * 64}))
+    row = Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=200_000)
+    plain = load_recipe("paper_copper_net").model_dump(mode="json")
+    assert outdated(replace(kept, row=row, settings=now | {"recipe": plain})) == ""
+    longer = plain | {"run": {"steps": 1, "envs": 1}}
+    assert "the recipe 'paper_copper_net' is another now" in outdated(
+        replace(kept, row=row, settings=now | {"recipe": longer})
+    )
+
+
+def test_every_kept_row_is_of_today() -> None:
+    """The tables show what the environments and recipes of this version give."""
+    kept = Results(Path(__file__).parent.parent / "benchmarks" / "results" / "paper").all()
+    assert len(kept) > 80
+    assert [(str(result.row), why) for result in kept if (why := outdated(result))] == []
 
 
 def test_goal_task_learns_with_hindsight(toy: PaperEnvironment) -> None:

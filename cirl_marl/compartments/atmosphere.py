@@ -25,6 +25,7 @@ class Atmosphere:
     kind: ClassVar[str] = "atmosphere"
     state_names: ClassVar[tuple[str, ...]] = ("co2_mmol",)
     input_names: ClassVar[tuple[str, ...]] = ("emission_mmol_day", "removal_mmol_day")
+    input_unit: ClassVar[str] = "mmol/day"
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -62,8 +64,10 @@ class Digester:
         "inorganic_carbon_mmol_l",
     )
     input_names: ClassVar[tuple[str, ...]] = ("dilution_per_day",)
+    input_unit: ClassVar[str] = "1/day"
     measure_names: ClassVar[tuple[str, ...]] = ("methane_mmol_l_day",)
     time_unit: ClassVar[str] = "day"
+    bounds: ClassVar[Mapping[str, tuple[float, float]]] = dict.fromkeys((*state_names, *input_names), (0.0, math.inf))
     reward_state: ClassVar[RewardState] = "before"
 
     growth1_per_day: float = 1.2

@@ -34,6 +34,7 @@ class DigesterPublished:
     kind: ClassVar[str] = "digester_published"
     state_names: ClassVar[tuple[str, ...]] = Digester.state_names
     input_names: ClassVar[tuple[str, ...]] = tuple(f"dilution_{name}_per_day" for name in "x1 s1 x2 s2 z c".split())
+    input_unit: ClassVar[str] = "1/day"
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 

@@ -112,6 +112,7 @@ class Incinerator:
         "freeboard_degc",
     )
     input_names: ClassVar[tuple[str, ...]] = ("heat_taken_kj_min",)
+    input_unit: ClassVar[str] = "kJ/min"
     time_unit: ClassVar[str] = "min"
     reward_state: ClassVar[RewardState] = "after"
 

@@ -47,6 +47,7 @@ class MicroalgaeDroop:
     kind: ClassVar[str] = "microalgae_droop"
     state_names: ClassVar[tuple[str, ...]] = ("biomass_um3_l", "quota_umol_um3", "nutrient_umol_l")
     input_names: ClassVar[tuple[str, ...]] = ("light_umol_m2_s",)
+    input_unit: ClassVar[str] = "umol/m**2/s"
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
@@ -60,6 +61,15 @@ class MicroalgaeDroop:
     dilution_per_day: float = 0.45
     nutrient_in_umol_l: float = 100.0
     co2_per_nutrient: float = 0.3
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Nothing is negative, and cells hold their minimal quota; the published form has no bounds."""
+        if self.form == "published":
+            return {}
+        return dict.fromkeys((*self.state_names, *self.input_names), (0.0, math.inf)) | {
+            "quota_umol_um3": (self.minimal_quota_umol_um3, math.inf)
+        }
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""

@@ -49,6 +49,7 @@ class MicroalgaeMonod:
     kind: ClassVar[str] = "microalgae_monod"
     state_names: ClassVar[tuple[str, ...]] = ("biomass_um3_l", "nutrient_umol_l")
     input_names: ClassVar[tuple[str, ...]] = ("light_umol_m2_s",)
+    input_unit: ClassVar[str] = "umol/m**2/s"
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "after"
 
@@ -61,6 +62,12 @@ class MicroalgaeMonod:
     dilution_per_day: float = 0.45
     nutrient_in_umol_l: float = 100.0
     co2_per_nutrient: float = 0.3
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Nothing is negative; the published form has no bounds."""
+        names = () if self.form == "published" else (*self.state_names, *self.input_names)
+        return dict.fromkeys(names, (0.0, math.inf))
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""

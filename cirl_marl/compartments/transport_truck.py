@@ -44,6 +44,7 @@ class TransportTruck:
     kind: ClassVar[str] = "transport_truck"
     state_names: ClassVar[tuple[str, ...]] = ("position_m", "speed_m_s")
     input_names: ClassVar[tuple[str, ...]] = ("force_n",)
+    input_unit: ClassVar[str] = "N"
     time_unit: ClassVar[str] = "s"
     reward_state: ClassVar[RewardState] = "after"
 

@@ -163,6 +163,10 @@ def _create(directory: Path, config: RunConfig, network: Network) -> RunDirector
     with tempfile.TemporaryDirectory() as folder:
         written = Path(folder) / "network.toml"
         write_network(network, written)
+        try:
+            load_network(written)
+        except CirlError as error:
+            raise RunError(f"{directory}: a run on disk needs a network that can be read again: {error}") from error
         return RunDirectory.create(directory, replace(config, scenario="default"), written)
 
 

@@ -14,6 +14,9 @@ from cirl_marl.errors import CirlError
 from cirl_marl.flows import FlowLaws
 from cirl_marl.network import Floats, Integers, Network
 
+MOST_NODES = 1000
+"""Nodes of the largest network that is bounded; memory grows with their square, to some 1.2 GB here."""
+
 
 class NoCertificate(CirlError):
     """A network for which no upper bound is proved; the message says why."""
@@ -110,7 +113,9 @@ def _setter(network: Network, arc: Arc) -> Arc | Node | None:
 
 
 def _uncertified(network: Network) -> Iterator[str]:
-    """Yield every reason why the flows of ``network`` are not the linear laws that the theorem is about."""
+    """Yield why the theorem does not hold for the flows of ``network``, or its system would not fit into memory."""
+    if len(network.nodes) > MOST_NODES:
+        yield f"{len(network.nodes):,} nodes are more than the {MOST_NODES:,} whose products in pairs are kept"
     if network.episode.solver != "exact":
         yield f"solver '{network.episode.solver}' is not exact within a control interval"
     modelled = [c.id for c in network.compartments.values() if c.model is not None]

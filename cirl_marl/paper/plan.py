@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cirl_marl.catalogue import recipes
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.paper.published import BOX_ALGORITHMS, ENVIRONMENTS, GOAL_ALGORITHMS, chosen, environment_of
+from cirl_marl.paper.published import ALGORITHMS, BOX_ALGORITHMS, ENVIRONMENTS, GOAL_ALGORITHMS, chosen, environment_of
 from cirl_marl.paper.results import Row
 
 RECIPES = ("published", "tuned")
@@ -34,6 +34,8 @@ def planned(
     """
     if recipe is not None and recipe not in RECIPES:
         raise CirlError(f"--recipe: {unknown('recipe', recipe, RECIPES)}")
+    if algorithm is not None and algorithm not in ALGORITHMS:
+        raise CirlError(unknown("algorithm of the paper", algorithm, ALGORITHMS))
     rows = []
     if recipe != "tuned":
         rows += [
@@ -44,7 +46,7 @@ def planned(
     if recipe != "published":
         rows += _tuned(environment, algorithm, steps, seeds, must_exist=recipe == "tuned")
     if not rows:
-        raise CirlError("there are no tuned recipes agents/paper_*.toml")
+        raise CirlError(f"there is no tuned recipe agents/paper_*.toml for {environment or algorithm or 'any'}")
     return rows
 
 
@@ -83,9 +85,9 @@ def _tuned(
             if must_exist and environment is not None:
                 raise CirlError(f"there is no tuned recipe agents/paper_*.toml for {environment}")
             continue
-        learner = load_recipe(name).learner.algorithm
+        learner = load_recipe(name).learner.algorithm + ("-HER" if found.has_goals else "")
         if algorithm not in (None, learner):
-            if must_exist:
+            if must_exist and environment is not None:
                 raise CirlError(f"the tuned recipe '{name}' uses {learner}, not {algorithm}")
             continue
         rows += [

@@ -28,7 +28,7 @@ class Row:
 
     Attributes:
         environment: name in the paper.
-        algorithm: name in the paper; of a tuned row, that of its recipe.
+        algorithm: name in the paper; of a tuned row, that of its recipe, with ``-HER`` where it learns in hindsight.
         recipe: ``published`` for the paper's settings, ``tuned`` for ``agents/paper_*.toml``.
         steps: environment steps, summed over the copies.
         seed: of model and environment.

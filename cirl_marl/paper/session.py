@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Results, Row
 from cirl_marl.paper.table import environment_table, result_line
-from cirl_marl.paper.training import Report, check_registered, run_row
+from cirl_marl.paper.training import Report, check_registered, outdated, run_row
 
 REFRESH_S = 0.2
 
@@ -28,7 +28,10 @@ def run_session(rows: Sequence[Row], results: Results, console: Console, *, succ
     for environment in environments:
         check_registered(environment)
     for i, row in enumerate(rows):
-        if not results.has(row):
+        again = outdated(results.read(row), success_episodes) if results.has(row) else ""
+        if again:
+            console.print(f"{row}: once more, as {again}", soft_wrap=True, highlight=False)
+        if again or not results.has(row):
             with live_bar(
                 console, f"{i + 1} of {len(rows)}: {row.environment} {row.algorithm}, seed {row.seed}"
             ) as bar:

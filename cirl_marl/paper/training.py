@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from hashlib import sha256
 from importlib import metadata
 from typing import Any
 
@@ -25,10 +24,13 @@ from cirl_marl.catalogue import load_network
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluate import EVALUATION_SEEDS, SEED_SPACING
 from cirl_marl.learners.algorithms import algorithm_class
+from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.run import versions
 from cirl_marl.learners.training import one_torch_thread
+from cirl_marl.paper.plan import tuned_recipe
 from cirl_marl.paper.published import PaperEnvironment, environment_of
 from cirl_marl.paper.results import WINDOW, Evaluation, Result, Row, thinned
+from cirl_marl.results import fingerprint
 
 EVALUATION_EPISODES = 100
 EVALUATION_COPIES = 20
@@ -91,8 +93,7 @@ def run_row(row: Row, *, report: Report | None = None, success_episodes: int | N
             trained = train_tuned(environment, row, report)
         if not trained.returns:
             raise CirlError(f"{row}: no training episode ended; use more steps")
-        wanted = environment.success_episodes if success_episodes is None else success_episodes
-        episodes = wanted if environment.success_episodes else EVALUATION_EPISODES
+        episodes = evaluation_episodes(environment, success_episodes)
         seed = EVALUATION_SEEDS + SEED_SPACING * row.seed
         evaluation = evaluate(environment.id, trained.predict, episodes, seed, report, trained.options)
         threads = torch.get_num_threads()
@@ -112,6 +113,33 @@ def run_row(row: Row, *, report: Report | None = None, success_episodes: int | N
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
         cpu_seconds=trained.cpu_seconds,
     )
+
+
+def evaluation_episodes(environment: PaperEnvironment, success_episodes: int | None) -> int:
+    """Return how many episodes a final policy plays: where successes are counted, as many as asked for."""
+    if not environment.success_episodes:
+        return EVALUATION_EPISODES
+    return environment.success_episodes if success_episodes is None else success_episodes
+
+
+def outdated(result: Result, success_episodes: int | None = None) -> str:
+    """Return in what a result differs from what its row would give today; empty if in nothing that is known.
+
+    Args:
+        result: of a row that is done.
+        success_episodes: as for ``run_row``.
+    """
+    environment, settings = environment_of(result.row.environment), result.settings
+    episodes = evaluation_episodes(environment, success_episodes)
+    if result.evaluation.episodes != episodes:
+        return f"its policy played {result.evaluation.episodes} episodes, not {episodes}"
+    recorded = settings.get("definition_sha256")
+    if recorded is not None and recorded != described(environment).get("definition_sha256"):
+        return "the definition of the environment is another now"
+    name = tuned_recipe(environment.name) if result.row.recipe == "tuned" else None
+    if name is not None and Recipe.model_validate(settings["recipe"]) != load_recipe(name):
+        return f"the recipe '{name}' is another now"
+    return ""
 
 
 def check_registered(environment: PaperEnvironment) -> gymnasium.envs.registration.EnvSpec:
@@ -167,9 +195,9 @@ def described(environment: PaperEnvironment) -> dict[str, Any]:
     """Return id, arguments and fingerprint of the definition of an environment, for the record."""
     spec = check_registered(environment)
     found = {"environment": spec.id, "arguments": {key: str(value) for key, value in spec.kwargs.items()}}
-    source = load_network(spec.kwargs["network"]).source if "network" in spec.kwargs else None
-    if source is not None and source.is_file():
-        found["definition_sha256"] = sha256(source.read_bytes()).hexdigest()
+    if "network" in spec.kwargs:
+        network = load_network(spec.kwargs["network"], scenario=spec.kwargs.get("scenario"))
+        found["definition_sha256"] = fingerprint(network)
     return found
 
 

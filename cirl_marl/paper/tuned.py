@@ -18,6 +18,7 @@ from cirl_marl.errors import CirlError, RecipeError
 from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
+from cirl_marl.learners.recipe import Learner
 from cirl_marl.learners.trainee import derived_seed
 from cirl_marl.paper.plan import tuned_recipe
 from cirl_marl.paper.published import PaperEnvironment
@@ -52,7 +53,7 @@ def train_tuned(environment: PaperEnvironment, row: Row, report: Report, recipe:
         if name is None:
             raise CirlError(f"there is no tuned recipe agents/paper_*.toml for {environment.name}")
         recipe = load_recipe(name)
-    if recipe.learner.algorithm != row.algorithm:
+    if recipe.learner.algorithm != row.algorithm.removesuffix("-HER"):
         raise RecipeError(f"recipe '{recipe.name}' uses {recipe.learner.algorithm}, but the row says {row.algorithm}")
     _check_comparable(recipe)
     recipe.check_demonstrations(row.steps)
@@ -120,11 +121,12 @@ def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, repo
 
 def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, report: Report) -> Trained:
     """Train in copies of the Gymnasium environment; a goal task gets hindsight, as in the paper."""
-    if recipe.environment or recipe.learner.share_of_steps != 1:
-        raise RecipeError(
-            f"recipe '{recipe.name}': {environment.name} learns in copies: leave out environment and share"
-        )
     learner, copies = recipe.learner, recipe.run.envs
+    plain = Learner(algorithm=learner.algorithm)
+    unused = [key for key in ("scheme", "share_of_steps", "bootstrap") if getattr(learner, key) != getattr(plain, key)]
+    if recipe.environment or unused:
+        left_out = ", ".join([*(["environment"] if recipe.environment else []), *unused])
+        raise RecipeError(f"recipe '{recipe.name}': {environment.name} learns in copies: leave out {left_out}")
     monitors: list[Monitor[Any, Any]] = [Monitor(gymnasium.make(environment.id)) for _ in range(copies)]
     env: VecEnv = DummyVecEnv([lambda monitor=monitor: monitor for monitor in monitors])  # type: ignore[misc]
     goal = isinstance(env.observation_space, gymnasium.spaces.Dict)

@@ -88,6 +88,7 @@ class Fetch:
 
     kind: ClassVar[str] = "fetch"
     input_names: ClassVar[tuple[str, ...]] = ("move_x", "move_y", "move_z", "fingers")
+    input_unit: ClassVar[str] = "1"
     time_unit: ClassVar[str] = "s"
     reward_state: ClassVar[RewardState] = "after"
     interval: ClassVar[float] = 0.04

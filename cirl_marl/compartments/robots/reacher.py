@@ -68,6 +68,7 @@ class Reacher:
 
     kind: ClassVar[str] = "reacher"
     input_names: ClassVar[tuple[str, ...]] = ("torque_0_n_m", "torque_1_n_m")
+    input_unit: ClassVar[str] = "1"
     time_unit: ClassVar[str] = "s"
     reward_state: ClassVar[RewardState] = "after"
     interval: ClassVar[float] = 0.02

@@ -75,6 +75,12 @@ class SortingStation:
         return names
 
     @property
+    def input_unit(self) -> str:
+        """That of the robot's inputs."""
+        unit: str = self.robot.input_unit
+        return unit
+
+    @property
     def observed(self) -> tuple[str, ...]:
         """Whether the robot works, and what it sees."""
         return ("busy", *self.robot.observed)
