@@ -159,7 +159,6 @@ def _create(directory: Path, config: RunConfig, network: Network) -> RunDirector
         read = load_network(source, scenario=network.scenario_name).with_options(**asked)
         if read == network:
             return RunDirectory.create(directory, config, source)
-    directory.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         written = Path(folder) / "network.toml"
         write_network(network, written)
