@@ -12,6 +12,7 @@
       metrics.csv          one row an episode: λ̄, service level, return of each agent
       tensorboard/LEARNER/ learning curves of each learner
       evaluation.json      written by an evaluation
+      .lock                claimed while a training has the run open
       pictures/
 """
 
