@@ -3,7 +3,7 @@
 Results of few training seeds are reported as the interquartile mean (IQM) with stratified bootstrap intervals: the
 quarter of lowest and the quarter of highest scores are left out, which is steadier than the mean and sees more than the
 median; seeds are resampled within each network, the stratum. Such intervals are meant to hold the true figure 95 times
-in 100; of five normal scores on one network they hold it some 89 times, of ten 93 times.
+in 100; of five normal scores on one network they hold it some 90 times, of ten 93 times.
 
 References: Agarwal et al. 2021, Deep Reinforcement Learning at the Edge of the Statistical Precipice (rliable).
 """

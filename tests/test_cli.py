@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, cli
+from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, cli, learners
 from cirl_marl.catalogue import folder
 from cirl_marl.definition import write_network
-from cirl_marl.learners import train
+from cirl_marl.learners import RunDirectory, train
 from cirl_marl.optimum import search_each
 
 
@@ -157,6 +157,28 @@ def test_check_remarks_on_steps_that_are_too_long(
     assert run(monkeypatch, "check", "long.toml") == 0
     printed = capsys.readouterr().out
     assert ("remark on scenario 'default': episode.solver_step" in printed) == said
+
+
+def test_a_stopped_training_says_what_is_saved(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All of it after one Ctrl-C, the last checkpoint after two, nothing before the first."""
+    shutil.copytree(trained, "run")
+    kept = RunDirectory("run")
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(learners, "train", stop)
+    checkpoint = kept.status["checkpoint"]
+    for state, name, said in (
+        ("interrupted", checkpoint, "everything learnt is saved. Go on with: cirl train --resume run"),
+        ("running", checkpoint, "what was learnt in the first 160 steps is saved. Go on with"),
+        ("running", None, "nothing was learnt yet that could be saved"),
+    ):
+        kept.set_status(state, 20, name)
+        assert run(monkeypatch, "train", "copper_net", "--out", "run") == 130
+        assert said in " ".join(capsys.readouterr().out.split())
 
 
 def test_short_trainings_say_that_there_are_no_curves(

@@ -12,9 +12,15 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from cirl_marl import (
+    Arc,
+    Control,
     ControlError,
+    ControlKind,
+    Network,
+    Node,
     VectorEnv,
     aec_env,
+    credit,
     load_network,
     networks,
     parallel_env,
@@ -23,6 +29,7 @@ from cirl_marl import (
 )
 from cirl_marl.controllers import Constant, Random, Scripted
 from cirl_marl.evaluate import rollout
+from cirl_marl.simulate import Dynamics
 from cirl_marl.testing import check_parallel_env, check_vector_env
 
 CATALOGUE = [
@@ -160,6 +167,36 @@ def test_difference_reward_by_hand(circularity: str) -> None:
             # the neutral action maps to the neutral control to round-off
             counterfactual = imagined.advance(other).reward[row]
             np.testing.assert_allclose(reward[row], actual - counterfactual, rtol=1e-9, atol=1e-9)
+
+
+def test_difference_rewards_stay_within_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a dense network the flows, not the stocks, limit how many agents are imagined at once."""
+    nodes = tuple(Node(id=f"n{i}", initial=(50.0, 100.0)) for i in range(8))
+    valve = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
+    arcs = tuple(
+        Arc(id=f"a{i}_{j}", donor=f"n{i}", recipient=f"n{j}", rate=0.05, control=valve)
+        for i in range(8)
+        for j in range(8)
+        if i != j
+    )
+    env = VectorEnv(Network(name="dense", nodes=nodes, arcs=arcs), num_envs=3, reward="difference")
+    actions = np.random.default_rng(0).uniform(-1, 1, (len(arcs), 3))
+    env.reset(1)
+    here = env.snapshot()
+    at_once = env.advance(actions).reward
+    widths: list[int] = []
+    advance = Dynamics.advance
+
+    def noted(self: Dynamics, stock: Any, *rest: Any) -> Any:
+        widths.append(stock.shape[1])
+        return advance(self, stock, *rest)
+
+    monkeypatch.setattr(Dynamics, "advance", noted)
+    monkeypatch.setattr(credit, "CELLS", 2000)
+    env.restore(here)
+    np.testing.assert_array_equal(env.advance(actions).reward, at_once)
+    assert sum(widths) == 3 + 3 * len(arcs)
+    assert max(widths) * len(arcs) <= 2000
 
 
 def test_copies_restart_by_themselves() -> None:

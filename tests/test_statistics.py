@@ -49,17 +49,17 @@ def test_seeds_are_resampled_within_each_network() -> None:
 
 
 @pytest.mark.parametrize(
-    ("networks", "seeds", "least", "most"), [(4, 10, 0.90, 0.99), (1, 10, 0.90, 0.96), (1, 5, 0.85, 0.92)]
+    ("networks", "seeds", "least", "most"), [(4, 10, 0.915, 0.945), (1, 10, 0.92, 0.95), (1, 5, 0.89, 0.92)]
 )
 def test_coverage(networks: int, seeds: int, least: float, most: float) -> None:
     """Intervals hold the true value about 95 times in 100, of few seeds on one network fewer times, as documented."""
     rng = np.random.default_rng(1)
     middles = np.arange(networks, dtype=float)  # symmetric, so that their mean is the true interquartile mean
     hits = 0
-    for trial in range(400):
+    for trial in range(4000):
         found = over_seeds(list(rng.normal(middles[:, None], 1.0, (networks, seeds))), resamples=400, seed=trial)
         hits += found.low <= middles.mean() <= found.high
-    assert least <= hits / 400 <= most
+    assert least <= hits / 4000 <= most
 
 
 def test_one_seed_has_no_interval() -> None:

@@ -15,7 +15,7 @@ from cirl_marl.flows import FlowLaws
 from cirl_marl.network import Floats, Integers, Network
 
 MOST_NODES = 1000
-"""Nodes of the largest network that is bounded; memory grows with their square, to some 1.2 GB here."""
+"""Nodes of the largest network that is bounded; memory grows with their square, time faster."""
 
 
 class NoCertificate(CirlError):
