@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
 from cirl_marl.learners import Recipe, Training, load_recipe, train
+from cirl_marl.learners.algorithms import algorithm_class
 from cirl_marl.paper import published, session, training, tuned
 from cirl_marl.paper.plan import planned, study
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
@@ -149,6 +151,35 @@ def test_same_seed_same_figures() -> None:
     assert first.evaluation == second.evaluation
 
 
+@pytest.mark.parametrize("algorithm", ["SAC", "DDPG", "PPO"])
+def test_weights_that_become_nan_are_a_result(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A learner that breaks shows its episodes until then and the step; there is no policy to evaluate."""
+    wild = partial(algorithm_class(algorithm), learning_rate=1e30)
+    monkeypatch.setattr(training, "algorithm_class", lambda _: wild)
+    arguments = (algorithm, "--steps", "10000", "--out", str(tmp_path))
+    assert cirl(monkeypatch, *arguments) == 0
+    assert "weights NaN after" in capsys.readouterr().out
+    (found,) = Results(tmp_path).all()
+    assert found.diverged
+    assert found.evaluation is None
+    assert 100 < found.steps_done < 10_000
+    assert found.episodes == found.steps_done // 50
+    assert found.gain_per_step == found.gain / found.steps_done
+    assert not outdated(found)
+    line = next(line for line in markdown([found]).splitlines() if f"| {algorithm} | ours | 0 |" in line)
+    assert f"seed 0: weights NaN after {found.steps_done:,} of 10,000 steps" in line
+    assert "nan" not in line
+
+
+def test_other_failures_of_a_training_are_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only broken weights are what the settings give; anything else that goes wrong is said."""
+    monkeypatch.setattr(training.Watch, "_on_step", lambda _: int("none"))
+    with pytest.raises(ValueError, match="invalid literal"):
+        run_row(Row(environment="CopperNet", algorithm="SAC", steps=200))
+
+
 def test_interrupted_row_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -256,6 +287,7 @@ def test_names_choose_rows() -> None:
 def test_results_that_answer_another_question_are_outdated() -> None:
     """Other evaluation episodes, definitions or recipes are named; what is not on record is not held against it."""
     kept = result()
+    assert kept.evaluation is not None
     assert outdated(kept) == ""
     assert "played 50 episodes, not 100" in outdated(replace(kept, evaluation=replace(kept.evaluation, episodes=50)))
     now = described(COPPER)
@@ -281,9 +313,8 @@ def test_goal_task_learns_with_hindsight(toy: PaperEnvironment) -> None:
     """Successes count when they come, in the number of episodes asked for."""
     del toy
     found = run_row(Row(environment="Toy", algorithm="SAC-HER", steps=110), success_episodes=40)
-    assert found.evaluation.episodes == 40
-    assert found.evaluation.success == 50.0
-    assert found.evaluation.mean == found.end_return == -10.0
+    assert found.evaluation == Evaluation(episodes=40, mean=-10.0, deviation=0.0, success=50.0)
+    assert found.end_return == -10.0
     assert found.settings["policy"] == "MultiInputPolicy"
 
 
@@ -326,6 +357,7 @@ def test_tuned_policy_is_measured_behind_its_normaliser(monkeypatch: pytest.Monk
     (trainee,) = kept[0].trainees.values()
     assert isinstance(trainee.env, VecNormalize)
     seen = np.random.default_rng(0).uniform(50, 2000, (3, 6)).astype(np.float32)
+    assert trained.predict is not None
     chosen = trained.predict(seen, None, np.ones(3, dtype=bool))[0]
     expected = trainee.model.predict(np.asarray(trainee.env.normalize_obs(seen)), deterministic=True)[0]
     np.testing.assert_array_equal(chosen, expected)

@@ -73,13 +73,14 @@ class Result:
 
     Attributes:
         row: the row.
-        steps_done: environment steps done; on-policy learners finish their last rollout.
+        steps_done: environment steps done; on-policy learners finish their last rollout, and a learner whose weights
+            became NaN did no more.
         seconds: wall time of training, without evaluation.
         episodes: training episodes that ended.
         start_return: r_s, mean return of the first 100 of them.
         end_return: r_e, mean return of the last 100.
         curve: (steps, mean return) of consecutive training episodes, at most 500 points.
-        evaluation: of the final policy.
+        evaluation: of the final policy; None if its weights became NaN, and there is none.
         settings: hyperparameters that differ from the library's defaults, copies, the environment's id and arguments.
         versions: of Python and the packages.
         machine: processors, torch threads, load at the end.
@@ -94,7 +95,7 @@ class Result:
     start_return: float
     end_return: float
     curve: list[tuple[int, float]]
-    evaluation: Evaluation
+    evaluation: Evaluation | None
     settings: dict[str, Any]
     versions: dict[str, str]
     machine: dict[str, Any]
@@ -107,16 +108,21 @@ class Result:
         return self.end_return - self.start_return
 
     @property
+    def diverged(self) -> bool:
+        """Whether the weights became NaN, so that the training ended before its time and left no policy."""
+        return self.evaluation is None
+
+    @property
     def gain_per_step(self) -> float:
-        """ψ = ζ / steps."""
-        return self.gain / self.row.steps
+        """ψ = ζ / steps, of those that were to be done as many as were."""
+        return self.gain / min(self.row.steps, self.steps_done)
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> Result:
         """Read what ``asdict`` returned, after a detour through JSON."""
         given = {key: value for key, value in plain.items() if key not in ("gain", "gain_per_step")}
         given["row"] = Row(**given["row"])
-        given["evaluation"] = Evaluation(**given["evaluation"])
+        given["evaluation"] = None if given["evaluation"] is None else Evaluation(**given["evaluation"])
         given["curve"] = [(int(step), float(value)) for step, value in given["curve"]]
         return cls(**given)
 

@@ -34,7 +34,11 @@ Published figures: {SOURCE}. Written by `python benchmarks/paper.py --table`.
 
 def result_line(result: Result) -> str:
     """Say in one line what a row gave."""
-    success = "" if result.evaluation.success is None else f", s {result.evaluation.success:.1f} %"
+    success = ""
+    if result.evaluation is None:
+        success = f", {_broke(result)}"
+    elif result.evaluation.success is not None:
+        success = f", s {result.evaluation.success:.1f} %"
     return (
         f"{result.row}: r_s {number(result.start_return)}, r_e {number(result.end_return)}, "
         f"ζ {number(result.gain)}{success}, {result.seconds / 60:.1f} min"
@@ -135,7 +139,8 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
     def cell(figure: Callable[[Result], float]) -> str:
         return over_seeds([figure(result) for result in seeds])
 
-    successes = [result.evaluation.success for result in seeds if result.evaluation.success is not None]
+    played = [result.evaluation for result in seeds if result.evaluation is not None]
+    successes = [evaluation.success for evaluation in played if evaluation.success is not None]
     cpu = [result.cpu_seconds for result in seeds if result.cpu_seconds is not None]
     return (
         algorithm,
@@ -146,7 +151,7 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
         cell(lambda result: result.gain),
         cell(lambda result: result.gain_per_step),
         over_seeds(successes) if successes else "",
-        cell(lambda result: result.evaluation.mean),
+        over_seeds([evaluation.mean for evaluation in played]) if played else "",
         f"{np.mean([result.seconds for result in seeds]) / 60:.1f}",
         f"{np.mean(cpu) / 60:.1f}" if cpu else "",
         "; ".join(_remarks(environment, seeds)),
@@ -154,22 +159,30 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
 
 
 def _remarks(environment: PaperEnvironment, seeds: Sequence[Result]) -> Iterator[str]:
-    """Say what sets a row apart from the paper's: fewer steps or episodes, or a start that the learner was shown."""
+    """Say what sets a row apart from the paper's: fewer steps or episodes, weights that broke, a start it was shown."""
     result = seeds[0]
     few = min(seed.episodes for seed in seeds) // 2
     if few < WINDOW:
         yield f"r_s and r_e over {few} episodes"
     if result.row.steps != environment.steps:
         yield f"{result.row.steps:,} of {environment.steps:,} steps"
+    for seed in seeds:
+        if seed.diverged:
+            yield f"seed {seed.row.seed}: {_broke(seed)}, r_e is of the last episodes before"
     shown = result.settings.get("recipe", {}).get("learner", {}).get("demonstrations")
     if shown:
         yield f"the first {shown['steps']:,} steps, and r_s with them, are shown by {shown['controller']} control"
 
 
+def _broke(result: Result) -> str:
+    return f"weights NaN after {result.steps_done:,} of {result.row.steps:,} steps"
+
+
 def _notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
     """Say how many episodes the final policies played, what is the best possible, and what differs."""
     best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
-    own = [result.evaluation.episodes for result in results if result.row.environment == environment.name]
+    ours = (result.evaluation for result in results if result.row.environment == environment.name)
+    own = [evaluation.episodes for evaluation in ours if evaluation is not None]
     played = f"Final policy: {' or '.join(_distinct(own))} episodes a seed. " if own else ""
     return f"{played}Optimum: {best}. {environment.remark}".rstrip()
 

@@ -48,7 +48,7 @@ class Trained:
     """What a training hands over to be measured.
 
     Attributes:
-        predict: the final policy.
+        predict: the final policy; None if its weights became NaN.
         ends: environment steps at which each training episode ended.
         returns: undiscounted return of each.
         steps: environment steps done.
@@ -58,7 +58,7 @@ class Trained:
         options: options of the environment to evaluate in.
     """
 
-    predict: Predict
+    predict: Predict | None
     ends: list[int]
     returns: list[float]
     steps: int
@@ -95,7 +95,9 @@ def run_row(row: Row, *, report: Report | None = None, success_episodes: int | N
             raise CirlError(f"{row}: no training episode ended; use more steps")
         episodes = evaluation_episodes(environment, success_episodes)
         seed = EVALUATION_SEEDS + SEED_SPACING * row.seed
-        evaluation = evaluate(environment.id, trained.predict, episodes, seed, report, trained.options)
+        evaluation = None
+        if trained.predict is not None:
+            evaluation = evaluate(environment.id, trained.predict, episodes, seed, report, trained.options)
         threads = torch.get_num_threads()
     window = max(1, min(WINDOW, len(trained.returns) // 2))
     return Result(
@@ -131,7 +133,7 @@ def outdated(result: Result, success_episodes: int | None = None) -> str:
     """
     environment, settings = environment_of(result.row.environment), result.settings
     episodes = evaluation_episodes(environment, success_episodes)
-    if result.evaluation.episodes != episodes:
+    if result.evaluation is not None and result.evaluation.episodes != episodes:
         return f"its policy played {result.evaluation.episodes} episodes, not {episodes}"
     recorded = settings.get("definition_sha256")
     if recorded is not None and recorded != described(environment).get("definition_sha256"):
@@ -165,14 +167,23 @@ def _check_success(environment: PaperEnvironment) -> None:
 
 
 def train_published(environment: PaperEnvironment, row: Row, report: Report) -> Trained:
-    """Train with the paper's settings: the library's default hyperparameters, one copy; hindsight for goal tasks."""
+    """Train with the paper's settings: the library's default hyperparameters, one copy; hindsight for goal tasks.
+
+    A learner whose weights become NaN ends there, and that is what these settings give: the same seed gives it again.
+    """
     env = Monitor(gymnasium.make(environment.id))
     name, _, hindsight = row.algorithm.partition("-")
     policy = "MultiInputPolicy" if hindsight else "MlpPolicy"
     extra: dict[str, Any] = {"replay_buffer_class": HerReplayBuffer} if hindsight else {}
     model = algorithm_class(name)(policy, env, seed=row.seed, device="cpu", **extra)
     elapsed = stopwatch()
-    model.learn(row.steps, callback=Watch(report, row.steps))
+    diverged = False
+    try:
+        model.learn(row.steps, callback=Watch(report, row.steps))
+    except (CirlError, ValueError):  # what torch's distributions and the environments say of NaN
+        diverged = not _is_finite(model)
+        if not diverged:
+            raise
     seconds, cpu_seconds = elapsed()
     settings = {"policy": policy, "hyperparameters": "defaults of the library", "copies": 1, **described(environment)}
     if hindsight:
@@ -180,7 +191,7 @@ def train_published(environment: PaperEnvironment, row: Row, report: Report) -> 
     ends, returns = episodes_of([env])
     env.close()
     return Trained(
-        predict=predictor(model),
+        predict=None if diverged else predictor(model),
         ends=ends,
         returns=returns,
         steps=model.num_timesteps,
@@ -189,6 +200,10 @@ def train_published(environment: PaperEnvironment, row: Row, report: Report) -> 
         settings=settings,
         options={},
     )
+
+
+def _is_finite(model: BaseAlgorithm) -> bool:
+    return all(bool(weights.isfinite().all()) for weights in model.policy.parameters())
 
 
 def described(environment: PaperEnvironment) -> dict[str, Any]:
