@@ -15,15 +15,18 @@ PAPER_ENVIRONMENTS = {
     "cirl_marl/CO2MicroalgaeDroop-v0": ("net_zero", "microalgae", "paper_droop"),
 }
 """Gymnasium id → (network, agent, scenario)."""
+GOAL_TASKS = ("cirl_marl/FetchWasteSorting-v0",)
+"""Ids whose observations are dictionaries with goals, as hindsight needs them."""
 
 
 def register() -> None:
     """Register every id once; called when ``cirl_marl`` is imported."""
     for id_, (network, agent, scenario) in PAPER_ENVIRONMENTS.items():
         if id_ not in gymnasium.registry:
-            goal = scenario == "paper_fetch"
             gymnasium.register(
                 id_,
-                entry_point="cirl_marl.goal_env:GoalEnv" if goal else "cirl_marl.single_env:SingleAgentEnv",
+                entry_point="cirl_marl.goal_env:GoalEnv"
+                if id_ in GOAL_TASKS
+                else "cirl_marl.single_env:SingleAgentEnv",
                 kwargs={"network": network, "agent": agent, "scenario": scenario},
             )
