@@ -23,10 +23,9 @@ def register() -> None:
     """Register every id once; called when ``cirl_marl`` is imported."""
     for id_, (network, agent, scenario) in PAPER_ENVIRONMENTS.items():
         if id_ not in gymnasium.registry:
+            kind = "goal_env:GoalEnv" if id_ in GOAL_TASKS else "single_env:SingleAgentEnv"
             gymnasium.register(
                 id_,
-                entry_point="cirl_marl.goal_env:GoalEnv"
-                if id_ in GOAL_TASKS
-                else "cirl_marl.single_env:SingleAgentEnv",
+                entry_point=f"cirl_marl.{kind}",
                 kwargs={"network": network, "agent": agent, "scenario": scenario},
             )
