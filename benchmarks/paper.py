@@ -1,7 +1,7 @@
 """The paper's tables: every algorithm on every environment with the paper's settings, our tuned recipes beside them.
 
-``python benchmarks/paper.py --out runs/paper`` runs row after row, each in a process of its own, and can be stopped and
-started again: finished rows are kept. ``--table`` only writes the tables, ``--speed`` compares training times.
+``python benchmarks/paper.py`` runs row after row, each in a process of its own, and can be stopped and started again:
+finished rows are kept. ``--table`` only writes the tables, ``--speed`` compares training times.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ from cirl_marl.paper.training import outdated
 console = Console(width=None if sys.stdout.isatty() else 140)
 processes = get_context("spawn")
 PHASES = ("waiting", "training", "evaluating")
+KEPT = Path(__file__).parent / "results" / "paper"
 DOCUMENT = Path(__file__).parent.parent / "docs" / "paper_tables.md"
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="Where results are kept.")] = Path("runs/paper"),
+    out: Annotated[Path, typer.Option(help="Where results are kept; trials need a place of their own.")] = KEPT,
     only: Annotated[list[str] | None, typer.Option(help="ENV or ENV:ALGORITHM; repeatable. Default: all.")] = None,
     recipe: Annotated[str | None, typer.Option(help="published or tuned; default: both.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each row; default: the paper's.")] = None,
@@ -48,7 +49,8 @@ def main(
     table: Annotated[bool, typer.Option("--table", help="Run nothing, only write the tables.")] = False,
     speed: Annotated[bool, typer.Option("--speed", help="Only compare training times on CopperNet.")] = False,
     write: Annotated[
-        Path | None, typer.Option(help="The tables; default: docs/paper_tables.md, of a part or a trial in OUT.")
+        Path | None,
+        typer.Option(help="The tables; default: docs/paper_tables.md; of a part, a trial or another OUT: in OUT."),
     ] = None,
 ) -> None:
     """Run what is missing, then write the tables."""
@@ -71,7 +73,8 @@ def main(
             message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
             console.print(message, soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None
-    path = write or (out / DOCUMENT.name if only or steps or seeds or episodes or recipe else DOCUMENT)
+    part = only or steps or seeds or episodes or recipe or out.resolve() != KEPT.resolve()
+    path = write or (out / DOCUMENT.name if part else DOCUMENT)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(markdown(results.all()), encoding="utf-8")
     console.print(f"tables: {path}", soft_wrap=True)

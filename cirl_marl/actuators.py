@@ -41,14 +41,16 @@ class Actuators:
         self._all_act = self.acting.tolist() == list(range(len(laws.neutral)))
         self._neutral = laws.neutral
         low, high = laws.control_low[self.acting], laws.control_high[self.acting]
-        # one value per copy: NumPy multiplies equal shapes about twice as fast as it broadcasts a column
-        self._middle = np.repeat(((high + low) / 2)[:, None], num_envs, axis=1)
-        self._half = np.repeat(((high - low) / 2)[:, None], num_envs, axis=1)
+        # one value per copy: NumPy takes equal shapes about twice as fast as it broadcasts a column
+        self._low, self._middle, self._half, self._high = (
+            np.repeat(each[:, None], num_envs, axis=1) for each in (low, (high + low) / 2, (high - low) / 2, high)
+        )
 
     @property
     def neutral_action(self) -> dict[str, Floats]:
         """Normalised action of each agent that leaves it neutral, shape (entries,) each."""
         neutral = (self._neutral[self.acting] - self._middle[:, 0]) / self._half[:, 0]
+        np.clip(neutral, -1.0, 1.0, out=neutral)  # rounding may lead beyond a bound
         return {agent: neutral[entries] for agent, entries in self.entries.items()}
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
@@ -84,6 +86,7 @@ class Actuators:
             raise ControlError(self._wrong_values(actions))
         acting = actions * self._half
         acting += self._middle
+        np.clip(acting, self._low, self._high, out=acting)
         if self._all_act:
             return acting
         controls = np.repeat(self._neutral[:, None], actions.shape[1], axis=1)
@@ -118,6 +121,6 @@ def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:
     for agent in chosen:
         if agent not in network.control_rows:
             raise CirlError(f"network '{network.name}': {unknown('agent', agent, network.controllable)}")
-    if (agents is not None and not chosen) or len(set(chosen)) != len(chosen):
+    if (network.agents and not chosen) or len(set(chosen)) != len(chosen):
         raise CirlError(f"network '{network.name}': agents {list(chosen)} must be distinct and at least one")
     return chosen

@@ -196,19 +196,21 @@ class Converter:
         try:
             kind = model_class(table.kind)
             form = {} if table.form is None else {"form": table.form}
-            known = list(inspect.signature(kind).parameters)
+            known = inspect.signature(kind).parameters
             for name in (*table.parameters, *form):
                 if name not in known:
                     raise CirlError(unknown("parameter", name, known))
-            model = kind(**table.parameters, **form)
+            for name, value in table.parameters.items():
+                _check_type(known[name], value)
+            model = kind(**table.parameters | form)
         except CirlError as error:
             self.mistakes.append(f"{where}: {error}")
             return {}
         ranged = ranged_states(model)
         for name in (*table.initial, *ranged):
             if name not in ranged or name not in table.initial:
-                known = [state for state in ranged if state not in table.initial]
-                self.mistakes.append(f"{where}.initial: {unknown('inner state', name, known)}")
+                missing = [state for state in ranged if state not in table.initial]
+                self.mistakes.append(f"{where}.initial: {unknown('inner state', name, missing)}")
         ranges = [table.initial[name] for name in ranged if name in table.initial]
         scale = self._optional(table.reward_scale, "1", f"{where}.reward_scale")
         return {
@@ -246,3 +248,15 @@ class Converter:
                 self.mistakes.append(f"{where}: {error}")
                 return 1.0
         return self.factors[unit, kind]
+
+
+def _check_type(parameter: inspect.Parameter, value: bool | float) -> None:
+    """Raise a ``CirlError`` unless a value is of the kind of the parameter's default: a number, or true or false."""
+    default = parameter.default
+    if default is inspect.Parameter.empty:
+        return
+    if not isinstance(default, int | float):
+        raise CirlError(f"parameters.{parameter.name}: is no number, so that a definition cannot give it")
+    if isinstance(default, bool) != isinstance(value, bool):
+        needs = "true or false" if isinstance(default, bool) else "a number"
+        raise CirlError(f"parameters.{parameter.name}: needs {needs}, got {value!r}")

@@ -107,4 +107,4 @@ class Credit:
             flow = transition.moved / dynamics.network.episode.control_interval
             end, mean, _ = self.circularity(imagined_state, transition, flow)
             results.append((end if self._measure == "end" else mean).reshape(count, batch))
-        return np.concatenate(results)
+        return np.concatenate(results) if results else np.empty((0, batch))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import hashlib
 import tomllib
 import typing
 from collections.abc import Mapping
@@ -26,6 +27,7 @@ def read_network(path: Path) -> Network:
         DefinitionError: with every mistake in the file; nothing is returned half-read.
     """
     document = read_toml(path)
+    source_sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     overrides = document.get("scenarios", {})
     if not isinstance(overrides, dict) or not all(isinstance(o, dict) for o in overrides.values()):
         raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
@@ -52,6 +54,7 @@ def read_network(path: Path) -> Network:
         others = {name: other for name, other in networks.items() if other is not network}
         object.__setattr__(network, "scenarios", others)
         object.__setattr__(network, "source", path)
+        object.__setattr__(network, "source_sha256", source_sha256)
     return networks["default"]
 
 

@@ -73,6 +73,8 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
     def step(self, action: ArrayLike) -> tuple[Goals, float, bool, bool, dict[str, Any]]:
         """Hold the action for one control interval."""
         observation, reward, terminated, truncated, info = self.flat.step(action)
+        if "success" in info:
+            info["is_success"] = info["success"]  # what gymnasium-robotics calls it, and Stable-Baselines3 looks for
         return self._split(observation), reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:

@@ -53,6 +53,7 @@ class Network:
         time_unit: unit of time.
         title: one line for tables.
         source: definition file that it was read from; None if it was built in Python.
+        source_sha256: hash of that file as it was then.
         scenario_name: the scenario that this network describes.
         scenarios: the other scenarios of the same definition, by name.
     """
@@ -69,6 +70,7 @@ class Network:
     time_unit: str = "day"
     title: str = ""
     source: Path | None = field(default=None, repr=False, compare=False)
+    source_sha256: str | None = field(default=None, repr=False, compare=False)
     scenario_name: str = "default"
     scenarios: Mapping[str, Network] = field(default_factory=dict, repr=False, compare=False)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -190,11 +189,9 @@ class _Asked:
         run = RunDirectory(folder / f"{self.recipe.name}-weight{self.weight:.6g}-seed{self.seed}")
         if run.path.exists():
             self._check(run)
-            if run.status["checkpoint"] is None:
-                shutil.rmtree(run.path)  # nothing was learnt yet
-            elif run.status["state"] != "complete":
+            if run.status["state"] != "complete":
                 resume(run.path, report=lambda now: progress(now.env_steps / max(now.total, 1)))
-        if not run.path.exists():
+        else:
             train(
                 self.network,
                 self.recipe,

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from cirl_marl.elements import ControlKind, Law, Role
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.vector_env import VectorEnv
 
@@ -16,6 +17,9 @@ COARSE = 0.01
 
 INTERVALS = 200
 """Control intervals over which this is looked at."""
+
+SHORT = 20
+"""Control intervals over which the ends of the controls are tried."""
 
 
 def remarks(network: Network) -> Iterator[str]:
@@ -38,16 +42,22 @@ def _without_effect(network: Network) -> Iterator[str]:
 
 
 def _coarse(network: Network) -> Iterator[str]:
-    """Yield what neutral control brings about otherwise if the solver takes half the step."""
+    """Yield what neutral control brings about otherwise with half the solver's step, and controls it cannot follow."""
     step = network.episode.solver_step
     if step is None:
         return
-    shown = [_neutral_states(each) for each in (network, network.with_options(episode={"solver_step": step / 2}))]
-    with np.errstate(invalid="ignore"):
-        size = np.maximum(np.abs(shown[1]).max(axis=0), 1e-9)
-        apart = np.abs(shown[0] - shown[1]).max(axis=0) / size
-    if not (apart <= COARSE).all():
-        worst = int(np.nan_to_num(apart, nan=np.inf).argmax())
+    try:
+        for action in (-1.0, 1.0):
+            _states(network, action, SHORT)
+        finer = network.with_options(episode={"solver_step": step / 2})
+        shown = [_states(each, None, INTERVALS) for each in (network, finer)]
+    except CirlError as error:
+        yield str(error)
+        return
+    size = np.maximum(np.abs(shown[1]).max(axis=0), 1e-9)
+    apart = np.abs(shown[0] - shown[1]).max(axis=0) / size
+    if (apart > COARSE).any():
+        worst = int(apart.argmax())
         name = VectorEnv(network, num_envs=1).state_names[worst]
         yield (
             f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, neutral control gives another "
@@ -55,16 +65,20 @@ def _coarse(network: Network) -> Iterator[str]:
         )
 
 
-def _neutral_states(network: Network) -> Floats:
-    """Return what neutral control makes of the state, shape (intervals, states)."""
+def _states(network: Network, action: float | None, intervals: int) -> Floats:
+    """Return the states that come of one action of all agents, None being neutral, shape (intervals, states)."""
     env, nodes = VectorEnv(network, num_envs=1), len(network.nodes)
     env.reset(seed=0)
-    neutral = env.dynamics.neutral[:, None]
+    controls = env.dynamics.neutral.copy()
+    if action is not None:
+        acting = [row for agent in env.agents for row in range(*network.control_rows[agent].indices(len(controls)))]
+        controls[acting] = (env.dynamics.control_low if action < 0 else env.dynamics.control_high)[acting]
     state, rows = env.physical, []
-    for step in range(min(network.episode.horizon, INTERVALS)):
-        after = env.dynamics.advance(state.stock, state.inner, neutral, np.array([step]))
-        state = replace(state, stock=after.stock, inner=after.inner)
-        rows.append(np.concatenate([after.stock[:nodes, 0], after.inner[:, 0], after.stock[nodes:-1, 0]]))
+    with np.errstate(all="ignore"):
+        for step in range(min(network.episode.horizon, intervals)):
+            after = env.dynamics.advance(state.stock, state.inner, controls[:, None], np.array([step]))
+            state = replace(state, stock=after.stock, inner=after.inner)
+            rows.append(np.concatenate([after.stock[:nodes, 0], after.inner[:, 0], after.stock[nodes:-1, 0]]))
     return np.array(rows)
 
 

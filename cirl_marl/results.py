@@ -58,7 +58,7 @@ def provenance(network: Network, runs: Sequence[RunDirectory] = (), **options: A
         "network": {
             "name": network.name,
             "scenario": network.scenario_name,
-            "file_sha256": None if network.source is None else _hash(network.source.read_bytes()),
+            "file_sha256": network.source_sha256,
             "definition_sha256": fingerprint(network),
         },
         "options": options,

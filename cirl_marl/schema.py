@@ -83,7 +83,7 @@ class ModelTable(Table):
 
     kind: str = Field(description="name of a compartment model")
     form: str | None = Field(None, description="form of the equations, such as 'published' or 'sound'")
-    parameters: dict[str, Number] = Field({}, description="parameters that differ from the model's own, by name")
+    parameters: dict[str, bool | Number] = Field({}, description="parameters that differ from the model's own, by name")
     source: Source
     initial: dict[str, InnerRange] = Field(
         {}, description="initial range of each inner state that the model does not draw"

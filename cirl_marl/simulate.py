@@ -168,6 +168,9 @@ class Dynamics(FlowLaws):
             controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
             step: index of the control interval in each environment, shape (B,); networks without time series and
                 batches need none.
+
+        Raises:
+            CirlError: if a state is no longer a finite number, as the solver's step is too long for the physics.
         """
         rate = realised = self.rate(controls, step)
         sent = None
@@ -191,7 +194,21 @@ class Dynamics(FlowLaws):
             delivered, counted = self.batches.settle(stock, inner, step, self.inner)
             total[self.batches.arcs] = delivered
             batched = np.stack([sent, counted])
+        self._check_finite(stock, inner)
         return Transition(stock, inner, total, self.flow_at(stock, inner, controls, realised), batched)
+
+    def _check_finite(self, stock: Floats, inner: Floats) -> None:
+        if np.isfinite(stock).all() and np.isfinite(inner).all():
+            return
+        masses = [*(f"stock of node '{node.id}'" for node in self.network.nodes), *self.batches.names, "unit"]
+        states = np.concatenate([stock, inner])
+        row, copy_ = np.argwhere(~np.isfinite(states))[0]
+        name = [*masses, *self.inner.names][row]
+        raise CirlError(
+            f"network '{self.network.name}': {name} in copy {copy_} became {states[row, copy_]}: solver "
+            f"'{self.network.episode.solver}' cannot follow the physics in steps of {self.substep:g} "
+            f"{self.network.time_unit}; take a shorter solver_step or tighter bounds of the controls"
+        )
 
     def start_flow(self, stock: Floats, inner: Floats, controls: Floats) -> Floats:
         """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
@@ -302,11 +319,11 @@ class Dynamics(FlowLaws):
         """
         moved = passing(rate)
         after = self.incidence.add_to(stock.copy(), moved)
-        if after.min() >= 0:
+        if not (after < 0).any():  # asked of every copy, as a NaN in one says nothing of the others
             return after, moved, rate
         held = disposable(stock, self._busiest)
         settled = np.full_like(moved, np.nan)
-        while after.min() < 0:
+        while (after < 0).any():
             out = self._outgoing(moved)
             short = (after < 0) & (out > 0)
             share = np.divide(held, out, out=np.ones_like(out), where=short & (out > held))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cirl_marl.elements import ranged_states
 from cirl_marl.errors import ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.simulate import Dynamics
@@ -36,7 +37,10 @@ class Starts:
         self._rows = {name: row for row, name in enumerate(self.names)}
         self.streams = [np.random.default_rng() for _ in range(num_envs)]
         self._network = network
-        self._array_order = tuple(order)
+        self._bounds = _bounds(network)
+        self._wholes = _wholes(network)
+        inseparable = {name for names in self._wholes.values() for name in names}
+        self._array_order = () if inseparable & set(order) else tuple(order)
         self._physical = dynamics.physical
         nodes = len(network.nodes)
         self._nodes, self._inner = nodes, inner
@@ -116,6 +120,13 @@ class Starts:
                 )
             given = dict(zip(names, values, strict=True))
         checked = {self._row(id_): self._initial(id_, values) for id_, values in given.items()}
+        for owner, whole in self._wholes.items():
+            named = [name for name in whole if name in given]
+            if named and len(named) < len(whole):
+                raise ControlError(
+                    f"initial_state of '{named[0]}': a start of '{owner}' is the state of its simulator, all "
+                    f"{len(whole)} entries together; snapshot() and restore() go back to one"
+                )
         most = (self._low + self._width)[: self._nodes]
         limit = float(most.sum())
         if self._physical and checked:
@@ -142,7 +153,30 @@ class Starts:
         is_stock = self._physical and id_ in self._network.node_index
         if not np.isfinite(stock).all() or (is_stock and (stock < 0).any()):
             raise ControlError(f"initial_state of '{id_}' is {values!r}: stocks are finite and not negative")
+        low, high = self._bounds.get(id_, (-np.inf, np.inf))
+        if (stock < low).any() or (stock > high).any():
+            raise ControlError(f"initial_state of '{id_}' is {values!r}: its model holds for [{low:g}, {high:g}]")
         return stock
+
+
+def _bounds(network: Network) -> dict[str, tuple[float, float]]:
+    """Return the values of inner states for which their models hold, by ``compartment.state``."""
+    return {
+        f"{owner}.{name}": bounds
+        for owner, compartment in network.compartments.items()
+        for name, bounds in getattr(compartment.model, "bounds", {}).items()
+    }
+
+
+def _wholes(network: Network) -> dict[str, tuple[str, ...]]:
+    """Return the states that only make sense together: those of models that draw their start, but for their goals."""
+    found = {}
+    for owner, compartment in network.compartments.items():
+        model = compartment.model
+        if model is not None and not ranged_states(model):
+            goals = getattr(model, "desired_names", ())
+            found[owner] = tuple(f"{owner}.{name}" for name in model.state_names if name not in goals)
+    return found
 
 
 def _numbers(what: str, values: ArrayLike) -> Floats:

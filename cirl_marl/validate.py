@@ -51,7 +51,7 @@ OWN = {f.name: f.default for f in fields(Arc) if any(f.name in taken for taken i
 
 def problems(network: Network) -> Iterator[str]:
     """Yield every reason why ``network`` cannot be simulated."""
-    if not re.match(IDENTIFIER, network.name):
+    if not re.fullmatch(IDENTIFIER, network.name):
         yield f"name '{network.name}': begins with a letter and has lower-case letters, digits and underscores only"
     for key, unit, base in (("mass", network.mass_unit, "kg"), ("time", network.time_unit, "s")):
         try:
@@ -64,11 +64,12 @@ def problems(network: Network) -> Iterator[str]:
     yield from _name_problems("compartment", compartments)
     yield from _name_problems("service", [service.id for service in network.services])
     nodes = {node.id: node for node in network.nodes}
+    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
     for node in network.nodes:
         yield from _node_problems(network, node)
     controlled: dict[str, list[Arc]] = {}
     for arc in network.arcs:
-        yield from _arc_problems(network, arc, nodes)
+        yield from _arc_problems(network, arc, nodes, everyone)
         if arc.law is Law.CONTROLLED:
             controlled.setdefault(arc.donor, []).append(arc)
     for node in network.nodes:
@@ -84,8 +85,12 @@ def problems(network: Network) -> Iterator[str]:
                     f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', on the arc or on its "
                     f"donor '{node.id}'; it has {len(sets_flow)}"
                 )
+    for (donor, port), arcs in _ports(network).items():
+        if len(arcs) > 1:
+            yield f"arc '{arcs[1]}': port '{port}' of '{donor}' has the arc '{arcs[0]}' already"
+    providers = _providers(network)
     for service in network.services:
-        yield from _service_problems(service, network, nodes)
+        yield from _service_problems(service, everyone, providers)
     yield from _setting_problems(network)
     acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.acting:
@@ -94,9 +99,30 @@ def problems(network: Network) -> Iterator[str]:
     yield from _repeated("agents", network.acting)
 
 
+def _ports(network: Network) -> dict[tuple[str, str], list[str]]:
+    """Return the arcs that carry what is released, by compartment and port."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for arc in network.arcs:
+        if arc.law is Law.BATCH and arc.by:
+            found.setdefault((arc.by, arc.port), []).append(arc.id)
+    return found
+
+
+def _providers(network: Network) -> dict[str, dict[str, None]]:
+    """Return the compartments that may provide a service of each quantity."""
+    nodes, everyone = network.nodes, (*network.nodes, *network.arcs)
+    found = {
+        "flow": [arc.id for arc in network.arcs],
+        "stock": [*(node.id for node in nodes), *(arc.id for arc in network.arcs if arc.law is Law.BATCH)],
+        "measure": [c.id for c in everyone if hasattr(c.model, "measures")],
+        "outflow": [node.id for node in nodes],
+    }
+    return {quantity: dict.fromkeys(ids) for quantity, ids in found.items()}
+
+
 def _name_problems(kind: str, ids: list[str]) -> Iterator[str]:
     for id_ in dict.fromkeys(ids):
-        if not re.match(IDENTIFIER, id_):
+        if not re.fullmatch(IDENTIFIER, id_):
             yield f"{kind} '{id_}': an id begins with a letter and has lower-case letters, digits and underscores only"
     for id_, times in Counter(ids).items():
         if times > 1:
@@ -118,7 +144,9 @@ def _node_problems(network: Network, node: Node) -> Iterator[str]:
     yield from _common_problems(f"node '{node.id}'", node, network)
 
 
-def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
+def _arc_problems(
+    network: Network, arc: Arc, nodes: Mapping[str, Node], everyone: Mapping[str, Compartment]
+) -> Iterator[str]:
     where = f"arc '{arc.id}'"
     for end, node in (("from", arc.donor), ("to", arc.recipient)):
         if node not in nodes:
@@ -133,9 +161,9 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
     if not math.isfinite(arc.rate) or arc.rate < 0:
         yield f"{where}: rate {arc.rate} must be finite and not negative"
     if arc.law is Law.COMPARTMENT:
-        yield from _model_flow_problems(where, arc, network)
+        yield from _model_flow_problems(where, arc, everyone)
     if arc.law is Law.BATCH:
-        yield from _batch_problems(where, arc, network.episode.control_interval, nodes)
+        yield from _batch_problems(where, arc, network, nodes)
     if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and arc.rate == 0:
         yield f"{where}: law '{arc.law}' needs a positive rate"
     if not arc.flow or any(not math.isfinite(f) or f < 0 for f in arc.flow):
@@ -151,18 +179,15 @@ def _arc_problems(network: Network, arc: Arc, nodes: Mapping[str, Node]) -> Iter
     yield from _common_problems(where, arc, network)
 
 
-def _model_flow_problems(where: str, arc: Arc, network: Network) -> Iterator[str]:
-    ends = (arc.id, arc.donor, arc.recipient)
-    giving = [
-        c.id
-        for c in (*network.nodes, *network.arcs)
-        if c.id in ends and c.model is not None and hasattr(c.model, "outflow")
-    ]
+def _model_flow_problems(where: str, arc: Arc, everyone: Mapping[str, Compartment]) -> Iterator[str]:
+    ends = (arc.donor, arc.recipient, arc.id)
+    giving = [end for end in ends if end in everyone and hasattr(everyone[end].model, "outflow")]
     if arc.by not in giving:
         yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
 
 
-def _batch_problems(where: str, arc: Arc, interval: float, nodes: Mapping[str, Node]) -> Iterator[str]:
+def _batch_problems(where: str, arc: Arc, network: Network, nodes: Mapping[str, Node]) -> Iterator[str]:
+    interval = network.episode.control_interval
     vehicle = hasattr(arc.model, "boarding")
     if vehicle == (arc.delay > 0):
         yield f"{where}: law 'batch' needs a delay or a vehicle as its model, and not both"
@@ -192,6 +217,19 @@ def _batch_problems(where: str, arc: Arc, interval: float, nodes: Mapping[str, N
             yield f"{where}: {unknown('port', arc.port, ports)}"
         if arc.rate <= 0:
             yield f"{where}: law 'batch' with 'by' needs a positive rate, the mass per unit released"
+        else:
+            yield from _unit_problems(where, arc, network.mass_unit, donor)
+
+
+def _unit_problems(where: str, arc: Arc, mass_unit: str, donor: Node) -> Iterator[str]:
+    """Yield it if a model that knows the mass of what it releases knows another than its arc."""
+    unit_kg = getattr(donor.model, "unit_kg", None)
+    try:
+        carried_kg = arc.rate * factor(mass_unit, "kg")
+    except CirlError:
+        return  # a problem of its own
+    if unit_kg is not None and not math.isclose(carried_kg, unit_kg):
+        yield f"{where}: rate: {carried_kg:g} kg a unit, but '{donor.id}' releases units of {unit_kg:g} kg"
 
 
 def _rate_control(arc: Arc) -> str | None:
@@ -256,16 +294,13 @@ def _bound_problems(where: str, compartment: Compartment) -> Iterator[str]:
             yield f"{where}: model '{model.kind}' holds for {name} in [{low:g}, {high:g}], not for {given}"
 
 
-def _service_problems(service: Service, network: Network, nodes: Mapping[str, Node]) -> Iterator[str]:
+def _service_problems(
+    service: Service, everyone: Mapping[str, Compartment], providers: Mapping[str, Mapping[str, None]]
+) -> Iterator[str]:
     where = f"service '{service.id}'"
     if service.quantity not in QUANTITIES:
         yield f"{where}: {unknown('quantity', service.quantity, QUANTITIES)}"
-    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
-    known = {
-        "flow": [arc.id for arc in network.arcs],
-        "stock": [*nodes, *(arc.id for arc in network.arcs if arc.law is Law.BATCH)],
-        "measure": [id_ for id_, c in everyone.items() if hasattr(c.model, "measures")],
-    }.get(service.quantity, list(nodes))
+    known = providers.get(service.quantity, providers["outflow"])
     if service.provider in known and service.quantity == "measure":
         names = getattr(everyone[service.provider].model, "measure_names", ())
         if service.measure not in names:
@@ -323,7 +358,7 @@ def _setting_problems(network: Network) -> Iterator[str]:
             )
     for compartment in (*network.nodes, *network.arcs):
         yield from _clock_problems(network, compartment)
-    tracked = [c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None]
+    tracked = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None)
     yield from _repeated("objective.tracked", objective.tracked)
     yield from _repeated("observation.nodes", network.observation.nodes)
     for name in objective.tracked:
@@ -331,10 +366,10 @@ def _setting_problems(network: Network) -> Iterator[str]:
             yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
     if (network.observation.mode == "stocks") != bool(network.observation.nodes):
         yield "observation: mode 'stocks', and only that mode, lists its nodes"
-    signals: list[str] = [node.id for node in network.nodes]
+    signals = dict.fromkeys(node.id for node in network.nodes)
     for compartment in (*network.nodes, *network.arcs):
         if compartment.model is not None:
-            signals.extend(f"{compartment.id}.{name}" for name in compartment.model.state_names)
+            signals |= dict.fromkeys(f"{compartment.id}.{name}" for name in compartment.model.state_names)
     for name in network.observation.nodes:
         if name not in signals:
             yield f"observation: {unknown('node or inner state', name, signals)}"

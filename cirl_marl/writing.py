@@ -135,7 +135,10 @@ def _model(compartment: Compartment) -> str:
             problem = f"parameter '{name}' of its model '{model.kind}' is no number, which a definition cannot say"
             raise NetworkError(f"compartment '{compartment.id}'", [problem])
     numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
-    parameters = ", ".join(f"{name} = {float(value)!r}" for name, value in numbers.items())
+    parameters = ", ".join(
+        f"{name} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}"
+        for name, value in numbers.items()
+    )
     initial = ", ".join(
         f"{name} = {{ low = {float(low)!r}, high = {float(high)!r}, source = {_text(SOURCE)} }}"
         for name, (low, high) in zip(ranged_states(model), compartment.inner, strict=True)

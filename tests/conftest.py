@@ -120,7 +120,9 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
 def _control(rng: np.random.Generator, kind: ControlKind) -> Control:
     most = 1.5 if kind is ControlKind.RATE else 10 ** rng.uniform(-1, 3)
     low, neutral, high = np.sort(rng.random(3)) * most
-    return Control(kind=kind, low=float(low * rng.integers(2)), neutral=float(neutral), high=float(high))
+    low *= rng.integers(2)
+    neutral = rng.choice([low, neutral, high])
+    return Control(kind=kind, low=float(low), neutral=float(neutral), high=float(high))
 
 
 def _node(rng: np.random.Generator, i: int, sets_flow: bool) -> Node:

@@ -158,6 +158,34 @@ def test_snapshot_of_another_definition() -> None:
         VectorEnv(replace(network, arcs=faster), num_envs=1).restore(env.snapshot())
 
 
+@pytest.mark.parametrize(
+    ("network", "scenario", "given", "message"),
+    [
+        ("net_zero", "droop", {"microalgae.nutrient_umol_l": -5.0}, r"holds for \[0, inf\]"),
+        ("net_zero", "default", {"digester.substrate_g_l": -7.1}, r"holds for \[0, inf\]"),
+        ("solids_net", "reacher", {"incinerator.freeboard_degc": -400.0}, r"holds for \[-272\.15, inf\]"),
+        ("solids_net", "reacher", {"sorter.target_x_m": 0.1}, r"the state of its simulator, all \d+ entries together"),
+    ],
+)
+def test_states_beyond_the_equations(network: str, scenario: str, given: dict[str, float], message: str) -> None:
+    """A start for which a model does not hold, or that its simulator would not take over, is refused."""
+    env = VectorEnv(network, num_envs=2, scenario=scenario)
+    with pytest.raises(ControlError, match=message):
+        env.reset(seed=0, options={"initial_state": given})
+
+
+def test_a_whole_state_of_a_simulator_is_a_start() -> None:
+    """What one robot was in, another goes on from, bit for bit."""
+    env = VectorEnv("solids_net", num_envs=1, scenario="reacher")
+    names = [name for name in env.state_names if name.startswith("sorter.")]
+    env.reset(seed=3)
+    begun = dict(zip(env.state_names, env.state()[0], strict=False))
+    after = env.step({agent: action[None] for agent, action in env.neutral_action.items()})[0]["sorter"]
+    env.reset(seed=4, options={"initial_state": {name: begun[name] for name in names}})
+    again = env.step({agent: action[None] for agent, action in env.neutral_action.items()})[0]["sorter"]
+    np.testing.assert_array_equal(after, again)
+
+
 def test_mass_is_counted_in_each_copy() -> None:
     """What one copy holds here and another there is not added up."""
     ends = Node(id="a", initial=(0.0, 100.0)), Node(id="b")

@@ -8,6 +8,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -98,8 +99,27 @@ def test_check_takes_names_and_recipes(monkeypatch: pytest.MonkeyPatch, capsys: 
     Path("mine.toml").write_text(recipe.replace('algorithm = "PPO"', 'algorithm = "PPQ"'))
     assert run(monkeypatch, "check", "mine.toml") == 2
     assert "Did you mean 'PPO'?" in capsys.readouterr().err
-    assert run(monkeypatch, "check", "coper_net") == 2
-    assert "Did you mean 'copper_net'?" in capsys.readouterr().err
+    assert run(monkeypatch, "check", "coper_net", "mine.toml") == 2
+    said = capsys.readouterr().err
+    assert "Did you mean 'copper_net'?" in said
+    assert "Did you mean 'PPO'?" in said
+
+
+def test_check_runs_into_what_simulations_would(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A rate that no solver follows is a mistake; a control that none follows is a remark."""
+    network = idle_network()
+    fast = Arc(id="fast", donor="depot", recipient="shop", rate=1e9)
+    write_network(replace(network, arcs=(*network.arcs, fast)), Path("fast.toml"))
+    assert run(monkeypatch, "check", "fast.toml") == 2
+    assert "more than 10,000 solver steps" in " ".join(capsys.readouterr().err.split())
+    wild = (folder("envs") / "net_zero.toml").read_text()
+    assert 'low = 0.3, neutral = 0.5, high = 0.7, unit = "1/day"' in wild
+    wild = wild.replace('neutral = 0.5, high = 0.7, unit = "1/day"', 'neutral = 0.5, high = 250.0, unit = "1/day"', 1)
+    Path("wild.toml").write_text(wild.partition("[scenarios.")[0])
+    run(monkeypatch, "check", "wild.toml")
+    assert "became nan: solver 'rk4' cannot follow" in " ".join(capsys.readouterr().out.split())
 
 
 def test_check_remarks_on_services_that_nobody_owes(

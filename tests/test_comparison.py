@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import re
 from collections.abc import Callable
@@ -19,12 +20,12 @@ from cirl_marl.comparison import compare
 from cirl_marl.comparison.contenders import differences
 from cirl_marl.comparison.files import FILES, write_comparison
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.learners import Progress, RunDirectory, train
+from cirl_marl.learners import Progress, RunDirectory, load_recipe, train
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
 from cirl_marl.pareto import pareto
 from cirl_marl.report.run import evaluate_run
-from cirl_marl.results import published
+from cirl_marl.results import provenance, published
 from cirl_marl.statistics import interquartile_mean
 from cirl_marl.vector_env import VectorEnv
 
@@ -168,6 +169,30 @@ def test_other_environments_are_refused(bottles: Network, runs: list[Path], tmp_
     assert [row.name for row in both.rows] == ["independent_a2c", f"independent_a2c ({tmp_path / 'seeing'})", "neutral"]
 
 
+def test_recipes_called_like_controllers_are_no_controllers(bottles: Network, runs: list[Path], tmp_path: Path) -> None:
+    """Gains refer to neutral control, whatever a recipe is called."""
+    recipe = load_recipe("independent_a2c").model_copy(update={"name": "neutral"})
+    train(bottles, recipe, directory=tmp_path / "run", seed=0, steps=320, envs=8)
+    found = compare([tmp_path / "run"], episodes=3, bounds=False)
+    same = compare(runs[:1], episodes=3, bounds=False)
+    assert [row.name for row in found.rows] == [f"neutral ({tmp_path / 'run'})", "neutral", "random"]
+    for one, other in zip(found.entries, same.entries, strict=True):
+        np.testing.assert_array_equal(one.gain, other.gain)
+
+
+def test_results_name_the_definition_that_was_read(bottles: Network, tmp_path: Path) -> None:
+    """Not one that has been edited since, or that is gone."""
+    assert bottles.source is not None
+    path = tmp_path / "mine.toml"
+    path.write_bytes(bottles.source.read_bytes())
+    network = load_network(path)
+    expected = hashlib.sha256(path.read_bytes()).hexdigest()
+    path.write_text("no network any more")
+    assert provenance(network)["network"]["file_sha256"] == expected
+    path.unlink()
+    assert provenance(network.with_options(episode={"horizon": 3}))["network"]["file_sha256"] == expected
+
+
 def test_unfinished_runs_are_rows_of_their_own(
     bottles: Network, runs: list[Path], tmp_path: Path, ctrl_c_after: Callable[[int], Callable[[Progress], None]]
 ) -> None:
@@ -239,6 +264,16 @@ def test_what_makes_another_episode_is_named(changes: dict[str, dict[str, object
     env, other = (VectorEnv(n, num_envs=1) for n in (network.with_options(**changes), network))
     found = list(differences(env, other))
     assert not found if message is None else len(found) == 1 and re.search(message, found[0])
+
+
+def test_services_do_not_hide_compartments_of_their_name(bottles: Network) -> None:
+    """A service may have the id of a node; a change of either is seen."""
+    node = bottles.nodes[1]
+    named = replace(bottles, services=(replace(bottles.services[0], id=node.id), *bottles.services[1:]))
+    wider = replace(node, initial=(node.initial[0], node.initial[1] + 1.0))
+    other = replace(named, nodes=(bottles.nodes[0], wider, *bottles.nodes[2:]))
+    (found,) = differences(VectorEnv(named, num_envs=1), VectorEnv(other, num_envs=1))
+    assert f"'{node.id}'" in found
 
 
 def test_other_parts_and_agents_make_another_episode() -> None:

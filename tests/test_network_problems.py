@@ -13,6 +13,7 @@ from cirl_marl import (
     Arc,
     Control,
     ControlKind,
+    DefinitionError,
     Episode,
     Law,
     Network,
@@ -22,6 +23,7 @@ from cirl_marl import (
     Service,
     load_network,
 )
+from cirl_marl.catalogue import folder
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.definition import write_network
@@ -75,6 +77,52 @@ def test_networks_that_cannot_be_simulated(changes: dict[str, Any], said: str) -
     network = Network(name="two", nodes=(A, B), arcs=(LINK,))
     with pytest.raises(NetworkError, match=said):
         replace(network, **changes)
+
+
+def test_what_a_station_releases_fits_its_arcs() -> None:
+    """Each port has one arc, and an arc carries units of the mass that the station knows."""
+    network = load_network("solids_net", scenario="reacher")
+    sorted_, unsorted = (next(arc for arc in network.arcs if arc.port == port) for port in ("sorted", "unsorted"))
+    for changed, said in (
+        (replace(unsorted, port="sorted"), "port 'sorted' of 'sorter' has the arc .* already"),
+        (replace(unsorted, rate=1.5 * unsorted.rate), "150 kg a unit, but 'sorter' releases units of 100 kg"),
+    ):
+        with pytest.raises(NetworkError, match=said):
+            replace(network, arcs=tuple(changed if arc is unsorted else arc for arc in network.arcs))
+    assert sorted_.rate == unsorted.rate
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "said"),
+    [
+        ("digester_published", "misprint = 0.5", "parameters.misprint: needs true or false, got 0.5"),
+        ("digester_published", "process = 1.0", "parameters.process: is no number"),
+        ("digester", "k1 = true", "parameters.k1: needs a number, got True"),
+        ("digester", "k7 = 1.0", "'k7'"),
+    ],
+)
+def test_parameters_of_models_are_of_their_kind(kind: str, given: str, said: str, tmp_path: Path) -> None:
+    """Truth values are truth values and numbers numbers; what is neither cannot be given."""
+    text = (folder("envs") / "net_zero.toml").read_text()
+    assert 'kind = "digester"\n' in text
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace('kind = "digester"\n', f'kind = "{kind}"\nparameters = {{ {given} }}\n', 1))
+    with pytest.raises(DefinitionError, match=said):
+        load_network(path)
+
+
+@pytest.mark.parametrize("misprint", [True, False])
+def test_truth_values_of_models_are_kept(misprint: bool, tmp_path: Path) -> None:
+    """A definition says them as such, and they come back."""
+    network = load_network("net_zero")
+    nodes = tuple(
+        replace(node, model=DigesterPublished(misprint=misprint)) if node.id == "digester" else node
+        for node in network.nodes
+    )
+    path = tmp_path / "mine.toml"
+    write_network(replace(network, nodes=nodes, services=()), path)
+    assert f"misprint = {str(misprint).lower()}" in path.read_text()
+    assert load_network(path).compartments["digester"].model == DigesterPublished(misprint=misprint)
 
 
 def test_models_that_cannot_be_written(tmp_path: Path) -> None:

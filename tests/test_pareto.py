@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,19 @@ def test_trainings_are_kept(bottles: Network, tmp_path: Path) -> None:
     assert len(longer.runs) == 2
     with pytest.raises(RunError, match=r"another sweep \(640 steps, not 320\); choose another folder"):
         swept(bottles, tmp_path)
+
+
+def test_runs_without_a_checkpoint_are_begun_again_by_their_owner_only(bottles: Network, tmp_path: Path) -> None:
+    """What another process trains is left alone, even before its first checkpoint; what nobody trains is begun anew."""
+    found = swept(bottles, tmp_path)
+    run = found.runs[0]
+    status = json.loads((run.path / "status.json").read_text())
+    (run.path / "status.json").write_text(json.dumps(status | {"state": "running", "checkpoint": None}))
+    kept = sorted(path.name for path in run.path.iterdir())
+    with run.claimed(), pytest.raises(RunError, match="is being trained"):
+        swept(bottles, tmp_path)
+    assert sorted(path.name for path in run.path.iterdir()) == kept
+    assert swept(bottles, tmp_path).points == found.points
 
 
 def test_network_without_certificate(tmp_path: Path) -> None:

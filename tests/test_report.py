@@ -21,6 +21,7 @@ from cirl_marl.network import Floats
 from cirl_marl.report import (
     Canvas,
     draw_network,
+    drawing,
     save_before_after,
     save_circularity,
     save_learning_curves,
@@ -167,6 +168,25 @@ def test_title_tells_circularity() -> None:
     assert "copper" in texts
     assert any(text.startswith("λ = −93.6 kt ") for text in texts)
     assert texts.count("46.8") == 9
+
+
+def test_batches_count_in_the_title(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where batches move, a rendered frame shows the λ of the infos; flows alone tell none."""
+    env = cirl_marl.parallel_env("solids_net", scenario="reacher", render_mode="rgb_array")
+    env.reset(seed=0)
+    shown: list[float | None] = []
+    monkeypatch.setattr(drawing, "_write_title", lambda axes, network, value, title: shown.append(value))
+    told = []
+    for _ in range(60):
+        _, _, _, _, infos = env.step(env.neutral_action)
+        told.append(infos["sorter"]["circularity"])
+        if told[-1] != 0.0:
+            break
+    env.render()
+    assert shown == [pytest.approx(told[-1])] != [0.0]
+    network = env.network
+    draw_network(Figure().add_axes((0, 0, 1, 0.9)), network, np.zeros(len(network.nodes)), np.zeros(len(network.arcs)))
+    assert shown[1] is None
 
 
 def test_overflow_is_drawn(tmp_path: Path) -> None:

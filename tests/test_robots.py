@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -359,6 +360,25 @@ class TestSortingStation:
             SortingStation(**given_)
         with pytest.raises(CirlError, match=r"moves in steps of 0\.04, not 0\.02"):
             SortingStation().advance(np.zeros((1, 1)), np.zeros((4, 1)), 0.02, stock_kg=np.zeros(1))
+
+
+class TestThreads:
+    """Environments in threads are those of a single thread: each has a simulator of its own."""
+
+    @pytest.mark.parametrize("id_", ["cirl_marl/Reacher-v0", "cirl_marl/FetchWasteSorting-v0"])
+    def test_threads_do_not_meet(self, id_: str) -> None:
+        """MuJoCo lets other threads run while it steps; no state is lost to them."""
+
+        def play(seed: int) -> float:
+            env = gymnasium.make(id_)
+            env.reset(seed=seed)
+            env.action_space.seed(seed)
+            steps = [env.step(env.action_space.sample()) for _ in range(40)]
+            return float(sum(abs(step[-1]["state"]).sum() for step in steps))
+
+        alone = [play(seed) for seed in range(4)]
+        with ThreadPoolExecutor(4) as pool:
+            assert list(pool.map(play, range(4))) == alone
 
 
 class TestRegistry:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from cirl_marl import CirlError, ControlError, VectorEnv, load_network, networks
 from cirl_marl.compartments import model_class, models
+from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.controllers import Neutral, Scripted
 from cirl_marl.controllers.scripted import LOWER_M, SCRIPTS, UPPER_M, _joint_angles, incinerator, truck
 from cirl_marl.evaluate import rollout
@@ -157,8 +159,19 @@ def test_truck_and_incinerator_pull_the_right_way() -> None:
     assert force.shape == (1, 3)
     assert force[0, 0] == -force[0, 1] > 0.0
     assert force[0, 2] < 0.0
-    heat = incinerator({"freeboard_degc": np.array([900.0, 1000.0, 1100.0])})[0]
+    heat = incinerator({"freeboard_degc": np.array([900.0, 1000.0, 1100.0])}, Incinerator())[0]
     assert (np.diff(heat) > 0.0).all()
+
+
+def test_the_incinerator_s_script_knows_its_set_point() -> None:
+    """It holds what its model asks for, to some degrees."""
+    base = load_network("solids_net", scenario="reacher")
+    for target in (900.0, 1000.0):
+        model = Incinerator(target_degc=target)
+        nodes = tuple(replace(each, model=model) if each.id == "incinerator" else each for each in base.nodes)
+        env = VectorEnv(replace(base, nodes=nodes), num_envs=1, horizon=2000)
+        run = rollout(env, Scripted({"sorter": 0.0}), seed=6)
+        assert inside(env, "incinerator.freeboard_degc", run)[-1] == pytest.approx(target, abs=30.0)
 
 
 def inside(run_of: VectorEnv, name: str, run: Any) -> Floats:

@@ -14,7 +14,7 @@ from cirl_marl.cli.common import MinService, NetworkName, Scenario, Seed, app, b
 from cirl_marl.controllers import Controller
 from cirl_marl.controllers.named import CONTROLLERS, SETTABLE, named_controller
 from cirl_marl.controllers.planner import Watched
-from cirl_marl.errors import CirlError, DefinitionError
+from cirl_marl.errors import CirlError
 from cirl_marl.evaluate import Rollout, interval_ends, rollout
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
@@ -52,11 +52,12 @@ def show(
         console.print(
             f"service '{service.id}': {service.measure or service.quantity} of {service.provider} {' and '.join(ends)}"
         )
-    console.print(f"λ of the start state: {float(found.circularity(flow)):.5g} {found.mass_unit}")
+    circularity = float(found.circularity(flow))
+    console.print(f"λ of the start state: {circularity:.5g} {found.mass_unit}")
     path = picture or Path(f"{found.name}.png")
     if path.suffix != ".png":
         raise CirlError(f"--picture {path}: needs the name of a .png file")
-    save_network(path, found, stock, flow, title=found.title)
+    save_network(path, found, stock, flow, title=found.title, circularity=circularity)
     console.print(f"picture: {path}")
 
 
@@ -78,7 +79,7 @@ def check(
                 _check_recipe(source)
             else:
                 _check_network(source)
-        except DefinitionError as error:
+        except CirlError as error:
             faulty = True
             errors.print(plain(error), highlight=False, soft_wrap=True)
     if faulty:
@@ -106,6 +107,8 @@ def _check_network(source: str) -> None:
     from cirl_marl.remarks import remarks
 
     network = load_network(source)
+    for each in (network, *network.scenarios.values()):
+        VectorEnv(each, num_envs=1)  # finds what only a network that is run says, such as rates no solver can follow
     say(
         f"{source}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
         f"scenarios {', '.join([network.scenario_name, *network.scenarios])}: no mistakes"

@@ -109,11 +109,13 @@ def paper(
 
     rows = planned(environment, algorithm, steps=steps, seeds=seeds, recipe=recipe)
     try:
-        run_session(rows, Results(out), console, success_episodes=episodes)
+        failed = run_session(rows, Results(out), console, success_episodes=episodes)
     except KeyboardInterrupt:
         message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
         console.print(message, soft_wrap=True, highlight=False)
         raise typer.Exit(130) from None
+    if failed:
+        raise typer.Exit(1)
 
 
 def _only_resume(context: typer.Context) -> None:

@@ -184,7 +184,8 @@ def compare(
             rollouts,
             lambda part: progress("bounds", done + part * (1 - done)),
         )
-    neutral = next(run for contender, run in zip(entered, rollouts, strict=True) if contender.name == "neutral")
+    plain = [contender.run is None and contender.name == "neutral" for contender in entered]
+    neutral = rollouts[plain.index(True)]
     entries = tuple(
         Entry(contender.name, contender.seed, contender.run, run, gain(run, neutral), bound)
         for contender, run, bound in zip(entered, rollouts, proved, strict=True)

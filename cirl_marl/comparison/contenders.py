@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from cirl_marl.controllers.basic import Controller
-from cirl_marl.controllers.named import named_controller
+from cirl_marl.controllers.named import CONTROLLERS, named_controller
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Network
@@ -79,7 +79,7 @@ def differences(env: VectorEnv, other: VectorEnv) -> Iterator[str]:
         f"{what} {physics[what]!r}, not {reference[what]!r}" for what in physics if physics[what] != reference[what]
     ]
     parts, counterparts = _parts(ours), _parts(theirs)
-    changed = [f"'{name}'" for name in parts | counterparts if parts.get(name) != counterparts.get(name)]
+    changed = [f"'{key[1]}'" for key in parts | counterparts if parts.get(key) != counterparts.get(key)]
     if changed:
         found.append(f"the definition of {', '.join(changed[:5])}{' and others' if len(changed) > 5 else ''}")
     if found and ours.scenario_name != theirs.scenario_name:
@@ -99,8 +99,10 @@ def _physics(network: Network) -> dict[str, Any]:
     }
 
 
-def _parts(network: Network) -> dict[str, object]:
-    return {**network.compartments, **{service.id: service for service in network.services}}
+def _parts(network: Network) -> dict[tuple[str, str], object]:
+    """Return compartments and services, which may share ids, by what they are and their id."""
+    parts = {("compartment", id_): compartment for id_, compartment in network.compartments.items()}
+    return parts | {("service", service.id): service for service in network.services}
 
 
 def _trained(runs: Sequence[RunDirectory]) -> Iterator[Contender]:
@@ -117,7 +119,7 @@ def _trained(runs: Sequence[RunDirectory]) -> Iterator[Contender]:
             name += f", {status['state']} after {status['joint_steps'] * config.envs:,} of {config.steps:,} steps"
             asked += str(run.path)
         if asked not in names:
-            names[asked] = f"{name} ({run.path})" if name in names.values() else name
+            names[asked] = f"{name} ({run.path})" if name in (*names.values(), *CONTROLLERS) else name
         twin = seen.setdefault((asked, config.seed), run)
         if twin is not run:
             raise RunError(f"{run.path}: the same recipe and seed {config.seed} as {twin.path}; give one of them")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import ClassVar, Literal, NamedTuple
 
@@ -16,10 +18,10 @@ from cirl_marl.compartments.model import (
 )
 from cirl_marl.rowsum import Floats
 
-KELVIN = 273.15
+# The registered environment: one step is 5·10⁻⁵ min. Horizon 100 and T_g(0) ~ U[900, 1100] °C are inferred: from the
+# released 20 °C a step costs 9.6·10⁵, while the paper's whole episodes cost 3.2·10⁵ to 3.8·10⁵.
 
-"""Incinerator: one step is 5·10⁻⁵ min. Horizon 100 and T_g(0) ~ U[900, 1100] °C are inferred: from the released 20 °C a
-step costs 9.6·10⁵, while the paper's whole episodes cost 3.2·10⁵ to 3.8·10⁵."""
+KELVIN = 273.15
 
 
 class Flows(NamedTuple):
@@ -112,6 +114,9 @@ class Incinerator:
         "freeboard_degc",
     )
     input_names: ClassVar[tuple[str, ...]] = ("heat_taken_kj_min",)
+    bounds: ClassVar[Mapping[str, tuple[float, float]]] = {
+        name: (0.0 if name.endswith("_kg") else -KELVIN + 1.0, math.inf) for name in state_names
+    }
     input_unit: ClassVar[str] = "kJ/min"
     time_unit: ClassVar[str] = "min"
     reward_state: ClassVar[RewardState] = "after"

@@ -14,8 +14,8 @@ from cirl_marl.compartments.model import RewardState, check_form, check_not_nega
 from cirl_marl.compartments.nutrient import draw_down, substeps
 from cirl_marl.rowsum import Floats
 
-"""CO2MicroalgaeDroop: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred (mean return 454; the paper's end at 446
-to 473). The light changes the return by no more than 0.1 %."""
+# The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred (mean return 454; the paper's end
+# at 446 to 473). The light changes the return by no more than 0.1 %.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

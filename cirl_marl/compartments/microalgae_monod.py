@@ -14,9 +14,9 @@ from cirl_marl.compartments.model import RewardState, check_form, check_not_nega
 from cirl_marl.compartments.nutrient import draw_down, substeps
 from cirl_marl.rowsum import Floats
 
-"""CO2MicroalgaeMonod: one step is 5·10⁻⁵ d. S(0) ~ U[1, 5] µmol/L is inferred: from S = 0 constant darkness, all but
-the best there is, returns 103.4, while the paper reports up to 143.1. At S = 1 darkness returns 143.8, I = 75 114.7 and
-I = 150 95.3, more S at most 0.2 more: the paper's best end, its untrained policies, its DDPG stuck at full light."""
+# The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[1, 5] µmol/L is inferred: from S = 0 constant darkness
+# returns 103.4, while the paper reports up to 143.1. At S = 1 darkness returns 143.8, I = 75 114.7 and I = 150 95.3,
+# more S at most 0.2 more: the paper's best end, its untrained policies, its DDPG stuck at full light.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

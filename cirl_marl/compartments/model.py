@@ -36,7 +36,10 @@ class CompartmentModel(Protocol):
       the node holds, or ``load_kg``, what the vehicle of an arc carries, shape (B,) each;
     - ``receive(state, mass_kg)``: the state after a delivery of ``mass_kg``, shape (B,);
     - ``ports``, ``released(state)``, shape (ports, B), and ``complete(state)``, shape (B,): units released into batch
-      arcs in the last step, and whether that completed a batch;
+      arcs in the last step, and whether that completed a batch; ``unit_kg``: the mass of one, if the model needs it;
+    - ``goal_reward(achieved, desired)`` with ``observation_names``, ``achieved_names`` and ``desired_names``: a task
+      with goals, for ``GoalEnv``;
+    - ``robot``: the model that acts within this one;
     - ``boarding(state)``, ``depart(state, where)``, ``arrived(state)``, ``turn_back(state, where)``: a vehicle, which
       says where it can load and has arrived, shape (B,), and is told where it leaves, loaded or empty.
 

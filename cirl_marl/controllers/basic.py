@@ -72,10 +72,10 @@ class Random:
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Seed the draws."""
-        self._entries = {agent: len(neutral) for agent, neutral in env.neutral_action.items()}
+        self._entries, self._batch = {a: len(neutral) for a, neutral in env.neutral_action.items()}, env.num_envs
         self._random = np.random.default_rng([seed, 1])  # not the numbers that the start states are drawn from
 
     def act(self, observations: Arrays) -> Arrays:
         """Return fresh random actions."""
-        batch = len(next(iter(observations.values())))
-        return {agent: self._random.uniform(-1.0, 1.0, (batch, n)) for agent, n in self._entries.items()}
+        del observations
+        return {agent: self._random.uniform(-1.0, 1.0, (self._batch, n)) for agent, n in self._entries.items()}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
+from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.controllers.basic import Arrays, Constant
 from cirl_marl.elements import Control, ControlKind
 from cirl_marl.errors import ControlError
@@ -15,8 +17,8 @@ from cirl_marl.vector_env import VectorEnv
 Seen = dict[str, Floats]
 """Observed states of an agent's own model by name, shape (B,) each, in physical units."""
 
-Script = Callable[[Seen], Floats]
-"""Physical inputs, shape (inputs, B), from what is seen."""
+Script = Callable[[Seen, Any], Floats]
+"""Physical inputs, shape (inputs, B), from what is seen and the agent's model, whose parameters the engineer knows."""
 
 OPEN, CLOSED = 1.0, -1.0
 """Input of the fingers."""
@@ -32,7 +34,7 @@ HOLDING_M = 0.03
 """Opening of each finger below which the gripper holds something; an object of 5 cm leaves them at 0.025."""
 
 
-def fetch(seen: Seen) -> Floats:
+def fetch(seen: Seen, model: Any = None) -> Floats:
     """Return the inputs of the Fetch robot that reach, grasp, lift, carry and place, shape (4, B).
 
     A function of the observation alone. Away from the object the gripper is open and comes down to it on a slope, or at
@@ -58,7 +60,7 @@ def fetch(seen: Seen) -> Floats:
     return np.concatenate([move, fingers[None]])
 
 
-def reacher(seen: Seen) -> Floats:
+def reacher(seen: Seen, model: Any = None) -> Floats:
     """Return the torques of the Reacher that move its tip to the target and let it rest, shape (2, B).
 
     Inverse kinematics give the joint angles, a damped spring the torques.
@@ -89,7 +91,7 @@ def _joint_angles(x_m: Floats, y_m: Floats, second: Floats) -> tuple[Floats, Flo
     return shoulder, elbow
 
 
-def truck(seen: Seen) -> Floats:
+def truck(seen: Seen, model: Any = None) -> Floats:
     """Return the force that drives a truck to its destination and stops it there, shape (1, B), N: a damped spring."""
     return SPRING_N_M * (seen["destination_m"] - seen["position_m"])[None] - BRAKE_N_S_M * seen["speed_m_s"][None]
 
@@ -98,13 +100,13 @@ SPRING_N_M, BRAKE_N_S_M = 4e3, 6e3
 """[chosen: about critical for 3.2 t]"""
 
 
-def incinerator(seen: Seen) -> Floats:
-    """Return the heat to take from the freeboard, shape (1, B), kJ/min: more where it is hotter than 1000 °C."""
-    return HOLD_KJ_MIN + GAIN_KJ_MIN_K * (seen["freeboard_degc"] - 1000.0)[None]
+def incinerator(seen: Seen, model: Incinerator) -> Floats:
+    """Return the heat to take from the freeboard, shape (1, B), kJ/min: more where it is hotter than its set-point."""
+    return HOLD_KJ_MIN + GAIN_KJ_MIN_K * (seen["freeboard_degc"] - model.target_degc)[None]
 
 
 HOLD_KJ_MIN, GAIN_KJ_MIN_K = 6.4e5, 3e4
-"""Heat that the stationary plant gives at 1000 °C, and a proportional gain. [chosen]"""
+"""Heat that the stationary plant gives at 1000 °C, and a gain that leaves it some degrees off elsewhere. [chosen]"""
 
 SCRIPTS: dict[str, Script] = {
     "fetch": fetch,
@@ -122,7 +124,7 @@ class Scripted:
         """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral."""
         self._constant = Constant(constant)
         self._held = frozenset(constant or ())
-        self._scripts: dict[str, tuple[Script, dict[str, int], Control]] = {}
+        self._scripts: dict[str, tuple[Script, Any, dict[str, int], Control]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Find the script of each agent and what it reads.
@@ -142,7 +144,7 @@ class Scripted:
             columns = {
                 name.removeprefix(own): i for i, name in enumerate(env.layout.names[agent]) if name.startswith(own)
             }
-            self._scripts[agent] = script, columns, control
+            self._scripts[agent] = script, model, columns, control
 
     @property
     def scripted(self) -> tuple[str, ...]:
@@ -156,10 +158,10 @@ class Scripted:
             ControlError: if an agent does not see a state that its script needs.
         """
         actions = dict(self._constant.act(observations))
-        for agent, (script, columns, control) in self._scripts.items():
+        for agent, (script, model, columns, control) in self._scripts.items():
             seen = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}
             try:
-                inputs = script(seen)
+                inputs = script(seen, model)
             except KeyError as missing:
                 raise ControlError(f"scripted control of '{agent}' needs to see its state {missing}") from None
             actions[agent] = control.action(inputs).T

@@ -114,8 +114,8 @@ class Result:
 
     @property
     def gain_per_step(self) -> float:
-        """ψ = ζ / steps, of those that were to be done as many as were."""
-        return self.gain / min(self.row.steps, self.steps_done)
+        """ψ = ζ / steps done."""
+        return self.gain / self.steps_done
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> Result:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from cirl_marl.errors import CirlError
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Results, Row
 from cirl_marl.paper.table import environment_table, result_line
@@ -17,8 +18,8 @@ from cirl_marl.paper.training import Report, check_registered, outdated, run_row
 REFRESH_S = 0.2
 
 
-def run_session(rows: Sequence[Row], results: Results, console: Console, *, success_episodes: int | None) -> None:
-    """Run the rows that are not done, and show the tables of their environments.
+def run_session(rows: Sequence[Row], results: Results, console: Console, *, success_episodes: int | None) -> list[Row]:
+    """Run the rows that are not done, show the tables of their environments, and return the rows that failed.
 
     Raises:
         CirlError: if an environment is missing, before anything is run.
@@ -27,18 +28,28 @@ def run_session(rows: Sequence[Row], results: Results, console: Console, *, succ
     environments = [ENVIRONMENTS[name] for name in dict.fromkeys(row.environment for row in rows)]
     for environment in environments:
         check_registered(environment)
+    failed: list[Row] = []
     for i, row in enumerate(rows):
         again = outdated(results.read(row), success_episodes) if results.has(row) else ""
         if again:
             console.print(f"{row}: once more, as {again}", soft_wrap=True, highlight=False)
         if again or not results.has(row):
-            with live_bar(
-                console, f"{i + 1} of {len(rows)}: {row.environment} {row.algorithm}, seed {row.seed}"
-            ) as bar:
-                results.write(run_row(row, report=bar, success_episodes=success_episodes))
+            title = f"{i + 1} of {len(rows)}: {row.environment} {row.algorithm}, seed {row.seed}"
+            try:
+                with live_bar(console, title) as bar:
+                    results.write(run_row(row, report=bar, success_episodes=success_episodes))
+            except CirlError as error:
+                failed.append(row)
+                console.print(f"{row}: failed: {error}", soft_wrap=True, markup=False, highlight=False)
+                continue
         console.print(result_line(results.read(row)), soft_wrap=True, highlight=False)
     for environment in environments:
-        console.print(environment_table(environment, results.all()))
+        asked = {(row.algorithm, row.recipe) for row in rows if row.environment == environment.name}
+        shown = [
+            each for each in results.all() if each.row in rows or (each.row.algorithm, each.row.recipe) not in asked
+        ]
+        console.print(environment_table(environment, shown))
+    return failed
 
 
 @contextmanager

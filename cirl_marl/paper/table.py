@@ -16,7 +16,8 @@ NUMERIC = COLUMNS[3:11]
 NOT_RUN = "not run"
 INTRODUCTION = f"""# The paper's tables, repeated
 
-Published figures: {SOURCE}. Written by `python benchmarks/paper.py --table`.
+Published figures: {SOURCE}. Written by `python benchmarks/paper.py --table`, from the rows in
+`benchmarks/results/paper`.
 
 - **paper**: what it reports. **ours**: the same run here, `A("MlpPolicy", gymnasium.make(id))` with the library's
   default hyperparameters (goal tasks: `MultiInputPolicy`, `HerReplayBuffer`). **tuned**: our recipe
@@ -161,11 +162,12 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
 def _remarks(environment: PaperEnvironment, seeds: Sequence[Result]) -> Iterator[str]:
     """Say what sets a row apart from the paper's: fewer steps or episodes, weights that broke, a start it was shown."""
     result = seeds[0]
-    few = min(seed.episodes for seed in seeds) // 2
+    few = max(1, min(seed.episodes for seed in seeds) // 2)
     if few < WINDOW:
         yield f"r_s and r_e over {few} episodes"
     if result.row.steps != environment.steps:
-        yield f"{result.row.steps:,} of {environment.steps:,} steps"
+        more = f", {result.steps_done:,} done" if result.steps_done > result.row.steps else ""
+        yield f"{result.row.steps:,} of {environment.steps:,} steps{more}"
     for seed in seeds:
         if seed.diverged:
             yield f"seed {seed.row.seed}: {_broke(seed)}, r_e is of the last episodes before"

@@ -44,18 +44,19 @@ class Canvas:
         self._agg = FigureCanvasAgg(self._figure)
         self._axes = self._figure.add_axes((0.01, 0.01, 0.98, 0.87))
 
-    def draw(self, stock: Floats, flow: Floats, time: float) -> NDArray[np.uint8]:
+    def draw(self, stock: Floats, flow: Floats, time: float, circularity: float | None = None) -> NDArray[np.uint8]:
         """Return the picture, shape (height, width, 3), and show it if there is a window.
 
         Args:
             stock: stocks, shape (nodes,), mass.
             flow: flows, shape (arcs,), mass/time.
             time: time of the stocks, for the heading.
+            circularity: λ, mass; see ``draw_network``.
         """
         network = self._network
         reference = max(self._reference, largest_flow(flow))
         title = f"{spoken(network.name)}, {network.time_unit} {number(time)}"
-        draw_network(self._axes, network, stock, flow, title=title, reference_flow=reference)
+        draw_network(self._axes, network, stock, flow, title=title, circularity=circularity, reference_flow=reference)
         self._agg.draw()  # type: ignore[no-untyped-call]
         pixels = np.asarray(self._agg.buffer_rgba())  # type: ignore[no-untyped-call]
         image: NDArray[np.uint8] = pixels[..., :3].copy()
@@ -69,7 +70,14 @@ class Canvas:
             self._window.close()
 
 
-def save_network(path: str | Path, network: Network, stock: Floats, flow: Floats, title: str = "") -> Path:
+def save_network(
+    path: str | Path,
+    network: Network,
+    stock: Floats,
+    flow: Floats,
+    title: str = "",
+    circularity: float | None = None,
+) -> Path:
     """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide.
 
     Args:
@@ -78,6 +86,7 @@ def save_network(path: str | Path, network: Network, stock: Floats, flow: Floats
         stock: stocks, shape (nodes,), mass.
         flow: flows, shape (arcs,), mass/time.
         title: heading; empty takes that of the network.
+        circularity: λ, mass; see ``draw_network``.
 
     Returns:
         The path.
@@ -86,7 +95,8 @@ def save_network(path: str | Path, network: Network, stock: Floats, flow: Floats
         CirlError: if an array has the wrong shape.
     """
     figure = Figure(figsize=FRAME_INCHES)
-    draw_network(figure.add_axes((0.01, 0.01, 0.98, 0.87)), network, stock, flow, title=title)
+    axes = figure.add_axes((0.01, 0.01, 0.98, 0.87))
+    draw_network(axes, network, stock, flow, title=title, circularity=circularity)
     return save(figure, path)
 
 
@@ -96,6 +106,7 @@ def save_before_after(
     before: tuple[Floats, Floats],
     after: tuple[Floats, Floats],
     labels: tuple[str, str] = ("before", "after"),
+    circularity: tuple[float | None, float | None] = (None, None),
 ) -> Path:
     """Save two states of one network side by side, with arrows at the same scale.
 
@@ -105,6 +116,7 @@ def save_before_after(
         before: stocks, shape (nodes,), and flows, shape (arcs,).
         after: the same, later or under other control.
         labels: headings of the two.
+        circularity: λ of the two, mass; see ``draw_network``.
 
     Returns:
         The path.
@@ -114,8 +126,8 @@ def save_before_after(
     """
     figure = Figure(figsize=(9.0, 5.6))
     reference = max(largest_flow(np.asarray(flow)) for _, flow in (before, after))
-    for column, ((stock, flow), label) in enumerate(zip((before, after), labels, strict=True)):
+    for column, ((stock, flow), label, value) in enumerate(zip((before, after), labels, circularity, strict=True)):
         axes = figure.add_axes((0.005 + 0.5 * column, 0.1, 0.49, 0.78))
-        draw_network(axes, network, stock, flow, title=label, reference_flow=reference, legend=False)
+        draw_network(axes, network, stock, flow, title=label, circularity=value, reference_flow=reference, legend=False)
     figure.legend(**legend_of(network), loc="lower center", ncols=3)
     return save(figure, path)

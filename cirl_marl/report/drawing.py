@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from cirl_marl.elements import Role
+from cirl_marl.elements import Law, Role
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.report.plan import Layout, layout_of
@@ -46,6 +46,7 @@ def draw_network(
     flow: Floats,
     *,
     title: str = "",
+    circularity: float | None = None,
     reference_flow: float | None = None,
     legend: bool = True,
 ) -> None:
@@ -61,7 +62,9 @@ def draw_network(
         network: the network.
         stock: stocks, shape (nodes,), mass.
         flow: flows, shape (arcs,), mass/time.
-        title: heading; λ of these flows is written below it.
+        title: heading.
+        circularity: λ, mass, which is written below it; None takes that of ``flow``, and writes none where batches
+            move, of which the flows know nothing.
         reference_flow: flow of the widest arrow, mass/time; None: the largest of ``flow``. Pictures with
             the same reference compare.
         legend: whether to explain the colours below the digraph.
@@ -82,7 +85,10 @@ def draw_network(
     else:
         _draw_arrows(axes, network, layout.routes, flow, share, em)
         _draw_boxes(axes, network, layout, stock, em)
-    _write_title(axes, network, flow, title)
+    if circularity is None and all(arc.law is not Law.BATCH for arc in network.arcs):
+        with np.errstate(invalid="ignore"):  # flows that overflowed are shown as they are
+            circularity = float(network.circularity(flow))
+    _write_title(axes, network, circularity, title)
     if legend:
         axes.legend(**legend_of(network), loc="lower center", ncols=3)
 
@@ -226,10 +232,9 @@ def _draw_dots(axes: Axes, network: Network, layout: Layout, stock: Floats, shar
     axes.scatter(x, y, s=np.maximum(area, 4.0), c=faces, edgecolors=edges, linewidths=0.4, zorder=3)
 
 
-def _write_title(axes: Axes, network: Network, flow: Floats, title: str) -> None:
-    with np.errstate(invalid="ignore"):  # flows that overflowed are shown as they are
-        value = number(float(network.circularity(flow)))
+def _write_title(axes: Axes, network: Network, circularity: float | None, title: str) -> None:
     heading = title or network.title or spoken(network.name)
-    below = f"λ = {value} {network.mass_unit}    flows in {network.mass_unit}/{network.time_unit}"
+    below = "" if circularity is None else f"λ = {number(circularity)} {network.mass_unit}    "
+    below += f"flows in {network.mass_unit}/{network.time_unit}"
     axes.text(0.5, 1.075, heading, transform=axes.transAxes, fontsize=11, fontweight="bold", color=INK, ha="center")
     axes.text(0.5, 1.02, below, transform=axes.transAxes, fontsize=9.5, color=MUTED, ha="center")

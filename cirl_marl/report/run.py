@@ -87,6 +87,7 @@ def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv)
         (before.final_stock, before.mean_flow),
         (after.final_stock, after.mean_flow),
         ("neutral: mean flows, last stocks", "trained: mean flows, last stocks"),
+        (float(before.circularity.mean()), float(after.circularity.mean())),
     )
     time = interval_ends(network)
     circularity = folder / "circularity.png"

@@ -8,9 +8,10 @@ of bodies lag behind the joints by one substep, so observations and the pose of 
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -81,6 +82,22 @@ class Engine(ABC):
     @abstractmethod
     def _show(self) -> Floats:
         """Return what the library shows, in the order of ``shown``."""
+
+
+E = TypeVar("E", bound=Engine)
+
+
+def one_per_thread(make: Callable[[], E]) -> Callable[[], E]:
+    """Return a function that gives each thread an engine of its own; MuJoCo lets others run while it steps."""
+    kept = threading.local()
+
+    def engine() -> E:
+        if not hasattr(kept, "engine"):
+            kept.engine = make()
+        found: E = kept.engine
+        return found
+
+    return engine
 
 
 def _welded_bodies(model: Any) -> list[int]:

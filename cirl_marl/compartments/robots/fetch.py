@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import redirect_stderr
 from dataclasses import dataclass
-from functools import cache
 from io import StringIO
 from typing import Any, ClassVar
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.compartments.model import RewardState, check_step
-from cirl_marl.compartments.robots.engine import Engine
+from cirl_marl.compartments.robots.engine import Engine, one_per_thread
 from cirl_marl.rowsum import Floats
 
 with redirect_stderr(StringIO()):  # the package prints a notice about its robot hands, which are not used here
@@ -69,10 +68,7 @@ class FetchEngine(Engine):
         return np.concatenate([shown["observation"], shown["achieved_goal"], shown["desired_goal"]])
 
 
-@cache
-def engine() -> FetchEngine:
-    """Return the engine of this process."""
-    return FetchEngine()
+engine = one_per_thread(FetchEngine)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import ClassVar
 
 import gymnasium
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.compartments.model import RewardState, check_step
-from cirl_marl.compartments.robots.engine import Engine
+from cirl_marl.compartments.robots.engine import Engine, one_per_thread
 from cirl_marl.rowsum import Floats
 
 OBSERVED = (
@@ -43,10 +42,7 @@ class ReacherEngine(Engine):
         return np.array([*self.env._get_obs(), np.linalg.norm(apart)])
 
 
-@cache
-def engine() -> ReacherEngine:
-    """Return the engine of this process."""
-    return ReacherEngine()
+engine = one_per_thread(ReacherEngine)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

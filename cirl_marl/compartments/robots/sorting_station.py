@@ -49,6 +49,11 @@ class SortingStation:
     item_kg: float = 100.0
     attempt_steps: float = 50
 
+    @property
+    def unit_kg(self) -> float:
+        """Mass of what is released at a time."""
+        return self.item_kg
+
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""
         check_form(self.form, tuple(ROBOTS))
