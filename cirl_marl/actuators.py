@@ -12,6 +12,9 @@ from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.flows import FlowLaws
 from cirl_marl.network import Floats, Integers, Network
 
+ROUNDING = 1e-6
+"""By which an action may exceed a bound: wrappers that rescale actions do so in single precision."""
+
 
 class Actuators:
     """Checks actions and maps them linearly from [−1, 1] to the bounds of the controls.
@@ -82,7 +85,7 @@ class Actuators:
         Raises:
             ControlError: for NaN or values outside [−1, 1].
         """
-        if not (actions.max(initial=0.0) <= 1.0 and actions.min(initial=0.0) >= -1.0):
+        if not (actions.max(initial=0.0) <= 1.0 + ROUNDING and actions.min(initial=0.0) >= -1.0 - ROUNDING):
             raise ControlError(self._wrong_values(actions))
         acting = actions * self._half
         acting += self._middle
@@ -119,6 +122,8 @@ def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:
     else:
         chosen = tuple(agents)
     for agent in chosen:
+        if agent in network.compartments and agent not in network.control_rows:
+            raise CirlError(f"network '{network.name}': '{agent}' has no control, so that it cannot act")
         if agent not in network.control_rows:
             raise CirlError(f"network '{network.name}': {unknown('agent', agent, network.controllable)}")
     if (network.agents and not chosen) or len(set(chosen)) != len(chosen):

@@ -210,7 +210,8 @@ class Converter:
         for name in (*table.initial, *ranged):
             if name not in ranged or name not in table.initial:
                 missing = [state for state in ranged if state not in table.initial]
-                self.mistakes.append(f"{where}.initial: {unknown('inner state', name, missing)}")
+                told = f"'{name}' is missing" if name in ranged else unknown("inner state", name, missing)
+                self.mistakes.append(f"{where}.initial: {told}")
         ranges = [table.initial[name] for name in ranged if name in table.initial]
         scale = self._optional(table.reward_scale, "1", f"{where}.reward_scale")
         return {

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from cirl_marl.errors import NetworkError, unknown
 from cirl_marl.rowsum import Floats
 
 if TYPE_CHECKING:
@@ -47,6 +48,21 @@ class ControlKind(StrEnum):
     INPUT = "input"
 
 
+Choice = TypeVar("Choice", bound=StrEnum)
+
+
+def _choice(owner: str, what: str, kinds: type[Choice], value: str) -> Choice:
+    """Return the member that a value is, or spells.
+
+    Raises:
+        NetworkError: if it is none; names the nearest.
+    """
+    try:
+        return kinds(value)
+    except ValueError:
+        raise NetworkError(owner, [unknown(what, value, kinds)]) from None
+
+
 def ranged_states(model: CompartmentModel) -> tuple[str, ...]:
     """Return the states whose start is drawn from a given range: all, unless the model has a ``start`` of its own."""
     return () if hasattr(model, "start") else model.state_names
@@ -68,6 +84,10 @@ class Control:
     low: float
     high: float
     neutral: float
+
+    def __post_init__(self) -> None:
+        """Take a kind as definitions spell it."""
+        object.__setattr__(self, "kind", _choice("control", "kind", ControlKind, self.kind))
 
     def action(self, value: Floats) -> Floats:
         """Return the normalised actions, in [-1, 1], that come closest to physical values."""
@@ -122,6 +142,10 @@ class Node(Compartment):
     role: Role = Role.TECHNOSPHERE
     initial: tuple[float, float] = (0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        """Take a role as definitions spell it."""
+        object.__setattr__(self, "role", _choice(f"node '{self.id}'", "role", Role, self.role))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arc(Compartment):
@@ -154,6 +178,10 @@ class Arc(Compartment):
     flow: tuple[float, ...] = (0.0,)
     times: tuple[float, ...] = ()
     pollutant: bool = True
+
+    def __post_init__(self) -> None:
+        """Take a law as definitions spell it."""
+        object.__setattr__(self, "law", _choice(f"arc '{self.id}'", "law", Law, self.law))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, StrictBool
 
 from cirl_marl.elements import ControlKind, Law, Role
 from cirl_marl.validate import IDENTIFIER
@@ -83,7 +83,9 @@ class ModelTable(Table):
 
     kind: str = Field(description="name of a compartment model")
     form: str | None = Field(None, description="form of the equations, such as 'published' or 'sound'")
-    parameters: dict[str, bool | Number] = Field({}, description="parameters that differ from the model's own, by name")
+    parameters: dict[str, StrictBool | Number] = Field(
+        {}, description="parameters that differ from the model's own, by name"
+    )
     source: Source
     initial: dict[str, InnerRange] = Field(
         {}, description="initial range of each inner state that the model does not draw"
@@ -124,7 +126,7 @@ class ArcTable(Table):
     scale: Quantity | None = Field(
         None, description="reference flow, default: scales.flow; of a batch arc reference mass, default: scales.stock"
     )
-    pollutant: bool = Field(True, description="whether what enters an environment here is a pollutant")
+    pollutant: StrictBool = Field(True, description="whether what enters an environment here is a pollutant")
     control: ControlTable | None = None
 
 

@@ -73,9 +73,8 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.observation_space = self.parallel.observation_space(self.agent)
         self.action_space = self.parallel.action_space(self.agent)
         self.observation_names = {self.agent: self.parallel.observation_names[self.agent]}
-        names = self.parallel.state_names
-        observed = self.parallel.layout.array_order or names
-        self._order = np.array([names.index(name) for name in observed], dtype=np.intp)
+        rows = {name: row for row, name in enumerate(self.parallel.state_names)}
+        self._order = np.array([rows[name] for name in self.parallel.layout.array_order or rows], dtype=np.intp)
 
     @property
     def network(self) -> Network:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+from cirl_marl.compartments import kind_of
 from cirl_marl.elements import Arc, Compartment, ControlKind, Law, Node, ranged_states
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
@@ -145,7 +146,7 @@ def _model(compartment: Compartment) -> str:
     )
     scale = _quantity(compartment.reward_scale, "1")
     return (
-        f"{{ kind = {_text(model.kind)}, {form}parameters = {{ {parameters} }}, source = {_text(SOURCE)}, "
+        f"{{ kind = {_text(kind_of(model))}, {form}parameters = {{ {parameters} }}, source = {_text(SOURCE)}, "
         f"initial = {{ {initial} }}, reward_scale = {scale} }}"
     )
 

@@ -71,7 +71,7 @@ def test_acting_outside_an_episode() -> None:
     ("options", "message"),
     [
         ({"agents": ["mime"]}, "unknown agent 'mime'. Did you mean 'mine'"),
-        ({"agents": ["landfill"]}, "unknown agent 'landfill'"),
+        ({"agents": ["landfill"]}, "'landfill' has no control, so that it cannot act"),
         ({"agents": []}, "at least one"),
         ({"agents": ["mine", "mine"]}, "distinct"),
         ({"agents": "mine"}, "sequence of ids in a fixed order"),

@@ -67,6 +67,11 @@ def test_published_schema_is_up_to_date() -> None:
         ("title", "titel", "unknown key 'titel'. Did you mean 'title'?"),
         ("[learner]", '[environment]\nrewrad = "local"\n[learner]', "unknown option 'rewrad'. Did you mean 'reward'?"),
         (
+            "[learner]",
+            '[[match]]\nalgorithm = "SAC"\n[learner]',
+            "match.0: fits every agent; give kind,",
+        ),
+        (
             '"PPO"\nparameters = { n_steps = 8',
             '"SAC"\nparameters = { action_noise = 3',
             "needs kind and a number sigma, got 3",

@@ -20,6 +20,7 @@ from cirl_marl import Arc, CirlError, Network, Node, Role
 from cirl_marl.network import Floats
 from cirl_marl.report import (
     Canvas,
+    curves,
     draw_network,
     drawing,
     save_before_after,
@@ -304,3 +305,11 @@ def test_trajectory(tmp_path: Path, network: Callable[[], Network], steps: int) 
     flow = random.normal(10, 1, (len(shown.arcs), steps))
     time = np.arange(steps) / 4
     read(save_trajectory(tmp_path / "path.png", shown, time, stock, flow, shown.circularity(flow)))
+
+
+def test_smoothing_heeds_what_there_is() -> None:
+    """A moving average is that of the finite values in its window, whatever the size of others."""
+    values = np.array([1.0, 2.0, np.nan, 4.0, -1e17, 3.0, 3.0, 3.0, 3.0])
+    smoothed = curves._smoothed(values, 3)
+    np.testing.assert_allclose(smoothed[:3], [1.5, 1.5, 3.0])
+    np.testing.assert_allclose(smoothed[6:], 3.0)

@@ -13,8 +13,9 @@ import pytest
 from stable_baselines3.common.vec_env import VecNormalize
 
 import cirl_marl
-from cirl_marl import RunError
+from cirl_marl import RunError, VectorEnv
 from cirl_marl.controllers.trained import Trained
+from cirl_marl.evaluate import rollout
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners.recipe import Learner, Normalisation, Run
 
@@ -167,6 +168,15 @@ def test_policies_of_others_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> N
             Trained(tmp_path / "run")
         (folder / file.format("mine")).write_bytes(own)
     Trained(tmp_path / "run")
+
+
+def test_policies_act_on_what_they_learnt_to_see(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """An environment that shows something else is refused, with what it shows; options make the difference."""
+    train("copper_net", ppo_recipe, directory=tmp_path / "run")
+    policy = Trained(tmp_path / "run")
+    with pytest.raises(RunError, match=r"learnt from other observations .* with the options of the run"):
+        policy.start(VectorEnv("copper_net", num_envs=2, observe="full"), seed=0)
+    rollout(VectorEnv("copper_net", num_envs=2, horizon=3), policy, seed=0)
 
 
 def test_metrics_survive_a_crash(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:

@@ -35,8 +35,10 @@ def train(
     """Train one learner per compartment, all at once, then evaluate them and draw what changed."""
     from cirl_marl import learners
 
-    if (network is None) == (resume is None):
-        raise CirlError("train needs either NETWORK or --resume RUN")
+    if network is None and resume is None:
+        raise CirlError("train needs NETWORK, or --resume RUN")
+    if network is not None and resume is not None:
+        raise CirlError(f"--resume goes on with the network of its run; leave out {network}")
     if resume is not None:
         _only_resume(context)
     directory = resume or out

@@ -22,6 +22,7 @@ __all__ = [
     "DiscreteTimeModel",
     "OwnStepModel",
     "RewardState",
+    "kind_of",
     "model_class",
     "models",
 ]
@@ -61,12 +62,18 @@ def models() -> dict[str, type[Any]]:
 def model_class(kind: str) -> type[Any]:
     """Return the model of that kind; MuJoCo is imported only for a kind that is not among the others.
 
+    A model of your own is named by where it is, ``package.module:Class``.
+
     Raises:
         CirlError: if there is none; the message names the nearest match.
 
     >>> model_class("digester").time_unit
     'day'
+    >>> model_class("cirl_marl.compartments.digester:Digester") is model_class("digester")
+    True
     """
+    if ":" in kind:
+        return _elsewhere(kind)
     light = _found(__name__)
     if kind in light:
         return light[kind]
@@ -74,3 +81,21 @@ def model_class(kind: str) -> type[Any]:
         return _found(ROBOTS)[kind]
     except KeyError:
         raise CirlError(unknown("compartment kind", kind, models())) from None
+
+
+def kind_of(model: object) -> str:
+    """Return the name by which definitions call the class of ``model``: its kind, or where it is if it is your own."""
+    own, kind = type(model), getattr(model, "kind", "")
+    known = kind in _found(__name__) or kind in _found(ROBOTS)
+    return kind if known and model_class(kind) is own else f"{own.__module__}:{own.__qualname__}"
+
+
+def _elsewhere(place: str) -> type[Any]:
+    module, _, name = place.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise CirlError(f"compartment kind '{place}': {error}") from error
+    if not isinstance(found, type) or not hasattr(found, "reward"):
+        raise CirlError(f"compartment kind '{place}': is no class of compartment models")
+    return found

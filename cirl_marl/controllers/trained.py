@@ -28,7 +28,7 @@ class Trained:
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
         folder, groups = self.run.checkpoint, self.run.groups()
         env = self.run.make_env(1)
-        self._agents = env.agents
+        self._seen = env.layout.names
         self._views = {group.name: group.view(env) for group in groups}
         self._models = {group.name: load_model(folder, group.name, group.spec.algorithm) for group in groups}
         self._normalisers = {group.name: load_normaliser(folder, group.name, group.spec) for group in groups}
@@ -49,10 +49,17 @@ class Trained:
         """Forget the last episode.
 
         Raises:
-            RunError: if ``env`` has other agents than the run.
+            RunError: if ``env`` has other agents than the run, or shows them something else.
         """
-        if set(env.agents) != set(self._agents):
-            raise RunError(f"{self.run.path}: trained {sorted(self._agents)}, not {sorted(env.agents)}")
+        if set(env.agents) != set(self._seen):
+            raise RunError(f"{self.run.path}: trained {sorted(self._seen)}, not {sorted(env.agents)}")
+        for agent, seen in self._seen.items():
+            if (shown := env.layout.names[agent]) != seen:
+                other = next((name for name in shown if name not in seen), f"{len(shown)} entries, not {len(seen)}")
+                raise RunError(
+                    f"{self.run.path}: '{agent}' learnt from other observations than this environment's ({other}); "
+                    "make the environment with the options of the run, as its make_env() does"
+                )
         self._memory = dict.fromkeys(self._models)
         self._starts = np.ones(env.num_envs, dtype=bool)
         self._state = unseen_state(env)

@@ -228,6 +228,9 @@ class Recipe(_Table):
         for key in self.environment:
             if key not in OPTIONS:
                 yield f"environment: {unknown('option', key, OPTIONS)}"
+        for i, match in enumerate(self.match):
+            if match.kind is None and match.role is None and match.agents is None:
+                yield f"match.{i}: fits every agent; give kind, role or agents"
         for where, learner in self.learners():
             try:
                 learner.check()

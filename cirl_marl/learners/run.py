@@ -262,8 +262,8 @@ class RunDirectory:
         path = self.path / "metrics.csv"
         if not path.is_file():
             raise RunError(f"{path}: missing; the run directory is incomplete")
-        header, *rows = _complete_rows(path)
         try:
+            header, *rows = _complete_rows(path)
             return {name: [float(row[i]) for row in rows] for i, name in enumerate(header)}
         except (ValueError, IndexError) as error:
             raise RunError(f"{path}: cannot be read: {error}") from error

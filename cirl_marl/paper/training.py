@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import ValidationError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -139,9 +140,16 @@ def outdated(result: Result, success_episodes: int | None = None) -> str:
     if recorded is not None and recorded != described(environment).get("definition_sha256"):
         return "the definition of the environment is another now"
     name = tuned_recipe(environment.name) if result.row.recipe == "tuned" else None
-    if name is not None and Recipe.model_validate(settings["recipe"]) != load_recipe(name):
+    if name is not None and not _is_recipe(settings["recipe"], load_recipe(name)):
         return f"the recipe '{name}' is another now"
     return ""
+
+
+def _is_recipe(recorded: Mapping[str, Any], recipe: Recipe) -> bool:
+    try:
+        return Recipe.model_validate(recorded) == recipe
+    except ValidationError:  # it has keys that recipes no longer have
+        return False
 
 
 def check_registered(environment: PaperEnvironment) -> gymnasium.envs.registration.EnvSpec:

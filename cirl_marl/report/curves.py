@@ -224,12 +224,11 @@ def _draw_returns(axes: Axes, steps: Floats, values: Floats) -> None:
 
 
 def _smoothed(values: Floats, window: int) -> Floats:
-    """Centred moving average over about ``window`` values, fewer at the ends."""
-    half = window // 2
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    index = np.arange(len(values))
-    low, high = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
-    mean: Floats = (total[high] - total[low]) / (high - low)
+    """Centred moving average over about ``window`` values, fewer at the ends and where some are not finite."""
+    finite = np.isfinite(values)
+    weights = np.ones(2 * (window // 2) + 1)
+    total, count = (np.convolve(each, weights, "same") for each in (np.where(finite, values, 0.0), finite))
+    mean: Floats = np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
     return mean
 
 
@@ -247,4 +246,5 @@ def _draw_largest(axes: Axes, time: Floats, values: Floats, names: Sequence[str]
                   linewidth=1.5, label=label, marker=_dots(time))  # fmt: skip
     more = f": {SHOWN} of {len(names)}, the largest changes" if len(names) > SHOWN else ""
     dressed(axes, title=title + more, ylabel=unit)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
+    if len(kept):
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)

@@ -98,15 +98,16 @@ def layered(network: Network, pitch: Pitch, aspect: float) -> Floats:
     depth = depths(network)
     count = len(depth)
     height = np.zeros(count)
-    for level in range(int(depth.max()) + 1):
-        _spread(height, np.flatnonzero(depth == level))
+    levels = np.split(np.argsort(depth, kind="stable"), np.cumsum(np.bincount(depth))[:-1])
+    for level in levels:
+        _spread(height, level)
     neighbours = np.bincount(network.donors, minlength=count) + np.bincount(network.recipients, minlength=count)
     for _ in range(4):
         total = np.bincount(network.donors, height[network.recipients], count)
         total += np.bincount(network.recipients, height[network.donors], count)
         height = total / np.maximum(neighbours, 1)
-        for level in range(int(depth.max()) + 1):
-            _spread(height, np.flatnonzero(depth == level))
+        for level in levels:
+            _spread(height, level)
     rows = max(1, math.ceil(math.sqrt(count * pitch.across / (aspect * pitch.down))))
     return _in_columns(depth, height, rows)
 

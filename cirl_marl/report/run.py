@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.comparison import compare
+from cirl_marl.errors import RunError
 from cirl_marl.evaluate import Rollout, interval_ends, summary
 from cirl_marl.learners.run import RunDirectory, write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
@@ -67,7 +68,10 @@ def evaluate_run(
 def _is_evaluated(run: RunDirectory, figures: Mapping[str, Any]) -> bool:
     """Whether ``evaluation.json`` is of the same checkpoint and episodes as ``figures``."""
     path = run.path / "evaluation.json"
-    found = json.loads(path.read_text()) if path.is_file() else {}
+    try:
+        found = json.loads(path.read_text()) if path.is_file() else {}
+    except ValueError as error:
+        raise RunError(f"{path}: cannot be read: {error}; delete it to evaluate anew") from error
     return all(found.get(name) == figures[name] for name in ("checkpoint", "episodes", "first_seed"))
 
 
