@@ -434,7 +434,7 @@ def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         (["show", "copper_net", "--scenario", "papr"], "unknown scenario 'papr'. Did you mean 'paper'?"),
         (["train", "copper_net", "--agents", "independent_pp"], "Did you mean 'independent_ppo'?"),
         (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
-        (["train"], "needs either NETWORK or --resume RUN"),
+        (["train"], "train needs NETWORK, or --resume RUN"),
         (["train", "--resume", "nowhere"], "unknown run directory 'nowhere'"),
         (["train", "--resume", "nowhere", "--envs", "5", "--seed", "1"], "leave out --envs, --seed"),
         (["show", "copper_net", "--picture", "picture.pdf"], "needs the name of a .png file"),
