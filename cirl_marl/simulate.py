@@ -319,11 +319,11 @@ class Dynamics(FlowLaws):
         """
         moved = passing(rate)
         after = self.incidence.add_to(stock.copy(), moved)
-        if not (after < 0).any():  # asked of every copy, as a NaN in one says nothing of the others
+        if after.min() >= 0:
             return after, moved, rate
         held = disposable(stock, self._busiest)
         settled = np.full_like(moved, np.nan)
-        while (after < 0).any():
+        while (after < 0).any():  # asked of every copy, as a NaN in one says nothing of the others
             out = self._outgoing(moved)
             short = (after < 0) & (out > 0)
             share = np.divide(held, out, out=np.ones_like(out), where=short & (out > held))

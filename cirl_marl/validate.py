@@ -5,21 +5,16 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from cirl_marl.elements import (
-    NET_ZERO,
-    OBSERVE,
     QUANTITIES,
-    REWARDS,
-    SOLVERS,
     Arc,
     Compartment,
     ControlKind,
-    Episode,
     Law,
     Node,
     Service,
@@ -27,6 +22,7 @@ from cirl_marl.elements import (
 )
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.units import factor
+from cirl_marl.validate_settings import is_whole, repeated, setting_problems
 
 if TYPE_CHECKING:
     from cirl_marl.network import Network
@@ -91,12 +87,12 @@ def problems(network: Network) -> Iterator[str]:
     providers = _providers(network)
     for service in network.services:
         yield from _service_problems(service, everyone, providers)
-    yield from _setting_problems(network)
+    yield from setting_problems(network)
     acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.acting:
         if agent not in acting:
             yield f"agents: {unknown('acting compartment', agent, acting)}"
-    yield from _repeated("agents", network.acting)
+    yield from repeated("agents", network.acting)
 
 
 def _ports(network: Network) -> dict[tuple[str, str], list[str]]:
@@ -127,12 +123,6 @@ def _name_problems(kind: str, ids: list[str]) -> Iterator[str]:
     for id_, times in Counter(ids).items():
         if times > 1:
             yield f"{kind} '{id_}': the id is used twice"
-
-
-def _repeated(where: str, names: Iterable[str]) -> Iterator[str]:
-    for name, times in Counter(names).items():
-        if times > 1:
-            yield f"{where}: names '{name}' twice"
 
 
 def _node_problems(network: Network, node: Node) -> Iterator[str]:
@@ -203,7 +193,7 @@ def _batch_problems(where: str, arc: Arc, network: Network, nodes: Mapping[str, 
         return
     if math.isfinite(interval) and interval > 0:  # anything else is a problem of its own
         for what, time in [("delay", arc.delay), *(("batch at", time) for time in times)]:
-            if not _whole(time / interval) or (0 < time < interval / 2):
+            if not is_whole(time / interval) or (0 < time < interval / 2):
                 yield f"{where}: {what} {time:g} is not a whole number of control intervals of {interval:g}"
     for what, given in (("set_point", arc.set_point), ("control of kind 'rate'", _rate_control(arc))):
         if given is not None:
@@ -234,10 +224,6 @@ def _unit_problems(where: str, arc: Arc, mass_unit: str, donor: Node) -> Iterato
 
 def _rate_control(arc: Arc) -> str | None:
     return arc.control.kind if arc.control is not None and arc.control.kind is ControlKind.RATE else None
-
-
-def _whole(ratio: float) -> bool:
-    return math.isfinite(ratio) and math.isclose(ratio, round(ratio), rel_tol=1e-9, abs_tol=1e-9)
 
 
 def _common_problems(where: str, compartment: Compartment, network: Network) -> Iterator[str]:
@@ -310,7 +296,7 @@ def _service_problems(
         yield f"{where}: provider: {unknown(kind, service.provider, known)}"
     if service.measure and service.quantity != "measure":
         yield f"{where}: measure '{service.measure}': quantity '{service.quantity}' takes none"
-    yield from _repeated(f"{where}: owed_by", service.owed_by)
+    yield from repeated(f"{where}: owed_by", service.owed_by)
     for debtor in service.owed_by:
         if debtor not in everyone:
             yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
@@ -320,82 +306,3 @@ def _service_problems(
         yield f"{where}: the band from 0 without an upper end asks for nothing"
     if not math.isfinite(service.weight) or service.weight < 0:
         yield f"{where}: weight {service.weight} must be finite and not negative"
-
-
-def _setting_problems(network: Network) -> Iterator[str]:
-    episode, objective = network.episode, network.objective
-    for what, value, known in (
-        ("solver", episode.solver, SOLVERS),
-        ("net_zero", objective.net_zero, NET_ZERO),
-        ("reward", objective.reward, REWARDS),
-        ("observation mode", network.observation.mode, OBSERVE),
-    ):
-        if value not in known:
-            yield unknown(what, value, known)
-    for name, number in (
-        ("control_interval", episode.control_interval),
-        ("reference_interval", objective.reference_interval),
-        ("circularity_scale", objective.circularity_scale),
-    ):
-        if not math.isfinite(number) or number <= 0:
-            yield f"{name} {number} must be positive and finite"
-    criticality = objective.criticality
-    if criticality is not None and not (math.isfinite(criticality) and criticality >= 0):
-        yield f"criticality {criticality} must be finite and not negative"
-    if episode.horizon < 1:
-        yield f"horizon {episode.horizon} must be at least 1 step"
-    if not 0 <= objective.circularity_weight <= 1:
-        yield f"circularity_weight {objective.circularity_weight} must lie in [0, 1]"
-    if episode.solver != "exact":
-        yield from _step_problems(episode)
-    else:
-        if episode.solver_step is not None:
-            yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
-        moving = any(c.model is not None and not hasattr(c.model, "interval") for c in (*network.nodes, *network.arcs))
-        if moving or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
-            yield (
-                "solver 'exact' knows no continuous inner physics: a network with models needs solver 'rk4' or 'euler'"
-            )
-    for compartment in (*network.nodes, *network.arcs):
-        yield from _clock_problems(network, compartment)
-    tracked = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None)
-    yield from _repeated("objective.tracked", objective.tracked)
-    yield from _repeated("observation.nodes", network.observation.nodes)
-    for name in objective.tracked:
-        if name not in tracked:
-            yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
-    if (network.observation.mode == "stocks") != bool(network.observation.nodes):
-        yield "observation: mode 'stocks', and only that mode, lists its nodes"
-    signals = dict.fromkeys(node.id for node in network.nodes)
-    for compartment in (*network.nodes, *network.arcs):
-        if compartment.model is not None:
-            signals |= dict.fromkeys(f"{compartment.id}.{name}" for name in compartment.model.state_names)
-    for name in network.observation.nodes:
-        if name not in signals:
-            yield f"observation: {unknown('node or inner state', name, signals)}"
-
-
-def _clock_problems(network: Network, compartment: Compartment) -> Iterator[str]:
-    step = getattr(compartment.model, "interval", None)
-    if step is None or compartment.model is None:
-        return
-    interval = network.episode.control_interval * factor(network.time_unit, compartment.model.time_unit)
-    if not math.isclose(interval, step, rel_tol=1e-9):
-        unit = compartment.model.time_unit
-        yield (
-            f"'{compartment.id}': model '{compartment.model.kind}' moves in steps of {step:g} {unit}; "
-            f"the control interval is {interval:g} {unit}"
-        )
-
-
-def _step_problems(episode: Episode) -> Iterator[str]:
-    step = episode.solver_step
-    if step is None or not (math.isfinite(step) and step > 0):
-        yield f"solver '{episode.solver}' needs a positive solver_step, got {step}"
-        return
-    ratio = episode.control_interval / step
-    if math.isfinite(episode.control_interval) and (not _whole(ratio) or round(ratio) < 1):
-        yield (
-            f"control_interval {episode.control_interval} is not a whole number of solver steps of {step} "
-            f"({ratio:.6g} steps)"
-        )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import RescaleAction
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from cirl_marl import Arc, CirlError, Control, ControlKind, Network, Node, VectorEnv
+from cirl_marl import Arc, CirlError, Control, ControlError, ControlKind, Network, Node, VectorEnv
 from cirl_marl.comparison import compare
 from cirl_marl.controllers import Neutral, Random
 from cirl_marl.evaluate import rollout
@@ -39,6 +41,17 @@ def test_neutral_at_a_bound_is_an_action(low: float, high: float, where: str) ->
     rates = [env.dynamics.rate(env._actuators.controls(np.full((1, 2), end)), None)[0, 0] for end in (-1.0, 1.0)]
     assert 0.1 * low <= rates[0] == pytest.approx(0.1 * low)
     assert 0.1 * high >= rates[1] == pytest.approx(0.1 * high)
+
+
+@given(st.floats(-9.0, 0.0), st.floats(1.0, 9.0))
+def test_rescaled_actions_are_taken(low: float, high: float) -> None:
+    """Gymnasium's wrapper works in single precision and may land a rounding beyond the bounds."""
+    env = RescaleAction(gymnasium.make("cirl_marl/CarboNet-v0"), np.float32(low), np.float32(high))
+    env.reset(seed=0)
+    for action in (env.action_space.low, env.action_space.high):  # type: ignore[attr-defined]
+        env.step(action)
+    with pytest.raises(ControlError, match="must be a number in"):
+        env.unwrapped.step(np.array([1.00001]))
 
 
 def test_nobody_has_to_act() -> None:

@@ -45,6 +45,16 @@ def test_gymnasium_accepts_them(id_: str, legacy: bool) -> None:
     env.close()
 
 
+def test_success_has_the_name_that_learners_look_for() -> None:
+    """``is_success`` of gymnasium-robotics, from which Stable-Baselines3 takes its success rate."""
+    env = gymnasium.make("cirl_marl/FetchWasteSorting-v0")
+    env.reset(seed=0)
+    infos = [env.step(wanted(env))[-1] for _ in range(50)]
+    assert [info["is_success"] for info in infos] == [info["success"] for info in infos]
+    assert not infos[0]["is_success"]
+    assert infos[-1]["is_success"]
+
+
 def library(id_: str) -> Any:
     """Return the library's own environment."""
     gymnasium.register_envs(gymnasium_robotics)

@@ -11,7 +11,7 @@ from own_models import Fermenter
 
 from cirl_marl import Arc, CirlError, Control, Episode, Law, Network, Node, Role, VectorEnv, load_network
 from cirl_marl.comparison import compare
-from cirl_marl.compartments import kind_of, model_class, models
+from cirl_marl.compartments import kind_of, model_class
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.definition import write_network
 from cirl_marl.learners import Recipe, train
@@ -57,10 +57,8 @@ def test_own_models_are_kept_and_come_back(tmp_path: Path, ppo_recipe: Recipe) -
 
 def test_kinds_of_the_library_keep_their_names() -> None:
     """Also where a class of one's own takes the name of one of them."""
-    for kind, found in models().items():
-        assert kind_of(found) == "builtins:type"
-        assert model_class(kind) is found
-    assert kind_of(Digester()) == "digester"
+    for kind in ("digester", "delivery_truck", "incinerator", "reacher"):
+        assert kind_of(model_class(kind)()) == kind
 
     class Other(Digester):
         """Another digester."""

@@ -173,6 +173,35 @@ def test_weights_that_become_nan_are_a_result(
     assert "nan" not in line
 
 
+def test_a_session_goes_on_after_a_row_that_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The failure is said and in the exit code; other rows are run and shown."""
+
+    def run(row: Row, **_: Any) -> Result:
+        if row.algorithm == "A2C":
+            raise CirlError("no training episode ended")
+        return replace(result(row.algorithm), row=row)
+
+    monkeypatch.setattr(session, "run_row", run)
+    assert cirl(monkeypatch, "--steps", "200", "--out", str(tmp_path)) == 1
+    shown = capsys.readouterr().out
+    assert "CopperNet A2C (published, 200 steps, seed 0): failed: no training episode ended" in shown
+    assert [each.row.algorithm for each in Results(tmp_path).all()] == ["ARS", "DDPG", "PPO", "SAC"]
+    assert cirl(monkeypatch, "PPO", "--steps", "400", "--out", str(tmp_path)) == 0
+    assert "400 of 200,000" in capsys.readouterr().out
+    assert cirl(monkeypatch, "PPO", "--steps", "200", "--out", str(tmp_path)) == 0
+    assert "400 of 200,000" not in capsys.readouterr().out
+
+
+def test_recipes_of_other_versions_are_outdated() -> None:
+    """A recorded recipe with a key that recipes no longer have is another one."""
+    found = replace(result("PPO"), row=Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=200_000))
+    recorded = load_recipe("paper_copper_net").model_dump(mode="json")
+    assert outdated(replace(found, settings={"recipe": recorded})) == ""
+    assert "another now" in outdated(replace(found, settings={"recipe": recorded | {"gone": 1}}))
+
+
 def test_other_failures_of_a_training_are_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only broken weights are what the settings give; anything else that goes wrong is said."""
     monkeypatch.setattr(training.Watch, "_on_step", lambda _: int("none"))

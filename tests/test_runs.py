@@ -18,6 +18,7 @@ from cirl_marl.controllers.trained import Trained
 from cirl_marl.evaluate import rollout
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners.recipe import Learner, Normalisation, Run
+from cirl_marl.learners.run import write_atomically
 
 
 def test_run_directory_holds_what_is_needed(tmp_path: Path, ppo_recipe: Recipe) -> None:
@@ -177,6 +178,21 @@ def test_policies_act_on_what_they_learnt_to_see(tmp_path: Path, ppo_recipe: Rec
     with pytest.raises(RunError, match=r"learnt from other observations .* with the options of the run"):
         policy.start(VectorEnv("copper_net", num_envs=2, observe="full"), seed=0)
     rollout(VectorEnv("copper_net", num_envs=2, horizon=3), policy, seed=0)
+
+
+def test_failed_writing_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
+    """Half of a file is nowhere."""
+    path = tmp_path / "kept.txt"
+    path.write_text("old")
+
+    def write(partial: Path) -> None:
+        partial.write_text("ha")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, write)
+    assert [each.name for each in tmp_path.iterdir()] == ["kept.txt"]
+    assert path.read_text() == "old"
 
 
 def test_metrics_survive_a_crash(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:

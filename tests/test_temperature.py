@@ -40,6 +40,14 @@ def test_temperature_follows_the_stock() -> None:
     assert abs(expected[-1] - 288.33) > 1e-3, "a temperature that does not move would prove nothing"
 
 
+def test_neutral_control_leaves_the_model_s_range_within_eleven_days() -> None:
+    """Beyond 3750 t of carbon in the urban air no radiation leaves, as docs/compartments.md says."""
+    env = VectorEnv("carbo_net", num_envs=1, scenario="temperature")
+    run, day = rollout(env, Neutral(), seed=0), env.network.episode.control_interval
+    air = run.stock[:, env.network.node_index["urban_air"]]
+    assert 10.0 < (int(np.argmax(air > 3750.0)) + 1) * day <= 11.0
+
+
 def test_more_carbon_dioxide_is_warmer() -> None:
     """The published sign: more of it in the air, less radiation leaves."""
     env = VectorEnv(load_network("carbo_net", scenario="temperature"), num_envs=2, horizon=20)
