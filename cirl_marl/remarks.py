@@ -24,9 +24,19 @@ SHORT = 20
 
 def remarks(network: Network) -> Iterator[str]:
     """Yield what whoever wrote ``network`` may not have meant: idle agents and debtors, and steps that are too long."""
+    yield from _apart(network)
     yield from _without_effect(network)
+    yield from _aimless(network)
     yield from _unpaid(network)
     yield from _coarse(network)
+
+
+def _apart(network: Network) -> Iterator[str]:
+    """Yield nodes that no arc touches and that have nothing else to do."""
+    touched = {end for arc in network.arcs for end in (arc.donor, arc.recipient)}
+    for node in network.nodes:
+        if node.model is None and node.id not in touched:
+            yield f"node '{node.id}': no arc begins or ends here, so that no mass enters or leaves it"
 
 
 def _without_effect(network: Network) -> Iterator[str]:
@@ -82,13 +92,20 @@ def _states(network: Network, action: float | None, intervals: int) -> Floats:
     return np.array(rows)
 
 
+def _aimless(network: Network) -> Iterator[str]:
+    """Yield the lack of a service where agents are paid for λ, which is best when nothing flows."""
+    if _paid_for_circularity(network) and not network.services:
+        reward = network.objective.reward
+        yield f"there is no service, so that agents with reward '{reward}' do best to stop whatever flows"
+
+
 def _unpaid(network: Network) -> Iterator[str]:
     """Yield services whose shortfall nobody who acts feels.
 
-    A shortfall lowers the local reward of those who owe the service. If none of them acts, or some do not, the agents
-    are paid for stopping what the service is there to keep up.
+    A shortfall lowers the local reward of those who owe the service. If none of them acts, or some do not, agents that
+    are paid for λ too are paid for stopping what the service is there to keep up.
     """
-    if not network.agents:
+    if not _paid_for_circularity(network):
         return
     for service in network.services:
         idle = [debtor for debtor in service.debtors if debtor not in network.agents]
@@ -100,3 +117,7 @@ def _unpaid(network: Network) -> Iterator[str]:
             )
         elif idle:
             yield f"service '{service.id}': owed_by: {', '.join(idle)} does not act and cannot be paid less"
+
+
+def _paid_for_circularity(network: Network) -> bool:
+    return bool(network.agents) and not network.objective.reward.startswith("local")
