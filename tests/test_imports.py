@@ -17,6 +17,7 @@ LAYERS = (
         "elements",
         "rowsum",
         "validate",
+        "validate_settings",
         "network",
         "staged",
         "statistics",
