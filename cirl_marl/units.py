@@ -9,16 +9,6 @@ import pint
 
 from cirl_marl.errors import CirlError
 
-AMBIGUOUS = {
-    "ton": "t (tonne), or short_ton, or long_ton",
-    "tons": "t (tonne), or short_ton, or long_ton",
-    "kton": "kt (kilotonne)",
-    "Mton": "Mt (megatonne)",
-    "mt": "t (metric tonne), or Mt (megatonne)",
-    "mton": "t (metric tonne), or Mt (megatonne)",
-}
-"""Symbols that pint reads as short tons or as millitonnes, though many mean tonnes by them; what to write instead."""
-
 
 @cache
 def _registry() -> pint.UnitRegistry[float]:
@@ -26,6 +16,23 @@ def _registry() -> pint.UnitRegistry[float]:
     registry: pint.UnitRegistry[float] = pint.UnitRegistry(on_redefinition="ignore", cache_folder=None)
     registry.define("kilotonne = 1000 * tonne = kt")
     return registry
+
+
+def _ambiguity(symbol: str) -> str | None:
+    """Return what to write instead of a symbol that many read as another mass than pint does; None for any other.
+
+    Pint reads ``ton`` as the short ton, with whatever prefix, and ``mt`` as the millitonne.
+    """
+    if symbol == "mt":
+        return "t (metric tonne), or Mt (megatonne)"
+    registry = _registry()
+    for prefix, name, _ in registry.parse_unit_name(symbol):
+        if name == "ton" and "short_ton" not in symbol:
+            if prefix == "milli":
+                return "t (metric tonne), or Mt (megatonne)"
+            tonne = registry.get_symbol(f"{prefix}tonne")
+            return f"{tonne} ({prefix}tonne), or {prefix}short_ton, or {prefix}long_ton"
+    return None
 
 
 @cache
@@ -41,8 +48,9 @@ def factor(unit: str, target: str) -> float:
     1000.0
     """
     for symbol in re.findall(r"[^\W\d]\w*", unit):
-        if symbol in AMBIGUOUS:
-            raise CirlError(f"unit '{unit}': '{symbol}' is read in several ways; write {AMBIGUOUS[symbol]}")
+        instead = _ambiguity(symbol)
+        if instead is not None:
+            raise CirlError(f"unit '{unit}': '{symbol}' is read in several ways; write {instead}")
     registry = _registry()
     try:
         return float(registry.Quantity(1.0, unit).to(target).magnitude)
