@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
     """A ``SingleAgentEnv`` whose observation is a dictionary, as in gymnasium-robotics.
 
     The entries ``observation``, ``achieved_goal`` and ``desired_goal`` are what the agent's model calls so; the reward
-    is its local one, a function of the two goals, which ``compute_reward`` gives for any pair of them.
+    is its local one, which consists of the model's alone: a function of the two goals, which ``compute_reward`` gives
+    for any pair of them.
 
     Attributes:
         flat: the same environment with all entries in one array.
@@ -36,7 +38,8 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         """Make the environment; arguments are those of ``SingleAgentEnv``.
 
         Raises:
-            CirlError: if the agent's model knows no goals, they are not all observed, or the reward is not ``local``.
+            CirlError: if the agent's model knows no goals, they are not all observed, the reward is not ``local``, or
+                the local reward has a set-point or a service in it too.
         """
         self.flat = SingleAgentEnv(network, agent, **options)
         self.agent = self.flat.agent
@@ -48,6 +51,11 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         reward = options.get("reward") or self.flat.network.objective.reward
         if reward != "local":  # hindsight would learn from two rewards that disagree
             raise CirlError(f"agent '{self.agent}': a function of the goals is the reward 'local', not '{reward}'")
+        if more := list(_beside_the_goals(self.flat.network, self.agent)):
+            raise CirlError(
+                f"agent '{self.agent}' of '{self.flat.network.name}': its local reward is no function of the goals "
+                f"alone, as it also contains {' and '.join(more)}"
+            )
         self._parts = {
             part: np.array([names.index(name) for name in entries]) for part, entries in zip(PARTS, wanted, strict=True)
         }
@@ -108,3 +116,15 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
 
     def _split(self, observation: NDArray[np.float32]) -> Goals:
         return {part: observation[rows] for part, rows in self._parts.items()}
+
+
+def _beside_the_goals(network: Network, agent: str) -> Iterator[str]:
+    """Yield what the local reward of ``agent`` contains besides that of its model, and how to be rid of it."""
+    tracked = network.objective.tracked
+    if agent in tracked:
+        yield "the distance to its set-point (leave out its set_point and its place in objective.tracked)"
+    elif not tracked and network.compartments[agent].set_point is not None:
+        yield "the distance to its set-point (leave out its set_point)"
+    for service in network.services:
+        if agent in service.debtors and service.weight > 0.0:
+            yield f"the shortfall of service '{service.id}' (let another compartment owe it, or give it the weight 0)"

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cirl_marl import CirlError, load_network
+from cirl_marl import CirlError, Network, Node, Service, load_network
 from cirl_marl.compartments.robots.fetch import BIN
 from cirl_marl.controllers.scripted import fetch
 from cirl_marl.goal_env import PARTS, GoalEnv
@@ -236,6 +236,48 @@ def test_what_has_no_goals_is_refused(agent: str, options: dict[str, Any], messa
     """With the agent's name and what is wrong."""
     with pytest.raises(CirlError, match=message):
         GoalEnv("solids_net", agent, **options)
+
+
+def beside_a_depot(*, set_point: float | None = None, tracked: tuple[str, ...] = (), **service: Any) -> Network:
+    """Return the sorter's network with a depot, perhaps set-points, and a service that the sorter provides."""
+    network = load_network("solids_net", scenario="paper_fetch")
+    nodes = tuple(replace(node, set_point=set_point) for node in (*network.nodes, Node(id="depot")))
+    services = (Service(id="tidiness", provider="sorter", quantity="stock", low=0.5, **service),) if service else ()
+    return replace(network, nodes=nodes, services=services).with_options(objective={"tracked": tracked})
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        (beside_a_depot(set_point=0.0), r"set-point \(leave out its set_point\)$"),
+        (
+            beside_a_depot(set_point=0.0, tracked=("sorter",)),
+            r"\(leave out its set_point and its place in objective\.tracked\)$",
+        ),
+        (beside_a_depot(weight=1.0), r"the shortfall of service 'tidiness' \(let another compartment owe it"),
+        (beside_a_depot(set_point=0.0, weight=1.0), r"set-point \(.*\) and the shortfall of service"),
+    ],
+)
+def test_a_reward_of_more_than_the_goals_is_refused(network: Network, message: str) -> None:
+    """Hindsight would relabel with the model's part alone."""
+    with pytest.raises(CirlError, match=rf"'sorter' of 'solids_net': its local reward is no function.*{message}"):
+        GoalEnv(network, "sorter")
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        beside_a_depot(set_point=0.0, tracked=("depot",)),
+        beside_a_depot(weight=0.0),
+        beside_a_depot(weight=1.0, owed_by=("depot",)),
+    ],
+)
+def test_what_does_not_count_is_no_obstacle(network: Network) -> None:
+    """A set-point that is not tracked, a service of no weight, one that another owes: the rewards are equal."""
+    env = GoalEnv(network, "sorter")
+    env.reset(seed=0)
+    seen, reward, *_ = env.step(np.zeros(4))
+    assert reward == env.compute_reward(seen["achieved_goal"], seen["desired_goal"], {})
 
 
 def test_hindsight_runs() -> None:
