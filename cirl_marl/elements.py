@@ -281,3 +281,5 @@ REWARDS = ("local", "circularity", "mixed", "difference", "mixed_difference", "l
 OBSERVE = ("local", "neighbours", "full", "stocks", "model")
 QUANTITIES = ("stock", "outflow", "flow", "measure")
 SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})
+MAX_STEPS = 10_000
+"""Solver steps of a control interval, or control intervals of a delay, beyond which a unit is taken for a mistake."""

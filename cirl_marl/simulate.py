@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from cirl_marl.elements import Law
+from cirl_marl.elements import MAX_STEPS, Law
 from cirl_marl.errors import CirlError
 from cirl_marl.flows import FlowLaws
 from cirl_marl.inner import InnerPhysics
@@ -18,9 +18,6 @@ from cirl_marl.rowsum import RowSum, disposable
 
 MAX_TURNOVER = 1.0
 """Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
-
-MAX_SUBSTEPS = 10_000
-"""Solver steps per control interval beyond which a rate is taken for a mistake."""
 
 TRUNCATION = 1e-13
 """Bound on the first neglected term of the exact solver's series, relative to the mass in the network."""
@@ -125,10 +122,10 @@ class Dynamics(FlowLaws):
         node = int(turnover.argmax())
         rate = f"{turnover[node]:.4g}/{self.network.time_unit}"
         where = f"network '{self.network.name}': node '{self.network.nodes[node].id}' turns over {rate}"
-        if turnover[node] * episode.control_interval > MAX_SUBSTEPS * MAX_TURNOVER:
+        if turnover[node] * episode.control_interval > MAX_STEPS * MAX_TURNOVER:
             raise CirlError(
                 f"{where}; a control interval of {episode.control_interval:g} {self.network.time_unit} would need more "
-                f"than {MAX_SUBSTEPS:,} solver steps. Is a rate in the wrong unit?"
+                f"than {MAX_STEPS:,} solver steps. Is a rate in the wrong unit?"
             )
         if (
             episode.solver == "rk4"

@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from cirl_marl.elements import (
+    MAX_STEPS,
     QUANTITIES,
     Arc,
     Compartment,
@@ -193,7 +194,12 @@ def _batch_problems(where: str, arc: Arc, network: Network, nodes: Mapping[str, 
         return
     if math.isfinite(interval) and interval > 0:  # anything else is a problem of its own
         for what, time in [("delay", arc.delay), *(("batch at", time) for time in times)]:
-            if not is_whole(time / interval) or (0 < time < interval / 2):
+            if what == "delay" and time / interval > MAX_STEPS:
+                yield (
+                    f"{where}: delay {time:g} {network.time_unit} is {time / interval:.6g} control intervals of "
+                    f"{interval:g} {network.time_unit}, more than {MAX_STEPS:,}. Is it in the wrong unit?"
+                )
+            elif not is_whole(time / interval) or (0 < time < interval / 2):
                 yield f"{where}: {what} {time:g} is not a whole number of control intervals of {interval:g}"
     for what, given in (("set_point", arc.set_point), ("control of kind 'rate'", _rate_control(arc))):
         if given is not None:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from cirl_marl.elements import NET_ZERO, OBSERVE, REWARDS, SOLVERS, Compartment, Episode, Law
+from cirl_marl.elements import MAX_STEPS, NET_ZERO, OBSERVE, REWARDS, SOLVERS, Compartment, Episode, Law
 from cirl_marl.errors import unknown
 from cirl_marl.units import factor
 
@@ -41,7 +41,7 @@ def setting_problems(network: Network) -> Iterator[str]:
     if not 0 <= objective.circularity_weight <= 1:
         yield f"circularity_weight {objective.circularity_weight} must lie in [0, 1]"
     if episode.solver != "exact":
-        yield from _step_problems(episode)
+        yield from _step_problems(episode, network.time_unit)
     else:
         if episode.solver_step is not None:
             yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
@@ -82,13 +82,20 @@ def _clock_problems(network: Network, compartment: Compartment) -> Iterator[str]
         )
 
 
-def _step_problems(episode: Episode) -> Iterator[str]:
+def _step_problems(episode: Episode, unit: str) -> Iterator[str]:
     step = episode.solver_step
     if step is None or not (math.isfinite(step) and step > 0):
         yield f"solver '{episode.solver}' needs a positive solver_step, got {step}"
         return
     ratio = episode.control_interval / step
-    if math.isfinite(episode.control_interval) and (not is_whole(ratio) or round(ratio) < 1):
+    if not math.isfinite(episode.control_interval):
+        return  # a problem of its own
+    if ratio > MAX_STEPS:
+        yield (
+            f"control_interval {episode.control_interval:g} {unit} is {ratio:.6g} solver steps of {step:g} {unit}, "
+            f"more than {MAX_STEPS:,}. Is solver_step in the wrong unit?"
+        )
+    elif not is_whole(ratio) or round(ratio) < 1:
         yield (
             f"control_interval {episode.control_interval} is not a whole number of solver steps of {step} "
             f"({ratio:.6g} steps)"

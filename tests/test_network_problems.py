@@ -53,6 +53,18 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
         ({"episode": Episode(control_interval=math.nan, solver="rk4", solver_step=1.0)}, "control_interval nan"),
         ({"episode": Episode(control_interval=math.inf, solver="rk4", solver_step=1.0)}, "control_interval inf"),
         ({"episode": Episode(solver="rk4", solver_step=math.nan)}, "positive solver_step, got nan"),
+        (
+            {"episode": Episode(control_interval=0.25, solver="rk4", solver_step=0.25 / 1_728_000)},
+            r"0.25 day is 1.728e\+06 solver steps of 1.4.*e-07 day, more than 10,000. Is solver_step in the wrong unit",
+        ),
+        (
+            {"episode": Episode(control_interval=1e300, solver="euler", solver_step=1e-300)},
+            "is inf solver steps of 1e-300 day",
+        ),
+        (
+            {"arcs": (replace(DELAYED, delay=86400.0),)},
+            "delay 86400 day is 86400 control intervals.*wrong unit",
+        ),
         ({"services": (OWED, OWED)}, "service 's': the id is used twice"),
         ({"objective": Objective(tracked=("a", "a"))}, "tracked: names 'a' twice"),
         ({"nodes": (replace(A, id="Mine 1"), B), "arcs": ()}, "compartment 'Mine 1': an id begins with a letter"),
