@@ -212,7 +212,7 @@ class InnerPhysics:
             inner[self.rows[owner]] = receive(inner[self.rows[owner]], mass * self._kg)
 
     def _context(self, i: int, stock: Floats) -> dict[str, Floats]:
-        """What model i asks for: the mass that its compartment holds."""
+        """What model i asks for: the mass that its node holds or that its vehicle carries."""
         names = getattr(self._models[i], "context_names", ())
         held = self._held[i]
         return {name: stock[held] * self._kg for name in names} if held is not None else {}

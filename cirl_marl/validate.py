@@ -179,7 +179,7 @@ def _model_flow_problems(where: str, arc: Arc, everyone: Mapping[str, Compartmen
 
 def _batch_problems(where: str, arc: Arc, network: Network, nodes: Mapping[str, Node]) -> Iterator[str]:
     interval = network.episode.control_interval
-    vehicle = hasattr(arc.model, "boarding")
+    vehicle = _has_vehicle(arc)
     if vehicle == (arc.delay > 0):
         yield f"{where}: law 'batch' needs a delay or a vehicle as its model, and not both"
     if vehicle and not arc.by:
@@ -228,6 +228,10 @@ def _unit_problems(where: str, arc: Arc, mass_unit: str, donor: Node) -> Iterato
         yield f"{where}: rate: {carried_kg:g} kg a unit, but '{donor.id}' releases units of {unit_kg:g} kg"
 
 
+def _has_vehicle(arc: Arc) -> bool:
+    return arc.law is Law.BATCH and hasattr(arc.model, "boarding")
+
+
 def _rate_control(arc: Arc) -> str | None:
     return arc.control.kind if arc.control is not None and arc.control.kind is ControlKind.RATE else None
 
@@ -247,6 +251,7 @@ def _common_problems(where: str, compartment: Compartment, network: Network) -> 
             yield f"{where}: initial range [{low}, {high}] of an inner state is empty or not finite"
     control = compartment.control
     yield from _bound_problems(where, compartment)
+    yield from _context_problems(where, compartment)
     inputs = compartment.model.input_names if compartment.model is not None else ()
     if compartment.model is not None and inputs and (control is None or control.kind is not ControlKind.INPUT):
         yield (
@@ -269,6 +274,19 @@ def _common_problems(where: str, compartment: Compartment, network: Network) -> 
         )
     if control.kind is ControlKind.RATE and control.low < 0:
         yield f"{where}: control.low {control.low:g} is negative; a valve cannot reverse a flow"
+
+
+def _context_problems(where: str, compartment: Compartment) -> Iterator[str]:
+    """Yield what a compartment's model asks the network for that it is not told there."""
+    told: tuple[str, ...] = ()
+    if isinstance(compartment, Node):
+        told = ("stock_kg",)
+    elif isinstance(compartment, Arc) and _has_vehicle(compartment):
+        told = ("load_kg",)
+    for name in getattr(compartment.model, "context_names", ()):
+        if name not in told:
+            kind = getattr(compartment.model, "kind", "")
+            yield f"{where}: model '{kind}': context_names: {unknown('quantity told to this model', name, told)}"
 
 
 def _bound_problems(where: str, compartment: Compartment) -> Iterator[str]:

@@ -24,8 +24,10 @@ from cirl_marl import (
     load_network,
 )
 from cirl_marl.catalogue import folder
+from cirl_marl.compartments.delivery_truck import DeliveryTruck
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.digester_published import DigesterPublished
+from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
 from cirl_marl.definition import write_network
 
 A, B = Node(id="a", initial=(10.0, 10.0)), Node(id="b")
@@ -89,6 +91,37 @@ def test_networks_that_cannot_be_simulated(changes: dict[str, Any], said: str) -
     network = Network(name="two", nodes=(A, B), arcs=(LINK,))
     with pytest.raises(NetworkError, match=said):
         replace(network, **changes)
+
+
+TRUCK: dict[str, Any] = {
+    "model": DeliveryTruck(),
+    "inner": ((0.0, 0.0),) * 3,
+    "control": Control(kind=ControlKind.INPUT, low=-1e3, neutral=0.0, high=1e3),
+}
+AIR: dict[str, Any] = {"model": TroposphereTemperature(), "inner": ((280.0, 290.0),)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"nodes": (replace(A, **TRUCK), B)},
+            r"node 'a': model 'delivery_truck': context_names: unknown quantity .* 'load_kg'.* Known: stock_kg",
+        ),
+        (
+            {"arcs": (replace(LINK, **AIR),)},
+            r"arc 'k': model 'troposphere_temperature': context_names: unknown .* 'stock_kg'\. Known: none",
+        ),
+        ({"arcs": (replace(LINK, **TRUCK),)}, r"arc 'k': model 'delivery_truck': .* 'load_kg'\. Known: none"),
+    ],
+)
+def test_models_are_told_what_they_ask_for(changes: dict[str, Any], said: str) -> None:
+    """A node tells its stock and a vehicle's arc its load; one is never handed over for the other."""
+    episode = Episode(solver="rk4", solver_step=0.5)
+    network = Network(name="two", nodes=(A, B), arcs=(LINK,), episode=episode)
+    with pytest.raises(NetworkError, match=said):
+        replace(network, **changes)
+    assert replace(network, nodes=(replace(A, **AIR), B)).nodes[0].model == AIR["model"]
 
 
 def test_what_a_station_releases_fits_its_arcs() -> None:

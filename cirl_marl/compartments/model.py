@@ -32,8 +32,8 @@ class CompartmentModel(Protocol):
       controls are taken as they are given;
     - ``bounds``: lowest and highest value of states and inputs, by name, between which the equations hold; starts and
       controls beyond are refused;
-    - ``context_names``: keyword arguments that ``derivative`` or ``advance`` takes from the network: ``stock_kg``, what
-      the node holds, or ``load_kg``, what the vehicle of an arc carries, shape (B,) each;
+    - ``context_names``: keyword arguments that ``derivative`` or ``advance`` takes from the network, shape (B,) each:
+      on a node ``stock_kg``, what it holds; on a batch arc whose vehicle it is ``load_kg``, what that carries;
     - ``receive(state, mass_kg)``: the state after a delivery of ``mass_kg``, shape (B,);
     - ``ports``, ``released(state)``, shape (ports, B), and ``complete(state)``, shape (B,): units released into batch
       arcs in the last step, and whether that completed a batch; ``unit_kg``: the mass of one, if the model needs it;
