@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from cirl_marl.compartments import CompartmentModel, model_class
@@ -43,6 +44,9 @@ NEEDED = {
     Law.BATCH: ("rate", "batches"),
 }
 """What each law needs, one of the given."""
+
+BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+"""Kinds of the parameters that a definition can give."""
 
 
 class Converter:
@@ -195,16 +199,21 @@ class Converter:
             return {}
         try:
             kind = model_class(table.kind)
-            form = {} if table.form is None else {"form": table.form}
-            known = inspect.signature(kind).parameters
-            for name in (*table.parameters, *form):
-                if name not in known:
-                    raise CirlError(unknown("parameter", name, known))
-            for name, value in table.parameters.items():
-                _check_type(known[name], value)
+        except CirlError as error:
+            self.mistakes.append(f"{where}: {error}")
+            return {}
+        form = {} if table.form is None else {"form": table.form}
+        mistakes = list(_parameter_mistakes(kind, table.parameters, form))
+        self.mistakes += (f"{where}: {mistake}" for mistake in mistakes)
+        if mistakes:
+            return {}
+        try:
             model = kind(**table.parameters | form)
         except CirlError as error:
             self.mistakes.append(f"{where}: {error}")
+            return {}
+        except (ArithmeticError, TypeError, ValueError) as error:
+            self.mistakes.append(f"{where}: '{table.kind}' refuses its parameters: {type(error).__name__}: {error}")
             return {}
         ranged = ranged_states(model)
         for name in (*table.initial, *ranged):
@@ -251,13 +260,28 @@ class Converter:
         return self.factors[unit, kind]
 
 
-def _check_type(parameter: inspect.Parameter, value: bool | float) -> None:
-    """Raise a ``CirlError`` unless a value is of the kind of the parameter's default: a number, or true or false."""
+def _parameter_mistakes(
+    kind: type[Any], parameters: Mapping[str, bool | float], form: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield what a model does not take, what it needs besides, and numbers and truth values that are none."""
+    known = {name: each for name, each in inspect.signature(kind).parameters.items() if each.kind in BY_NAME}
+    for name in (*parameters, *form):
+        if name not in known:
+            yield unknown("parameter", name, known)
+    for name, parameter in known.items():
+        if parameter.default is parameter.empty and name not in {*parameters, *form}:
+            yield f"{name}: missing" if name == "form" else f"parameters.{name}: missing"
+        elif name in parameters:
+            yield from _type_mistakes(parameter, parameters[name])
+
+
+def _type_mistakes(parameter: inspect.Parameter, value: bool | float) -> Iterator[str]:
+    """Yield it if a value is not of a parameter's kind: true or false, or, unless another default is seen, a number."""
     default = parameter.default
-    if default is inspect.Parameter.empty:
+    if default is not parameter.empty and not isinstance(default, int | float):
+        yield f"parameters.{parameter.name}: is no number, so that a definition cannot give it"
         return
-    if not isinstance(default, int | float):
-        raise CirlError(f"parameters.{parameter.name}: is no number, so that a definition cannot give it")
-    if isinstance(default, bool) != isinstance(value, bool):
-        needs = "true or false" if isinstance(default, bool) else "a number"
-        raise CirlError(f"parameters.{parameter.name}: needs {needs}, got {value!r}")
+    truth = isinstance(default, bool) or (default is parameter.empty and parameter.annotation in (bool, "bool"))
+    if truth != isinstance(value, bool):
+        needs = "true or false" if truth else "a number"
+        yield f"parameters.{parameter.name}: needs {needs}, got {value!r}"

@@ -46,3 +46,29 @@ class Fermenter:
         """Return the biomass, shape (B,)."""
         biomass: Floats = state[0]
         return biomass
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeakyFermenter(Fermenter):
+    """A fermenter whose parameters have no default, and which refuses some of them with errors of Python's own."""
+
+    kind: ClassVar[str] = "leaky_fermenter"
+
+    leak_per_day: float
+    stirred: bool
+
+    def __post_init__(self) -> None:
+        """Refuse a leak that is none."""
+        if self.leak_per_day < 0.0:
+            raise ValueError(f"leak_per_day = {self.leak_per_day}: a leak takes away")
+
+
+class Aimless:
+    """A class with a reward and no physics."""
+
+    kind: ClassVar[str] = "aimless"
+    input_names: ClassVar[tuple[str, ...]] = ()
+
+    def reward(self, state: Floats, inputs: Floats) -> Floats:
+        """Return nothing."""
+        return np.zeros(state.shape[1])

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from own_models import Fermenter
+from own_models import Fermenter, LeakyFermenter
 
-from cirl_marl import Arc, CirlError, Control, Episode, Law, Network, Node, Role, VectorEnv, load_network
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Control,
+    DefinitionError,
+    Episode,
+    Law,
+    Network,
+    Node,
+    Role,
+    VectorEnv,
+    load_network,
+)
 from cirl_marl.comparison import compare
 from cirl_marl.compartments import kind_of, model_class
 from cirl_marl.compartments.digester import Digester
@@ -71,7 +85,12 @@ def test_kinds_of_the_library_keep_their_names() -> None:
     [
         ("own_models:Fermentor", "has no attribute 'Fermentor'"),
         ("no_such_module:Fermenter", "No module named 'no_such_module'"),
-        ("own_models:np", "is no class of compartment models"),
+        ("own_models:np", "is no class of compartment models, but <module 'numpy'"),
+        (":Fermenter", "kind ':Fermenter': write where the class is, as 'package.module:Class'"),
+        (".own_models:Fermenter", "kind '.own_models:Fermenter': write where the class is"),
+        ("own_models:", "kind 'own_models:': write where the class is"),
+        ("own_models:Aimless", "lacks state_names, time_unit, reward_state, derivative or advance$"),
+        ("cirl_marl.compartments:CompartmentModel", "lacks kind, time_unit, reward_state, derivative or advance$"),
         ("fermenter", "unknown compartment kind 'fermenter'"),
     ],
 )
@@ -79,6 +98,46 @@ def test_places_without_a_model_are_named(kind: str, said: str) -> None:
     """Module, class and what is there instead."""
     with pytest.raises(CirlError, match=said):
         model_class(kind)
+
+
+def test_modules_that_cannot_be_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fault in the user's own module is told as such."""
+    (tmp_path / "faulty_models.py").write_text("rate = 1 / 0\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(CirlError, match="'faulty_models:Mine': importing it failed: ZeroDivisionError: division by"):
+        model_class("faulty_models:Mine")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ("", ["nodes.tank.model: parameters.leak_per_day: missing", "nodes.tank.model: parameters.stirred: missing"]),
+        ("leak_per_day = true, stirred = true", ["model: parameters.leak_per_day: needs a number, got True"]),
+        ("leak_per_day = 0.1, stirred = 1", ["nodes.tank.model: parameters.stirred: needs true or false, got 1.0"]),
+        (
+            "leak_per_day = -0.1, stirred = true",
+            ["'own_models:LeakyFermenter' refuses its parameters: ValueError: leak_per_day = -0.1: a leak takes away"],
+        ),
+        (
+            "leak_per_dy = 0.1, stirred = true",
+            ["unknown parameter 'leak_per_dy'. Did you mean 'leak_per_day'?", "parameters.leak_per_day: missing"],
+        ),
+    ],
+)
+def test_parameters_of_own_models(parameters: str, said: list[str], tmp_path: Path) -> None:
+    """File and key of what is missing, of another kind, or refused by the class itself; all of it at once."""
+    path = tmp_path / "brewery.toml"
+    network = brewery()
+    tank = replace(network.nodes[0], model=LeakyFermenter(leak_per_day=0.1, stirred=True))
+    write_network(replace(network, nodes=(tank, network.nodes[1])), path)
+    assert load_network(path).nodes[0].model == tank.model
+    text = path.read_text()
+    path.write_text(re.sub(r"parameters = \{.*?\}", f"parameters = {{ {parameters} }}", text))
+    with pytest.raises(DefinitionError) as raised:
+        load_network(path)
+    assert all(line.startswith(str(path)) for line in str(raised.value).splitlines())
+    for fragment in said:
+        assert fragment in str(raised.value)
 
 
 ENDS = {"donor": "a", "recipient": "b"}

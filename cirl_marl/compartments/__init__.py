@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import pkgutil
 from functools import cache
@@ -28,6 +29,12 @@ __all__ = [
 ]
 
 ROBOTS = f"{__name__}.robots"
+
+NEEDED = ("kind", "state_names", "input_names", "time_unit", "reward_state", "reward")
+"""What the library asks of every model."""
+
+MOTIONS = ("derivative", "advance")
+"""How a model moves, at least one of them."""
 
 
 @cache
@@ -92,10 +99,25 @@ def kind_of(model: object) -> str:
 
 def _elsewhere(place: str) -> type[Any]:
     module, _, name = place.partition(":")
+    if not all(part.isidentifier() for part in (*module.split("."), name)):
+        raise CirlError(f"compartment kind '{place}': write where the class is, as 'package.module:Class'")
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise CirlError(f"compartment kind '{place}': {error}") from error
-    if not isinstance(found, type) or not hasattr(found, "reward"):
-        raise CirlError(f"compartment kind '{place}': is no class of compartment models")
+    except Exception as error:
+        raise CirlError(f"compartment kind '{place}': importing it failed: {type(error).__name__}: {error}") from error
+    if not isinstance(found, type):
+        raise CirlError(f"compartment kind '{place}': is no class of compartment models, but {found!r}")
+    lacking = _lacking(found)
+    if lacking:
+        raise CirlError(f"compartment kind '{place}': is no class of compartment models: it lacks {', '.join(lacking)}")
     return found
+
+
+def _lacking(found: type[Any]) -> list[str]:
+    """Return what every compartment model has and this class has not, neither itself nor as a field of it."""
+    fields = dataclasses.fields(found) if dataclasses.is_dataclass(found) else ()
+    offered = {*dir(found), *(field.name for field in fields)}
+    lacking = [name for name in NEEDED if name not in offered]
+    return lacking if offered & set(MOTIONS) else [*lacking, " or ".join(MOTIONS)]
