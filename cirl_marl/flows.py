@@ -71,7 +71,8 @@ class FlowLaws:
 
         Args:
             controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
-            step: index of the control interval in each environment, shape (B,); picks the value of time series.
+            step: index of the control interval in each environment, shape (B,); picks the value of time series, which
+                without it count as 1.
 
         Returns:
             r, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.

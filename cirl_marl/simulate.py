@@ -92,6 +92,7 @@ class Dynamics(FlowLaws):
         laws = {arc.law for arc in network.arcs}
         self._pulls = Law.RECIPIENT in laws
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
+        self._timed = [arc.id for arc in network.arcs if arc.times or arc.law is Law.BATCH]
         self._compile_orders()
 
     def _series_terms(self) -> int:
@@ -167,12 +168,17 @@ class Dynamics(FlowLaws):
                 batches need none.
 
         Raises:
-            CirlError: if a state is no longer a finite number, as the solver's step is too long for the physics.
+            CirlError: if ``step`` is missing though an arc needs it, or if a state is no longer a finite number, as the
+                solver's step is too long for the physics.
         """
+        if step is None and self._timed:
+            raise CirlError(
+                f"network '{self.network.name}': advance needs step, the index of the control interval of each copy: "
+                f"time series and batches depend on it, those of arc '{self._timed[0]}' for one"
+            )
         rate = realised = self.rate(controls, step)
         sent = None
-        if self.batches.lines:
-            assert step is not None
+        if self.batches.lines and step is not None:
             stock = stock.copy()
             sent = self.batches.dispatch(stock, step)
         inner = self.inner.tick(inner, controls, stock)

@@ -159,10 +159,11 @@ def _arc_problems(
         yield f"{where}: law '{arc.law}' needs a positive rate"
     if not arc.flow or any(not math.isfinite(f) or f < 0 for f in arc.flow):
         yield f"{where}: flow {arc.flow} must be finite and not negative"
-    if len(arc.times) != (len(arc.flow) if arc.times else 0):
-        yield f"{where}: series has {len(arc.times)} times and {len(arc.flow)} values"
-    if arc.times and (arc.times[0] != 0 or any(b <= a for a, b in pairwise(arc.times))):
-        yield f"{where}: series times {arc.times} must start at 0 and increase"
+    if arc.flow and len(arc.flow) != max(len(arc.times), 1):
+        one = "one for each" if arc.times else "a constant flow has one; a series needs the times at which they begin"
+        yield f"{where}: series has {len(arc.times)} times and {len(arc.flow)} values: {one}"
+    if arc.times and (arc.times[0] != 0 or not all(a < b < math.inf for a, b in pairwise(arc.times))):
+        yield f"{where}: series times {arc.times} must start at 0, increase and be finite"
     if arc.control and arc.control.kind is ControlKind.FLOW and arc.law is not Law.CONTROLLED:
         yield f"{where}: control.kind 'flow' needs law 'controlled', not '{arc.law}'"
     if arc.control and arc.control.kind is ControlKind.RATE and arc.law is Law.CONTROLLED:

@@ -33,6 +33,7 @@ from cirl_marl.definition import write_network
 A, B = Node(id="a", initial=(10.0, 10.0)), Node(id="b")
 LINK = Arc(id="k", donor="a", recipient="b", rate=0.1)
 DELAYED = Arc(id="k", donor="a", recipient="b", law=Law.BATCH, delay=1.0, batches=((0.0, 1.0),))
+FED = Arc(id="k", donor="a", recipient="b", law=Law.EXOGENOUS, flow=(1.0,))
 ORDER = Arc(id="k", donor="a", recipient="b", law=Law.CONTROLLED)
 BACKWARD = Control(kind=ControlKind.FLOW, low=-5.0, neutral=0.0, high=5.0)
 VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
@@ -67,6 +68,12 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
             {"arcs": (replace(DELAYED, delay=86400.0),)},
             "delay 86400 day is 86400 control intervals.*wrong unit",
         ),
+        ({"arcs": (replace(FED, flow=(1.0, 2.0, 3.0)),)}, "series has 0 times and 3 values: a constant flow has one"),
+        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0,)),)}, "series has 1 times and 2 values: one for each"),
+        ({"arcs": (replace(FED, flow=()),)}, r"flow \(\) must be finite"),
+        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.nan)),)}, r"times \(0.0, nan\) must start at 0"),
+        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.inf)),)}, r"times \(0.0, inf\) must .* be finite"),
+        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(math.nan, 1.0)),)}, r"times \(nan, 1.0\) must start at 0"),
         ({"services": (OWED, OWED)}, "service 's': the id is used twice"),
         ({"objective": Objective(tracked=("a", "a"))}, "tracked: names 'a' twice"),
         ({"nodes": (replace(A, id="Mine 1"), B), "arcs": ()}, "compartment 'Mine 1': an id begins with a letter"),

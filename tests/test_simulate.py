@@ -197,3 +197,21 @@ def test_network_without_controls_can_be_simulated() -> None:
     assert run.stock[-1].sum() == pytest.approx(8.0, rel=1e-12)
     with pytest.raises(CirlError, match="nothing can act"):
         parallel_env(network)
+
+
+@pytest.mark.parametrize(
+    "arc",
+    [
+        Arc(id="k", donor="a", recipient="b", law=Law.EXOGENOUS, flow=(2.0, 3.0), times=(0.0, 2.0)),
+        Arc(id="k", donor="a", recipient="b", law=Law.BATCH, batches=((0.0, 5.0),), delay=1.0),
+    ],
+)
+def test_what_depends_on_the_time_needs_it(arc: Arc) -> None:
+    """Without its interval a series would flow at 1 and a batch not at all; a constant network needs none."""
+    dynamics = Dynamics(small({"a": 10.0, "b": 0.0}, [arc]))
+    stock = dynamics.extend(np.array([[10.0], [0.0]]))
+    with pytest.raises(CirlError, match=r"'small': advance needs step, .* those of arc 'k'"):
+        dynamics.advance(stock, np.empty((0, 1)), np.empty((0, 1)))
+    dynamics.advance(stock, np.empty((0, 1)), np.empty((0, 1)), np.array([0]))
+    steady = Dynamics(small({"a": 10.0, "b": 0.0}, [Arc(id="k", donor="a", recipient="b", rate=0.1)]))
+    steady.advance(steady.extend(np.array([[10.0], [0.0]])), np.empty((0, 1)), np.empty((0, 1)))
