@@ -15,12 +15,13 @@ from cirl_marl.network import Floats, Integers, Network
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The physical state of B environments and the sums that an episode reports.
+    """The physical state of B environments, from which their observations follow, and the sums that an episode reports.
 
     Attributes:
         stock: masses of nodes, then of batch arcs, then the unit row, shape (rows, B), mass.
         inner: inner states of the compartments' models, shape (states, B).
         flow: mean flows of the last control interval, shape (arcs, B), mass/time.
+        measures: what the models measured at its end, under its controls, shape (measures, B).
         step: control intervals done, shape (B,).
         batched: m_fb, net batch mass moved finite-time sustainably in this episode, not through and through the
             environment, shape (2, B), mass.
@@ -31,6 +32,7 @@ class State:
     stock: Floats
     inner: Floats
     flow: Floats
+    measures: Floats
     step: Integers
     batched: Floats
     circularity: Floats

@@ -25,7 +25,6 @@ from cirl_marl.starts import Starts
 from cirl_marl.state import Outcome, Snapshot, State
 
 Infos = dict[str, dict[str, Any]]
-_NO_STATE = "the environment has no state yet: call reset() first"
 
 
 class VectorEnv:
@@ -101,9 +100,9 @@ class VectorEnv:
         self._starts = Starts(found, self.dynamics, num_envs, self.layout.array_order)
         self.state_names = (*self._starts.names, *self.dynamics.batches.names)
         self._batched = slice(len(found.nodes), self.dynamics.unit)
+        self._metered = self.layout.signals.measures
         self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
         self._state: State | None = None
-        self._latest = np.empty((0, num_envs), dtype=np.float32)
         _keep_freed_memory()
 
     @property
@@ -119,7 +118,7 @@ class VectorEnv:
             ControlError: before the first ``reset``.
         """
         if self._state is None:
-            raise ControlError(_NO_STATE)
+            raise ControlError("the environment has no state yet: call reset() first")
         return self._state
 
     def reset(
@@ -139,8 +138,7 @@ class VectorEnv:
         """
         self._state = self._fresh(self._starts.begin(seed, options))
         self.episodes = self.episodes + 1
-        self._latest = self._observe(self._state)
-        return self.by_agent(self._latest)
+        return self.by_agent(self._observe(self._state))
 
     def step(
         self, actions: Mapping[str, ArrayLike]
@@ -167,7 +165,7 @@ class VectorEnv:
         observation = outcome.observation
         if outcome.truncated.any():
             self._report_ends(infos, outcome)
-            observation = self._latest = self._restart(outcome.truncated)
+            observation = self._restart(outcome.truncated)
         terminated = np.zeros(self.num_envs, dtype=bool)
         terminated.flags.writeable = outcome.truncated.flags.writeable = False  # one array for all agents
         return (
@@ -207,9 +205,16 @@ class VectorEnv:
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
         self._state = State(
-            transition.stock, transition.inner, flow, step, batched, state.circularity + mean, state.service + service
+            transition.stock,
+            transition.inner,
+            flow,
+            quantities[self._metered],
+            step,
+            batched,
+            state.circularity + mean,
+            state.service + service,
         )
-        observation = self._latest = self.layout.observe(quantities, step / horizon, levels)
+        observation = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
 
@@ -231,14 +236,12 @@ class VectorEnv:
         ).T
 
     def observations(self) -> dict[str, NDArray[np.float32]]:
-        """Return the observations that the agents act on next: the arrays that the last reset, step or restore gave.
+        """Return the observations that the agents act on next, equal to what the last reset, step or restore gave.
 
         Raises:
             ControlError: before the first ``reset``.
         """
-        if self._state is None:
-            raise ControlError(_NO_STATE)
-        return self.by_agent(self._latest)
+        return self.by_agent(self._observe(self.physical))
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the state and the random streams; environments are not changed."""
@@ -254,8 +257,7 @@ class VectorEnv:
         self._starts.restore_streams(snapshot.streams)
         self._state = snapshot.state.copied()
         self.episodes = self.episodes + 1
-        self._latest = self._observe(self._state)
-        return self.by_agent(self._latest)
+        return self.by_agent(self._observe(self._state))
 
     def close(self) -> None:
         """Do nothing; the environment holds no resources."""
@@ -306,6 +308,7 @@ class VectorEnv:
             np.where(ended, fresh.stock, old.stock) if len(self.dynamics.batches) else fresh.stock,
             fresh.inner,
             np.where(ended, fresh.flow, old.flow),
+            np.where(ended, fresh.measures, old.measures),
             np.where(ended, 0, old.step),
             np.where(ended, 0.0, old.batched),
             np.where(ended, 0.0, old.circularity),
@@ -314,14 +317,15 @@ class VectorEnv:
         return self._observe(self._state)
 
     def _fresh(self, drawn: Floats) -> State:
-        """State at the start of an episode; the flows are those that neutral control would give."""
+        """State at the start of an episode; flows and measures are those that neutral control would give."""
         dynamics, batch, nodes = self.dynamics, drawn.shape[1], len(self.network.nodes)
         stock, inner = dynamics.extend(drawn[:nodes]), np.ascontiguousarray(drawn[nodes:])
         step = np.zeros(batch, dtype=np.intp)
         neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
         flow = dynamics.start_flow(stock, inner, neutral)
+        measures = dynamics.inner.measures(inner, neutral)
         zeros = np.zeros(batch)
-        return State(stock, inner, flow, step, np.zeros((2, batch)), zeros, zeros)
+        return State(stock, inner, flow, measures, step, np.zeros((2, batch)), zeros, zeros)
 
     def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
         """Return all quantities in one array, and the mean flows, which are read-only."""
@@ -338,11 +342,8 @@ class VectorEnv:
         return quantities, flow
 
     def _quantities(self, state: State) -> Floats:
-        dynamics = self.dynamics
-        neutral = np.repeat(dynamics.neutral[:, None], self.num_envs, axis=1)
-        measures = dynamics.inner.measures(state.inner, neutral)
-        nodes = state.stock[: len(self.network.nodes)]
-        return np.concatenate([nodes, state.flow, state.inner, measures, dynamics.batches.loads(state.stock)])
+        nodes, loads = state.stock[: len(self.network.nodes)], self.dynamics.batches.loads(state.stock)
+        return np.concatenate([nodes, state.flow, state.inner, state.measures, loads])
 
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)

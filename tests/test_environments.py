@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -29,6 +30,7 @@ from cirl_marl import (
 )
 from cirl_marl.controllers import Constant, Random, Scripted
 from cirl_marl.evaluate import rollout
+from cirl_marl.nested import same_or_raise
 from cirl_marl.simulate import Dynamics
 from cirl_marl.testing import check_parallel_env, check_vector_env
 
@@ -262,6 +264,25 @@ def test_results_cannot_be_written_through() -> None:
     for shared in (infos["mine"]["flows"], terminations["mine"], truncations["mine"]):
         with pytest.raises(ValueError, match="read-only"):
             shared[:] = 0
+
+
+def test_observations_belong_to_the_caller() -> None:
+    """What is written into them does not reach the environment."""
+    env, lone = vector_env("net_zero", num_envs=2, horizon=2), parallel_env("net_zero")
+    actions = {agent: np.zeros((2, *space.shape)) for agent, space in env.action_spaces.items()}
+    seen = env.reset(seed=0)
+    snapshot = env.snapshot()
+    for _ in range(3):  # over a restart
+        for given in (seen, env.observations()):
+            kept = copy.deepcopy(given)
+            for each in given.values():
+                each[:] = 99.0
+            same_or_raise(kept, env.observations(), "observations returned and asked for")
+        seen = env.step(actions)[0]
+    env.restore(snapshot)["microalgae"][:] = 99.0
+    assert (env.observations()["microalgae"] != 99.0).all()
+    lone.reset(seed=0)[0]["microalgae"][:] = 99.0
+    assert (lone.batch.observations()["microalgae"] != 99.0).all()
 
 
 def test_random_control_does_not_copy_the_start_state() -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pickle
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -14,8 +14,10 @@ from scipy.integrate import solve_ivp
 
 from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv, parallel_env
 from cirl_marl.compartments import model_class
+from cirl_marl.compartments.digester import Digester
 from cirl_marl.definition import read_network, write_network
 from cirl_marl.elements import Episode, Law, Objective, Observation
+from cirl_marl.nested import same_or_raise
 from cirl_marl.network import Floats
 from cirl_marl.single_env import SingleAgentEnv
 from cirl_marl.testing import check_parallel_env, check_vector_env
@@ -164,13 +166,45 @@ def test_environments_with_inner_physics_conform() -> None:
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (3, 3, 1))
     for action in actions:
-        batch.step({"digester": action})
+        shown = batch.step({"digester": action})[0]
         lone.step({"digester": action[2:]})
     assert np.array_equal(batch.state()[2:], lone.state())
     saved = pickle.loads(pickle.dumps(batch.snapshot()))
     first = [batch.advance(action.T).reward for action in actions]
-    batch.restore(saved)
+    same_or_raise(shown, batch.restore(saved), "observations of the snapshot and after going back")
     assert all(np.array_equal(a, batch.advance(b.T).reward) for a, b in zip(first, actions, strict=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeteredDigester(Digester):
+    """A digester that measures what flows through it, which is its input."""
+
+    measure_names: ClassVar[tuple[str, ...]] = ("dilution_per_day",)
+
+    def measures(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the input, shape (1, B)."""
+        return inputs
+
+
+def test_going_back_shows_what_was_measured() -> None:
+    """Also where that depends on the last controls, and whatever else the environment that goes back observes."""
+    network = digester_network(horizon=2)
+    digester, air = network.nodes
+    network = replace(network, nodes=(replace(digester, model=MeteredDigester()), air))
+    env, wide = VectorEnv(network, num_envs=2), VectorEnv(network, num_envs=2, observe="full")
+    place = env.observation_names["digester"].index("digester.dilution_per_day")
+    shown, expected = env.reset(seed=0), wide.reset(seed=0)
+    for action, dilution in ((1.0, 0.7), (-0.5, 0.4), (0.5, 0.6), (0.0, 0.5)):
+        snapshot = env.snapshot()
+        actions = {"digester": np.full((2, 1), action)}
+        env.step(actions)
+        same_or_raise(shown, env.restore(snapshot), "observations of the snapshot and after going back")
+        same_or_raise(shown, env.observations(), "observations after going back and asked for")
+        same_or_raise(expected, wide.restore(snapshot), "observations of the snapshot and after going back")
+        outcome = env.advance(env.stack(actions))
+        np.testing.assert_allclose(outcome.observation[place], dilution, rtol=1e-6)
+        env.restore(snapshot)
+        shown, expected = env.step(actions)[0], wide.step(actions)[0]
 
 
 def test_definition_with_a_model_reads_back(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from cirl_marl import Law, Network, SingleAgentEnv, VectorEnv, load_network, networks, parallel_env
 from cirl_marl.elements import REWARDS
+from cirl_marl.nested import same_or_raise
 from cirl_marl.testing import check_parallel_env, check_vector_env
 
 EPS = float(np.finfo(float).eps)
@@ -202,9 +203,9 @@ def test_snapshot_replays(network: Network, seed: int) -> None:
     """From a snapshot in mid-episode, also a pickled one, all comes again, restarts included."""
     env = VectorEnv(network, num_envs=2)
     rng = np.random.default_rng(seed)
-    env.reset(seed)
+    shown = env.reset(seed)
     for _ in range(network.episode.horizon // 2):
-        env.step(draw(env, rng))
+        shown = env.step(draw(env, rng))[0]
     snapshot = env.snapshot()
     before = env.state().copy()
     stored = pickle.dumps(snapshot)
@@ -212,7 +213,7 @@ def test_snapshot_replays(network: Network, seed: int) -> None:
     first = [(*env.step(a)[:2], env.state().copy()) for a in actions]
     fresh = VectorEnv(network, num_envs=2)
     for other, source in ((env, snapshot), (fresh, pickle.loads(stored))):
-        other.restore(source)
+        same_or_raise(shown, other.restore(source), "observations of the snapshot and after going back")
         np.testing.assert_array_equal(other.state(), before)
         for a, (observations, rewards, state) in zip(actions, first, strict=True):
             seen, earned = other.step(a)[:2]
