@@ -12,8 +12,8 @@ from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.flows import FlowLaws
 from cirl_marl.network import Floats, Integers, Network
 
-ROUNDING = 1e-6
-"""By which an action may exceed a bound: wrappers that rescale actions do so in single precision."""
+BOUND = 1.0 + 1e-6
+"""Largest action taken: wrappers that rescale actions do so in single precision and may land a rounding beyond 1."""
 
 
 class Actuators:
@@ -85,7 +85,7 @@ class Actuators:
         Raises:
             ControlError: for NaN or values outside [−1, 1].
         """
-        if not (actions.max(initial=0.0) <= 1.0 + ROUNDING and actions.min(initial=0.0) >= -1.0 - ROUNDING):
+        if not (actions.max(initial=0.0) <= BOUND and actions.min(initial=0.0) >= -BOUND):
             raise ControlError(self._wrong_values(actions))
         acting = actions * self._half
         acting += self._middle
@@ -103,7 +103,7 @@ class Actuators:
         return f"actions are missing for {[agent for agent in self.agents if agent not in actions]}"
 
     def _wrong_values(self, actions: Floats) -> str:
-        wrong = ~((actions >= -1.0) & (actions <= 1.0))
+        wrong = ~((actions >= -BOUND) & (actions <= BOUND))  # NaN too
         entry, copy_ = np.argwhere(wrong)[0]
         agent = next(agent for agent, entries in self.entries.items() if entries.start <= entry < entries.stop)
         return f"action of agent '{agent}' in copy {copy_} is {actions[entry, copy_]}; it must be a number in [-1, 1]"

@@ -31,6 +31,7 @@ AGENTS = ("mine", "use_to_collection")
         ({"mine": [np.nan], "use_to_collection": [0.0]}, "'mine'.* is nan"),
         ({"mine": [0.0], "use_to_collection": [np.inf]}, "'use_to_collection'.* is inf"),
         ({"mine": [0.0], "use_to_collection": [1.5]}, r"'use_to_collection'.* is 1.5.*\[-1, 1\]"),
+        ({"mine": [1.0000005], "use_to_collection": [np.nan]}, "'use_to_collection'.* is nan"),
         ({"mine": [0.0, 0.0], "use_to_collection": [0.0]}, "'mine' has shape"),
         ({"mine": 0.0, "use_to_collection": [0.0]}, "'mine' has shape"),
         ({"mine": [0.0]}, "missing for .*'use_to_collection'"),
