@@ -194,8 +194,8 @@ class Service:
     Attributes:
         id: name of the service.
         provider: compartment at which it is measured.
-        quantity: ``stock`` (of a node, or on the way along a batch arc), ``outflow`` of a node (sum of its outflows),
-            ``flow`` of an arc, or ``measure``, one that the provider's model offers.
+        quantity: ``stock`` (of a node, or on the way along a batch arc), ``outflow`` of a node (sum of its outflows,
+            none of them in batches), ``flow`` of an arc, or ``measure``, one that the provider's model offers.
         measure: its name, for ``quantity = "measure"``.
         low: lower end of the band, mass, mass/time or the unit of the measure.
         high: upper end of the band.

@@ -88,6 +88,7 @@ def problems(network: Network) -> Iterator[str]:
     providers = _providers(network)
     for service in network.services:
         yield from _service_problems(service, everyone, providers)
+        yield from _outflow_problems(service, network.arcs)
     yield from setting_problems(network)
     acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.acting:
@@ -331,3 +332,13 @@ def _service_problems(
         yield f"{where}: the band from 0 without an upper end asks for nothing"
     if not math.isfinite(service.weight) or service.weight < 0:
         yield f"{where}: weight {service.weight} must be finite and not negative"
+
+
+def _outflow_problems(service: Service, arcs: tuple[Arc, ...]) -> Iterator[str]:
+    """Yield batches among the outflows that a service adds up: they count on arrival, not when they leave."""
+    batches = [arc.id for arc in arcs if arc.law is Law.BATCH and arc.donor == service.provider]
+    if service.quantity == "outflow" and batches:
+        yield (
+            f"service '{service.id}': quantity 'outflow': '{service.provider}' gives batches to {', '.join(batches)}, "
+            "which count on arrival; ask for the 'flow' of that arc (what arrives) or its 'stock' (what is on the way)"
+        )

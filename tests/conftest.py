@@ -95,6 +95,7 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
     interval = float(rng.uniform(0.05, 3))
     orders = np.bincount([i for (i, _), law in zip(ends, laws, strict=True) if law is Law.CONTROLLED], minlength=nodes)
     sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) for i in range(nodes)]
+    batched = {f"node_{i}" for (i, _), law in zip(ends, laws, strict=True) if law is Law.BATCH}
     network = Network(
         name="random",
         nodes=tuple(_node(rng, i, sets_flow[i]) for i in range(nodes)),
@@ -102,7 +103,7 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
             _arc(rng, k, int(i), int(j), law, sets_flow[int(i)], interval)
             for k, ((i, j), law) in enumerate(zip(ends, laws, strict=True))
         ),
-        services=tuple(_services(rng, nodes, len(ends))),
+        services=tuple(_services(rng, nodes, len(ends), batched)),
         episode=Episode(control_interval=interval, horizon=int(rng.integers(1, 5))),
         objective=Objective(
             reference_interval=float(rng.uniform(0.1, 3)),
@@ -176,11 +177,14 @@ def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_
     )
 
 
-def _services(rng: np.random.Generator, nodes: int, arcs: int) -> list[Service]:
+def _services(rng: np.random.Generator, nodes: int, arcs: int, batched: set[str]) -> list[Service]:
+    """Draw services; of a node in ``batched`` the stock, as batches are no outflow."""
     services = []
     for s in range(rng.integers(0, 3)):
         quantity = str(rng.choice(["stock", "outflow", "flow"] if arcs else ["stock", "outflow"]))
         provider = f"arc_{rng.integers(arcs)}" if quantity == "flow" else f"node_{rng.integers(nodes)}"
+        if quantity == "outflow" and provider in batched:
+            quantity = "stock"
         low = float(rng.uniform(0.1, 200))
         high = low * float(rng.uniform(1, 3)) if rng.integers(2) else np.inf
         services.append(

@@ -75,6 +75,10 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
         ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.inf)),)}, r"times \(0.0, inf\) must .* be finite"),
         ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(math.nan, 1.0)),)}, r"times \(nan, 1.0\) must start at 0"),
         ({"services": (OWED, OWED)}, "service 's': the id is used twice"),
+        (
+            {"arcs": (DELAYED,), "services": (replace(OWED, provider="a", quantity="outflow"),)},
+            "service 's': quantity 'outflow': 'a' gives batches to k, which count on arrival; ask for the 'flow'",
+        ),
         ({"objective": Objective(tracked=("a", "a"))}, "tracked: names 'a' twice"),
         ({"nodes": (replace(A, id="Mine 1"), B), "arcs": ()}, "compartment 'Mine 1': an id begins with a letter"),
         ({"nodes": (replace(A, **DIGESTER), B)}, "'digester' needs a control of kind 'input' for dilution_per_day"),
