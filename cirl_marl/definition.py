@@ -82,14 +82,23 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``base`` with the tables of ``override`` laid over it; a quantity is replaced whole."""
+    """Return ``base`` with the tables of ``override`` laid over it, key by key, where they do not take its place."""
     merged = {key: value for key, value in base.items() if key != "scenarios"}
     for key, value in override.items():
         old = merged.get(key)
-        whole = isinstance(old, Mapping) and isinstance(old.get("source"), str)
-        nested = isinstance(value, Mapping) and isinstance(old, Mapping) and not whole
-        merged[key] = _merge(old, value) if nested and isinstance(old, Mapping) else value
+        if isinstance(old, Mapping) and isinstance(value, Mapping) and not _takes_its_place(value, old):
+            merged[key] = _merge(old, value)
+        else:
+            merged[key] = value
     return merged
+
+
+def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
+    """Whether a scenario's table replaces the old one whole: a quantity, or a model or control of another kind."""
+    kind = old.get("kind")
+    if isinstance(kind, str):
+        return bool(new.get("kind", kind) != kind)
+    return isinstance(old.get("source"), str)
 
 
 def _without(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
