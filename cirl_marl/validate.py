@@ -182,7 +182,7 @@ def _model_flow_problems(where: str, arc: Arc, everyone: Mapping[str, Compartmen
 def _batch_problems(where: str, arc: Arc, network: Network, nodes: Mapping[str, Node]) -> Iterator[str]:
     interval = network.episode.control_interval
     vehicle = _has_vehicle(arc)
-    if vehicle == (arc.delay > 0):
+    if vehicle == (arc.delay != 0):
         yield f"{where}: law 'batch' needs a delay or a vehicle as its model, and not both"
     if vehicle and not arc.by:
         yield f"{where}: a vehicle carries what a compartment releases: it needs 'by', not a schedule"
@@ -196,7 +196,9 @@ def _batch_problems(where: str, arc: Arc, network: Network, nodes: Mapping[str, 
         return
     if math.isfinite(interval) and interval > 0:  # anything else is a problem of its own
         for what, time in [("delay", arc.delay), *(("batch at", time) for time in times)]:
-            if what == "delay" and time / interval > MAX_STEPS:
+            if time < 0:
+                yield f"{where}: {what} {time:g} must not be negative"
+            elif what == "delay" and time / interval > MAX_STEPS:
                 yield (
                     f"{where}: delay {time:g} {network.time_unit} is {time / interval:.6g} control intervals of "
                     f"{interval:g} {network.time_unit}, more than {MAX_STEPS:,}. Is it in the wrong unit?"

@@ -266,6 +266,7 @@ def faulty(**changes: object) -> Network:
     ("changes", "message"),
     [
         ({"delay": 0.0}, "needs a delay or a vehicle"),
+        ({"delay": -0.04}, "arc 'recycling': delay -0.04 must not be negative"),
         ({"delay": 0.05}, "delay 0.05 is not a whole number of control intervals of 0.04"),
         ({"port": "sortd"}, "unknown port 'sortd'. Did you mean 'sorted'"),
         ({"by": "reservoir"}, "batches are released by the model of the donor 'sorter'"),
@@ -278,6 +279,14 @@ def test_faults_are_named(changes: dict[str, object], message: str) -> None:
     """What cannot be simulated is refused, with the reason."""
     with pytest.raises(NetworkError, match=message):
         faulty(**changes)
+
+
+@pytest.mark.parametrize("delay", [-0.04, -0.02])
+def test_a_vehicle_takes_no_delay_below_zero(delay: float) -> None:
+    """It would be a line of less than no slots."""
+    good = network()
+    with pytest.raises(NetworkError, match=rf"(?s)a delay or a vehicle.*delay {delay} must not be negative"):
+        replace(good, arcs=(*good.arcs[:2], replace(good.arcs[2], delay=delay)))
 
 
 def test_the_clock_of_a_model_is_that_of_the_network() -> None:
