@@ -24,17 +24,20 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from cirl_marl.errors import CirlError
+from cirl_marl.paper.document import markdown
 from cirl_marl.paper.plan import planned, study
 from cirl_marl.paper.published import environment_of
 from cirl_marl.paper.results import Results, Row
 from cirl_marl.paper.session import live_bar
-from cirl_marl.paper.table import markdown, result_line
+from cirl_marl.paper.table import result_line
 from cirl_marl.paper.training import outdated
 
 console = Console(width=None if sys.stdout.isatty() else 140)
 processes = get_context("spawn")
 PHASES = ("waiting", "training", "evaluating")
 KEPT = Path(__file__).parent / "results" / "paper"
+COMMENT = "comment.md"
+"""In OUT: what somebody has to say about the results there; it goes into the document."""
 DOCUMENT = Path(__file__).parent.parent / "docs" / "paper_tables.md"
 
 
@@ -76,7 +79,9 @@ def main(
     part = only or steps or seeds or episodes or recipe or out.resolve() != KEPT.resolve()
     path = write or (out / DOCUMENT.name if part else DOCUMENT)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(markdown(results.all()), encoding="utf-8")
+    comment = out / COMMENT
+    text = markdown(results.all(), comment.read_text(encoding="utf-8") if comment.is_file() else "")
+    path.write_text(text, encoding="utf-8")
     console.print(f"tables: {path}", soft_wrap=True)
     if failed:
         raise typer.Exit(1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +33,7 @@ def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pyt
 
 def test_a_trial_writes_a_document_of_its_own(tmp_path: Path) -> None:
     """Fewer recipes, seeds or steps than the study has change nothing that is published."""
-    published = {path: path.read_bytes() for path in (ROOT / "docs" / "study.md", *study.RESULTS.rglob("*.json"))}
+    published = {path: path.read_bytes() for path in (ROOT / "docs" / "study.md", *study.(ROOT / "benchmarks" / "results").rglob("*.json"))}
     study.main(out=tmp_path, only=["net_zero"], recipes=["shared_ppo"], seeds=1, steps=320, episodes=2, jobs=1)
     assert all(path.read_bytes() == text for path, text in published.items())
     assert "| shared_ppo |" in (tmp_path / "trial" / "study.md").read_text()
@@ -58,3 +60,12 @@ def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
     paper.main(out=tmp_path / "new", only=["CopperNet"], table=True)
     assert (tmp_path / "new" / "paper_tables.md").is_file()
     assert paper.DOCUMENT.read_bytes() == published
+
+
+def test_kept_results_name_no_machine() -> None:
+    """Directories in results are relative to the project, wherever they were made."""
+    kept = [path for path in (ROOT / "benchmarks" / "results").rglob("*") if path.suffix in (".json", ".csv", ".md")]
+    assert len(kept) > 100
+    absolute = re.compile(r"""(?<![^\s"',=])/\w[\w.-]*/""")
+    assert [path.name for path in kept if absolute.search(path.read_text(encoding="utf-8"))] == []
+    assert absolute.search('"/home/somebody/runs"')

@@ -21,10 +21,11 @@ from cirl_marl.errors import RunError
 from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.learners.algorithms import algorithm_class
 from cirl_marl.paper import published, session, training, tuned
+from cirl_marl.paper.document import markdown
 from cirl_marl.paper.plan import planned, study
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
 from cirl_marl.paper.results import Evaluation, Result, Results, Row, thinned
-from cirl_marl.paper.table import markdown, table_rows
+from cirl_marl.paper.table import table_rows
 from cirl_marl.paper.training import Trained, described, evaluate, outdated, run_row
 from cirl_marl.paper.tuned import train_tuned
 
@@ -273,7 +274,37 @@ def test_table_shows_both_and_what_was_not_run() -> None:
     assert "| TQC-HER | paper |  |  | -11.45 |" in text
     assert "Optimum: -4.60e7" in text
     assert "torch 2.13.0" in text
-    assert markdown([]).count("not run") == sum(len(found.runs) for found in ENVIRONMENTS.values()) + len(ENVIRONMENTS)
+    assert markdown([]).count("not run") == sum(len(found.runs) for found in ENVIRONMENTS.values()) + 2 * len(
+        ENVIRONMENTS
+    )
+
+
+def test_summary_says_what_was_reached() -> None:
+    """Means over the seeds of a tuned recipe are held against the paper's best and against the goal."""
+
+    def line(name: str, algorithm: str, end: float, final: list[float], success: float | None = None) -> list[str]:
+        environment = ENVIRONMENTS[name]
+        made = result(algorithm)
+        runs = [
+            replace(
+                made,
+                row=Row(environment=name, algorithm=algorithm, recipe="tuned", steps=environment.steps, seed=seed),
+                end_return=end,
+                evaluation=Evaluation(episodes=100, mean=mean, deviation=0.1, success=success),
+            )
+            for seed, mean in enumerate(final)
+        ]
+        found = next(found for found in markdown(runs).splitlines() if found.startswith(f"| {name} |"))
+        return [cell.strip() for cell in found.split("|")[1:-1]]
+
+    near = line("CarboNet", "PPO", -1e6, [-1.10e5, -1.12e5])
+    assert near[1:4] == ["-2.04e6 (ARS)", "-1.00e6 ± 0.00e6", "yes"]
+    assert near[5:] == ["-1.07e5", "≥ -1.13e5 (5 % of the optimum)", "yes"]
+    assert line("CarboNet", "PPO", -3e6, [-1.10e5, -1.20e5])[3::4] == ["no", "no"]
+    assert line("Reacher", "SAC", -5.0, [-4.0], 94.0)[-1] == "no"
+    assert line("Reacher", "SAC", -5.0, [-4.0], 95.0)[4:] == ["-4, s 95 %", "not known", "s ≥ 95 %", "yes"]
+    assert line("CO2MicroalgaeDroop", "PPO", 480.0, [450.0])[-2:] == ["", ""]
+    assert markdown([], "## Mine\n").index("## Mine") < markdown([], "## Mine\n").index("## Reacher")
 
 
 def test_published_table_is_whole() -> None:

@@ -1,4 +1,4 @@
-"""The paper's figures and ours side by side: for the terminal, and as Markdown for ``docs/paper_tables.md``."""
+"""The paper's figures and ours side by side, a table for each environment."""
 
 from __future__ import annotations
 
@@ -8,29 +8,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 from rich.table import Table
 
-from cirl_marl.paper.published import ENVIRONMENTS, HARDWARE, SOURCE, PaperEnvironment, Published
+from cirl_marl.paper.published import PaperEnvironment, Published
 from cirl_marl.paper.results import WINDOW, Result
 
 COLUMNS = ("algorithm", "run", "seeds", "r_s", "r_e", "ζ", "ψ", "s (%)", "final policy", "minutes", "CPU min", "remark")
 NUMERIC = COLUMNS[3:11]
 NOT_RUN = "not run"
-INTRODUCTION = f"""# The paper's tables, repeated
-
-Published figures: {SOURCE}. Written by `python benchmarks/paper.py --table`, from the rows in
-`benchmarks/results/paper`.
-
-- **paper**: what it reports. **ours**: the same run here, `A("MlpPolicy", gymnasium.make(id))` with the library's
-  default hyperparameters (goal tasks: `MultiInputPolicy`, `HerReplayBuffer`). **tuned**: our recipe
-  `agents/paper_….toml`, with as many environment steps.
-- r_s, r_e: mean return of the first and the last {WINDOW} training episodes, at most half of them each,
-  exploration included; ζ = r_e − r_s; ψ = ζ / steps.
-- s: share of evaluation episodes with a success at any step, deterministic policy.
-- final policy: mean return of the trained policy, deterministic, on fresh episodes that no training saw.
-- Several seeds: mean ± standard deviation over them. Minutes: training alone, on the machine named below; the paper's
-  on a {HARDWARE}. CPU min: processor time, which other work on the machine does not lengthen.
-- Time limits are truncations here. The published CarboNet and CopperNet end their episodes otherwise
-  ([networks.md](networks.md)), which shifts saturated returns by some percent.
-"""
 
 
 def result_line(result: Result) -> str:
@@ -48,24 +31,12 @@ def result_line(result: Result) -> str:
 
 def environment_table(environment: PaperEnvironment, results: Sequence[Result]) -> Table:
     """Return the table of one environment for the terminal."""
-    table = Table(title=f"{environment.name}, {environment.steps:,} steps", caption=_notes(environment, results))
+    table = Table(title=f"{environment.name}, {environment.steps:,} steps", caption=notes(environment, results))
     for column in COLUMNS:
         table.add_column(column, justify="right" if column in NUMERIC else "left")
     for row in table_rows(environment, results):
         table.add_row(*row, end_section=row[1] == "ours")
     return table
-
-
-def markdown(results: Sequence[Result]) -> str:
-    """Return the document: one table an environment, what was not run, versions and machine."""
-    parts = [INTRODUCTION]
-    for environment in ENVIRONMENTS.values():
-        lines = [f"## {environment.name} ({environment.steps:,} steps)", ""]
-        lines += ["| " + " | ".join(COLUMNS) + " |", "|" + "|".join("-" for _ in COLUMNS) + "|"]
-        lines += ["| " + " | ".join(row) + " |" for row in table_rows(environment, results)]
-        parts.append("\n".join(lines) + "\n\n" + _notes(environment, results) + "\n")
-    parts.append(_provenance(results))
-    return "\n".join(parts)
 
 
 def table_rows(environment: PaperEnvironment, results: Iterable[Result]) -> list[tuple[str, ...]]:
@@ -180,30 +151,23 @@ def _broke(result: Result) -> str:
     return f"weights NaN after {result.steps_done:,} of {result.row.steps:,} steps"
 
 
-def _notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
-    """Say how many episodes the final policies played, what is the best possible, and what differs."""
+def notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
+    """Say what final policies played and how much episodes vary, what is the best possible, and what differs."""
     best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
-    ours = (result.evaluation for result in results if result.row.environment == environment.name)
-    own = [evaluation.episodes for evaluation in ours if evaluation is not None]
-    played = f"Final policy: {' or '.join(_distinct(own))} episodes a seed. " if own else ""
+    own = [
+        (result.row.recipe, result.evaluation)
+        for result in results
+        if result.row.environment == environment.name and result.evaluation is not None
+    ]
+    played = ""
+    if own:
+        episodes = " or ".join(distinct(evaluation.episodes for _, evaluation in own))
+        spread = [evaluation.deviation for recipe, evaluation in own if recipe == "tuned"]
+        varied = f"; those of tuned ones vary by sd {number(float(np.mean(spread)))} an episode" if spread else ""
+        played = f"Final policy: {episodes} episodes a seed{varied}. "
     return f"{played}Optimum: {best}. {environment.remark}".rstrip()
 
 
-def _provenance(results: Sequence[Result]) -> str:
-    """Name what our figures were made with; a version that changed between rows is listed with all its values."""
-    if not results:
-        return "## Made with\n\nNothing has been run yet.\n"
-    names = list(dict.fromkeys(name for result in results for name in result.versions))
-    versions = [f"{name} {' and '.join(_distinct(r.versions.get(name, 'none') for r in results))}" for name in names]
-    cpus = ", ".join(_distinct(result.machine["cpus"] for result in results))
-    threads = ", ".join(_distinct(result.machine["torch_threads"] for result in results))
-    hours = sum(result.seconds for result in results) / 3600
-    days = sorted(result.finished[:10] for result in results)
-    return (
-        f"## Made with\n\n{len(results)} rows, {hours:.1f} hours of training on {cpus} CPUs "
-        f"({threads} torch thread each, no GPU), {days[0]} to {days[-1]}.\n\n{', '.join(versions)}.\n"
-    )
-
-
-def _distinct(values: Iterable[object]) -> list[str]:
+def distinct(values: Iterable[object]) -> list[str]:
+    """Return what there is among ``values``, in order."""
     return sorted({str(value) for value in values})
