@@ -155,6 +155,7 @@ def test_what_a_station_releases_fits_its_arcs() -> None:
         ("digester_published", "process = 1.0", "parameters.process: is no number"),
         ("digester", "k1 = true", "parameters.k1: needs a number, got True"),
         ("digester", "k7 = 1.0", "'k7'"),
+        ("delivery_truck", "load_kg = 210.0", "load_kg = 210.0, but the network knows what is aboard: leave it out"),
     ],
 )
 def test_parameters_of_models_are_of_their_kind(kind: str, given: str, said: str, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ class DeliveryTruck(TransportTruck):
     Source: the paper's truck and reward (arXiv 2505.21536); the trips are ours, the paper has one trip that never ends.
 
     Attributes:
-        load_kg: no effect here, the network knows the load.
+        load_kg: 0 and nothing else, the network knows the load.
         target_m: length of the road. [chosen: scaled to the robot's clock; the paper's is 1000 m]
         force_weight: weight of F² in the reward, m²/N². [chosen: 10 kN for a second weigh as much as 10 m]
         reach_m: distance at which the truck is there. [chosen]
@@ -47,6 +47,11 @@ class DeliveryTruck(TransportTruck):
         """Refuse what has no meaning."""
         TransportTruck.__post_init__(self)
         check_positive(self.kind, target_m=self.target_m, reach_m=self.reach_m, rest_m_s=self.rest_m_s)
+        if self.load_kg != 0.0:
+            raise CirlError(
+                f"{self.kind}: load_kg = {self.load_kg!r}, but the network knows what is aboard: leave it out, and let "
+                "batches bring the load."
+            )
         if 2.0 * self.reach_m >= self.target_m:
             raise CirlError(
                 f"{self.kind}: reach_m = {self.reach_m!r}, but on a road of {self.target_m!r} m it must be below half."
