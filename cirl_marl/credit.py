@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 from cirl_marl.reward import Scoring
 from cirl_marl.simulate import Dynamics, Transition
@@ -66,6 +67,9 @@ class Credit:
             levels: of the services, shape (services, B).
             state: at the start of the interval.
             controls: during it, shape (controls, B).
+
+        Raises:
+            CirlError: if the solver cannot follow what would have been, had an agent been neutral; names the agent.
         """
         if self.mode == "local":
             return local.copy()
@@ -87,24 +91,39 @@ class Credit:
 
     def _counterfactuals(self, state: State, controls: Floats) -> Floats:
         """λ had each agent in turn been neutral, re-simulated from the same state, shape (agents, B)."""
-        dynamics, batch = self._dynamics, controls.shape[1]
         chunk = max(1, CELLS // max(state.stock.size + state.inner.size, state.flow.size))
-        results = []
-        for start in range(0, len(self._agents), chunk):
-            agents = self._agents[start : start + chunk]
-            count = len(agents)
-            imagined = np.tile(controls, (1, count))
-            for i, agent in enumerate(agents):
-                rows = dynamics.network.control_rows[agent]
-                imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows, None]
-            transition = dynamics.advance(
-                np.tile(state.stock, (1, count)),
-                np.tile(state.inner, (1, count)),
-                imagined,
-                np.tile(state.step, count),
-            )
-            imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
-            flow = transition.moved / dynamics.network.episode.control_interval
-            end, mean, _ = self.circularity(imagined_state, transition, flow)
-            results.append((end if self._measure == "end" else mean).reshape(count, batch))
-        return np.concatenate(results) if results else np.empty((0, batch))
+        starts = range(0, len(self._agents), chunk)
+        results = [self._with_neutral(self._agents[start : start + chunk], state, controls) for start in starts]
+        return np.concatenate(results) if results else np.empty((0, controls.shape[1]))
+
+    def _with_neutral(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
+        """λ had each of ``agents`` in turn been neutral, all in one batch, shape (agents, B).
+
+        Raises:
+            CirlError: if a re-simulated state is no longer a finite number; names the agent.
+        """
+        try:
+            return self._imagined(agents, state, controls)
+        except CirlError as error:
+            if len(agents) == 1:
+                raise CirlError(
+                    f"with agent '{agents[0]}' neutral, as difference rewards imagine it: {error}"
+                ) from error
+        return np.concatenate([self._with_neutral([agent], state, controls) for agent in agents])
+
+    def _imagined(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
+        dynamics, count, batch = self._dynamics, len(agents), controls.shape[1]
+        imagined = np.tile(controls, (1, count))
+        for i, agent in enumerate(agents):
+            rows = dynamics.network.control_rows[agent]
+            imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows, None]
+        transition = dynamics.advance(
+            np.tile(state.stock, (1, count)),
+            np.tile(state.inner, (1, count)),
+            imagined,
+            np.tile(state.step, count),
+        )
+        imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
+        flow = transition.moved / dynamics.network.episode.control_interval
+        end, mean, _ = self.circularity(imagined_state, transition, flow)
+        return (end if self._measure == "end" else mean).reshape(count, batch)

@@ -189,6 +189,7 @@ class VectorEnv:
 
         Raises:
             ControlError: for NaN, values outside [−1, 1], or an episode that is over.
+            CirlError: if the solver cannot follow the physics, which leaves the environment as it was.
         """
         state, dynamics = self.physical, self.dynamics
         horizon = self.network.episode.horizon

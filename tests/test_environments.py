@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cirl_marl import (
     Arc,
+    CirlError,
     Control,
     ControlError,
     ControlKind,
@@ -29,6 +30,7 @@ from cirl_marl import (
     vector_env,
 )
 from cirl_marl.controllers import Constant, Random, Scripted
+from cirl_marl.elements import Episode
 from cirl_marl.evaluate import rollout
 from cirl_marl.nested import same_or_raise
 from cirl_marl.simulate import Dynamics
@@ -253,6 +255,29 @@ def test_zero_throughput_is_not_best() -> None:
         usual = rollout(env, Scripted(), seed=0)
         assert (stopped.returns.sum(axis=0) < usual.returns.sum(axis=0)).all(), name
         assert (stopped.episode_service < usual.episode_service).all(), name
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value encountered")
+def test_what_cannot_be_imagined_names_its_agent() -> None:
+    """Difference rewards simulate each agent neutral; where that fails, the copy is one of the environment's own."""
+    still = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=1.0)
+    network = Network(
+        name="brink",
+        nodes=(Node(id="a", initial=(1.0, 1.0)), Node(id="b", initial=(1.0, 1.0)), Node(id="c")),
+        arcs=(
+            Arc(id="slow", donor="a", recipient="c", rate=0.01, control=still),
+            Arc(id="fast", donor="b", recipient="c", rate=1e3, control=still),
+        ),
+        episode=Episode(control_interval=300.0, horizon=3, solver="euler", solver_step=1.0),
+    )
+    env = VectorEnv(network, num_envs=2, reward="difference")
+    env.reset(options={"initial_state": {"b": np.array([0.0, 1.0])}})
+    before = env.state()
+    with pytest.raises(CirlError, match=r"^with agent 'fast' neutral.*: network 'brink': stock of node 'b' in copy 1"):
+        env.step({agent: np.full((2, 1), -1.0) for agent in env.agents})
+    np.testing.assert_array_equal(env.state(), before)
+    with pytest.raises(CirlError, match=r"^network 'brink': stock of node 'b' in copy 1"):
+        env.step({agent: np.full((2, 1), 1.0) for agent in env.agents})
 
 
 def test_results_cannot_be_written_through() -> None:
