@@ -33,7 +33,7 @@ def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pyt
 
 def test_a_trial_writes_a_document_of_its_own(tmp_path: Path) -> None:
     """Fewer recipes, seeds or steps than the study has change nothing that is published."""
-    published = {path: path.read_bytes() for path in (ROOT / "docs" / "study.md", *study.(ROOT / "benchmarks" / "results").rglob("*.json"))}
+    published = {path: path.read_bytes() for path in (ROOT / "docs" / "study.md", *study.RESULTS.rglob("*.json"))}
     study.main(out=tmp_path, only=["net_zero"], recipes=["shared_ppo"], seeds=1, steps=320, episodes=2, jobs=1)
     assert all(path.read_bytes() == text for path, text in published.items())
     assert "| shared_ppo |" in (tmp_path / "trial" / "study.md").read_text()
@@ -64,7 +64,7 @@ def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
 
 def test_kept_results_name_no_machine() -> None:
     """Directories in results are relative to the project, wherever they were made."""
-    kept = [path for path in (ROOT / "benchmarks" / "results").rglob("*") if path.suffix in (".json", ".csv", ".md")]
+    kept = [path for path in study.RESULTS.parent.rglob("*") if path.suffix in (".json", ".csv", ".md")]
     assert len(kept) > 100
     absolute = re.compile(r"""(?<![^\s"',=])/\w[\w.-]*/""")
     assert [path.name for path in kept if absolute.search(path.read_text(encoding="utf-8"))] == []
