@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from paper_classes import PAPER
 from scipy.integrate import solve_ivp
 
+from cirl_marl import VectorEnv
 from cirl_marl.compartments import models
 from cirl_marl.compartments.atmosphere import Atmosphere
 from cirl_marl.compartments.delivery_truck import DeliveryTruck
@@ -130,6 +131,21 @@ def check_atmosphere() -> None:
     assert found[0, -1] == pytest.approx(14.0)
     assert box.concentration_mmol_l(found)[0] == pytest.approx(3.5)
     assert box.reward(found, np.array([[3.0], [1.0]]))[0] == -2.0
+
+
+def test_atmosphere_is_the_stock_of_a_network() -> None:
+    """Of net_zero, whose node has no model: fed with the flows of its arcs the box holds what the node holds."""
+    env, box, kg_per_mmol = VectorEnv("net_zero", num_envs=3, horizon=20), Atmosphere(), 44.01e-6
+    env.reset(seed=0)
+    air, rng = env.network.node_index["atmosphere"], np.random.default_rng(0)
+    assert env.network.nodes[air].model is None
+    arcs = [env.network.arc_index[arc] for arc in ("emission", "removal")]
+    state = env.physical.stock[[air]] / kg_per_mmol
+    for _ in range(20):
+        flow = env.advance(rng.uniform(-1.0, 1.0, (2, 3))).flow[arcs]
+        # the rate does not depend on the stock, so that mean flows give the change exactly
+        state = state + env.network.episode.control_interval * box.derivative(state, flow / kg_per_mmol)
+        np.testing.assert_allclose(state[0] * kg_per_mmol, env.physical.stock[air], rtol=1e-13)
 
 
 def check_temperature() -> None:

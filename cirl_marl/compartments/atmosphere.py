@@ -15,8 +15,10 @@ from cirl_marl.rowsum import Floats
 class Atmosphere:
     """Stock of CO₂ that rises by what is emitted and falls by what is removed: ṁ = ṁ12 − ṁ23 (arXiv 2502.02382).
 
-    In a network the stock is the node's and the network integrates it; the model stands alone for studies of the box
-    and gives its concentration. There is one form. No reward is published; it is −|ṁ12 − ṁ23|, zero at net zero.
+    It is for studies of the box alone: its agent sets both flows, and no mass of the network moves through it. Where
+    emission and removal are arcs, as in ``net_zero``, the node is the box and needs no model: the network integrates
+    its stock, and given the same flows both are equal. There is one form. No reward is published; it is −|ṁ12 − ṁ23|,
+    zero at net zero.
 
     Attributes:
         volume_l: volume of the box, L.
