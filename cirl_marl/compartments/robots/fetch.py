@@ -103,7 +103,11 @@ class Fetch:
         return engine().start(stream)
 
     def advance(self, state: Floats, inputs: Floats, interval: float) -> Floats:
-        """Return the state after twenty steps of the simulator, shape (k, B)."""
+        """Return the state after twenty steps of the simulator, shape (k, B).
+
+        Raises:
+            CirlError: if ``interval``, s, is not the model's own.
+        """
         check_step(self.kind, interval, self.interval)
         return engine().step(state, inputs)
 

@@ -83,7 +83,11 @@ class Reacher:
         return engine().start(stream)
 
     def advance(self, state: Floats, inputs: Floats, interval: float) -> Floats:
-        """Return the state after two steps of the simulator, shape (k, B)."""
+        """Return the state after two steps of the simulator, shape (k, B).
+
+        Raises:
+            CirlError: if ``interval``, s, is not the model's own.
+        """
         check_step(self.kind, interval, self.interval)
         return engine().step(state, inputs)
 

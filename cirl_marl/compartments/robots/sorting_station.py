@@ -104,7 +104,11 @@ class SortingStation:
         return np.concatenate([books, robot])
 
     def advance(self, state: Floats, inputs: Floats, interval: float, *, stock_kg: Floats) -> Floats:
-        """Return the state one interval later, shape (k, B); ``stock_kg`` is what the node holds, shape (B,)."""
+        """Return the state one interval later, shape (k, B); ``stock_kg`` is what the node holds, shape (B,).
+
+        Raises:
+            CirlError: if ``interval``, s, is not the model's own.
+        """
         check_step(self.kind, interval, self.interval)
         after = state.copy()
         books = after[: len(BOOKS)]
