@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -275,11 +275,17 @@ class Observation:
     nodes: tuple[str, ...] = ()
 
 
-SOLVERS = ("exact", "rk4", "euler")
-NET_ZERO = ("signed", "abs")
-REWARDS = ("local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team")
-OBSERVE = ("local", "neighbours", "full", "stocks", "model")
-QUANTITIES = ("stock", "outflow", "flow", "measure")
+Solver = Literal["exact", "rk4", "euler"]
+NetZero = Literal["signed", "abs"]
+Reward = Literal["local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team"]
+Observe = Literal["local", "neighbours", "full", "stocks", "model"]
+ServiceQuantity = Literal["stock", "outflow", "flow", "measure"]
+
+SOLVERS: tuple[str, ...] = get_args(Solver)
+NET_ZERO: tuple[str, ...] = get_args(NetZero)
+REWARDS: tuple[str, ...] = get_args(Reward)
+OBSERVE: tuple[str, ...] = get_args(Observe)
+QUANTITIES: tuple[str, ...] = get_args(ServiceQuantity)
 SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})
 MAX_STEPS = 10_000
 """Solver steps of a control interval, or control intervals of a delay, beyond which a unit is taken for a mistake."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool
 
-from cirl_marl.elements import ControlKind, Law, Role
+from cirl_marl.elements import ControlKind, Law, NetZero, Observe, Reward, Role, ServiceQuantity, Solver
 from cirl_marl.validate import IDENTIFIER
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -135,7 +135,7 @@ class ServiceTable(Table):
 
     title: str = ""
     provider: str = Field(description="compartment at which the service is measured")
-    quantity: Literal["stock", "outflow", "flow", "measure"]
+    quantity: ServiceQuantity
     measure: str = Field("", description="what the provider's model measures, for quantity 'measure'")
     low: Quantity
     high: Quantity | None = None
@@ -157,7 +157,7 @@ class EpisodeTable(Table):
 
     control_interval: Quantity
     horizon: Quantity = Field(description="decisions per episode, unit '1'")
-    solver: Literal["exact", "rk4", "euler"] = "exact"
+    solver: Solver = "exact"
     solver_step: Quantity | None = None
 
 
@@ -172,8 +172,8 @@ class ObjectiveTable(Table):
     """Circularity and rewards."""
 
     reference_interval: Quantity = Field(description="the interval Δ of λ = -(m_fb + Δ·ṁ_fc)")
-    net_zero: Literal["signed", "abs"]
-    reward: Literal["local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team"]
+    net_zero: NetZero
+    reward: Reward
     circularity_scale: Quantity
     circularity_weight: Quantity
     tracked: list[str] = Field(
@@ -187,7 +187,7 @@ class ObjectiveTable(Table):
 class ObservationTable(Table):
     """What agents see by default."""
 
-    mode: Literal["local", "neighbours", "full", "stocks", "model"]
+    mode: Observe
     nodes: list[str] = Field([], description="observed nodes of mode 'stocks', in order")
 
 
