@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from cirl_marl.elements import MAX_STEPS, NET_ZERO, OBSERVE, REWARDS, SOLVERS, Compartment, Episode, Law
-from cirl_marl.errors import unknown
+from cirl_marl.errors import CirlError, unknown
 from cirl_marl.units import factor
 
 if TYPE_CHECKING:
@@ -70,14 +70,23 @@ def setting_problems(network: Network) -> Iterator[str]:
 
 
 def _clock_problems(network: Network, compartment: Compartment) -> Iterator[str]:
-    step = getattr(compartment.model, "interval", None)
-    if step is None or compartment.model is None:
+    model = compartment.model
+    if model is None:
         return
-    interval = network.episode.control_interval * factor(network.time_unit, compartment.model.time_unit)
-    if not math.isclose(interval, step, rel_tol=1e-9):
-        unit = compartment.model.time_unit
+    try:
+        factor(model.time_unit, "s")
+    except CirlError as error:
+        yield f"'{compartment.id}': model '{model.kind}': time_unit: {error}"
+        return
+    try:
+        interval = network.episode.control_interval * factor(network.time_unit, model.time_unit)
+    except CirlError:
+        return  # a problem of its own, units.time
+    step = getattr(model, "interval", None)
+    if step is not None and not math.isclose(interval, step, rel_tol=1e-9):
+        unit = model.time_unit
         yield (
-            f"'{compartment.id}': model '{compartment.model.kind}' moves in steps of {step:g} {unit}; "
+            f"'{compartment.id}': model '{model.kind}' moves in steps of {step:g} {unit}; "
             f"the control interval is {interval:g} {unit}"
         )
 

@@ -295,6 +295,26 @@ def test_the_clock_of_a_model_is_that_of_the_network() -> None:
         replace(network(), episode=Episode(control_interval=0.08, solver="rk4", solver_step=0.08))
 
 
+def test_wrong_units_of_time_hide_nothing_else() -> None:
+    """That of the network is told once, that of a model with its compartment, and all other problems beside them."""
+    with pytest.raises(NetworkError) as raised:
+        replace(network(), time_unit="kg", name="Bad Name", mass_unit="Gton")
+    told = [problem.split(":")[0] for problem in raised.value.problems]
+    assert told == ["name 'Bad Name'", "units.mass", "units.time"]
+
+    class Hasty(Belt):
+        """A belt whose unit of time is none."""
+
+        time_unit: ClassVar[str] = "sec0nds"
+
+    good = network()
+    sorter = replace(good.nodes[1], model=Hasty())
+    with pytest.raises(NetworkError) as raised:
+        replace(good, nodes=(good.nodes[0], sorter, good.nodes[2]), name="Bad Name")
+    assert len(raised.value.problems) == 2
+    assert raised.value.problems[1].startswith("'sorter': model 'belt': time_unit: unit 'sec0nds' cannot be read")
+
+
 @pytest.mark.parametrize(("net_zero", "circularity"), [("signed", 10.0), ("abs", -10.0)])
 def test_over_removal_in_batches_is_no_merit_under_abs(net_zero: str, circularity: float) -> None:
     """A batch taken out of the environment counts like a continuous flow: by its absolute value if so asked."""
