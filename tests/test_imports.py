@@ -17,6 +17,7 @@ LAYERS = (
         "elements",
         "rowsum",
         "validate",
+        "validate_services",
         "validate_settings",
         "network",
         "staged",
