@@ -25,7 +25,7 @@ class TransportTruck:
 
     Source: published code of arXiv 2505.21536 (equation, masses, reward, bounds ±10⁶ N, start (0, 4)); confirmed by
     the reference trajectory, whose 200 later steps are reproduced to the last bit. The resistances are chosen, typical
-    of a light lorry. ±10⁶ N is 311 m/s²; the default scenario should stay at what tyres transmit, about ±12 kN (0.4 g).
+    of a light lorry. ±10⁶ N is 312 m/s²; the default scenario should stay at what tyres transmit, about ±12 kN (0.4 g).
 
     Attributes:
         form: ``published`` or ``sound``.
