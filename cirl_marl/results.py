@@ -67,8 +67,8 @@ def provenance(network: Network, runs: Sequence[RunDirectory] = (), **options: A
 
 
 def fingerprint(network: Network) -> str:
-    """Return a hash of the network under its scenario, of its definition with every default and no title."""
-    return _hash(definition_of(replace(network, title="")).encode())
+    """Return a hash of the network under its scenario, of its definition with every default, its name as the title."""
+    return _hash(definition_of(replace(network, title=network.name)).encode())
 
 
 def _run(run: RunDirectory) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def _lines(network: Network) -> Iterator[str]:
     mass, time = network.mass_unit, network.time_unit
     episode, objective = network.episode, network.objective
     yield f"name = {_text(network.name)}"
-    yield f"title = {_text(network.title or network.name)}"
+    yield f"title = {_text(network.title)}"
     yield 'material = "not stated"'
     yield f"agents = {_list(network.acting)}"
     if not network.arcs:

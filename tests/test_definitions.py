@@ -356,10 +356,12 @@ def test_a_compartment_may_be_called_source(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "scenario"), [(name, each) for name in networks() for each in scenarios(name)])
 def test_what_is_written_reads_back(name: str, scenario: str, tmp_path: Path) -> None:
-    """Every network of the catalogue, to the last bit, as the default scenario of its own file."""
+    """Every network of the catalogue, to the last bit, as the default scenario of its own file; without a title too."""
     network = load_network(name, scenario=scenario)
-    write_network(network, tmp_path / "written.toml")
-    assert load_network(tmp_path / "written.toml") == replace(network, scenario_name="default", scenarios={})
+    path = tmp_path / "written.toml"
+    for titled in (network, replace(network, title="")):
+        write_network(titled, path)
+        assert load_network(path) == replace(titled, scenario_name="default", scenarios={})
 
 
 ROLE = {role.value: role for role in Role}
