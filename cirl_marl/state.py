@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -41,6 +41,10 @@ class State:
     def copied(self) -> State:
         """Return the state with arrays of its own."""
         return replace(self, **{each.name: getattr(self, each.name).copy() for each in fields(self)})
+
+    def renewed(self, ended: NDArray[np.bool_], fresh: State) -> State:
+        """Return the state in which the copies that ``ended``, shape (B,), are those of ``fresh``."""
+        return State(*(np.where(ended, getattr(fresh, each.name), getattr(self, each.name)) for each in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +99,23 @@ class Outcome:
     flow: Floats
     truncated: NDArray[np.bool_]
     success: Mapping[str, NDArray[np.bool_]]
+
+    def infos(self, agents: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """Return λ, local reward, flows (B, arcs) and service level for each agent; success where it is defined."""
+        flows = self.flow.T
+        self.circularity.flags.writeable = self.service_level.flags.writeable = False  # the same for all agents
+        infos: dict[str, dict[str, Any]] = {
+            agent: {
+                "circularity": self.circularity,
+                "local_reward": self.local[i],
+                "flows": flows,
+                "service_level": self.service_level,
+            }
+            for i, agent in enumerate(agents)
+        }
+        for agent in self.success.keys() & infos.keys():
+            infos[agent]["success"] = self.success[agent]
+        return infos
 
 
 def _described(network: Network, copies: int, agents: tuple[str, ...]) -> str:

@@ -161,7 +161,7 @@ class VectorEnv:
             ControlError: for missing or unknown agents, wrong shapes, NaN or values out of bounds.
         """
         outcome = self.advance(self.stack(actions))
-        infos = self.infos(outcome)
+        infos: Infos = outcome.infos(self.agents)
         observation = outcome.observation
         if outcome.truncated.any():
             self._report_ends(infos, outcome)
@@ -267,24 +267,6 @@ class VectorEnv:
         """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
         return {agent: stacked[rows].T for agent, rows in self.layout.slices.items()}
 
-    def infos(self, outcome: Outcome) -> Infos:
-        """Return λ, local reward, flows (B, arcs) and service level for each agent; success where it is defined."""
-        flows = outcome.flow.T
-        outcome.circularity.flags.writeable = outcome.service_level.flags.writeable = False  # the same for all agents
-        infos: Infos = {
-            agent: {
-                "circularity": outcome.circularity,
-                "local_reward": outcome.local[i],
-                "flows": flows,
-                "service_level": outcome.service_level,
-            }
-            for i, agent in enumerate(self.agents)
-        }
-        for agent, success in outcome.success.items():
-            if agent in infos:
-                infos[agent]["success"] = success
-        return infos
-
     def _report_ends(self, infos: Infos, outcome: Outcome) -> None:
         """Add the final observations and the episode's λ̄ and service level of the copies that ended."""
         state, ended = self.physical, outcome.truncated
@@ -304,17 +286,7 @@ class VectorEnv:
         old = self.physical
         drawn = np.concatenate([old.stock[: len(self.network.nodes)], old.inner])
         drawn[:, which] = self._starts.draw(which)
-        fresh = self._fresh(drawn)
-        self._state = State(
-            np.where(ended, fresh.stock, old.stock) if len(self.dynamics.batches) else fresh.stock,
-            fresh.inner,
-            np.where(ended, fresh.flow, old.flow),
-            np.where(ended, fresh.measures, old.measures),
-            np.where(ended, 0, old.step),
-            np.where(ended, 0.0, old.batched),
-            np.where(ended, 0.0, old.circularity),
-            np.where(ended, 0.0, old.service),
-        )
+        self._state = old.renewed(ended, self._fresh(drawn))
         return self._observe(self._state)
 
     def _fresh(self, drawn: Floats) -> State:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jsonschema
 import numpy as np
@@ -28,10 +26,9 @@ from cirl_marl import (
     parallel_env,
 )
 from cirl_marl.catalogue import folder
-from cirl_marl.definition import read_network, write_network
+from cirl_marl.definition import write_network
 from cirl_marl.elements import ControlKind
 from cirl_marl.schema import json_schema
-from cirl_marl.units import factor
 
 FILES = sorted(folder("envs").glob("*.toml"))
 COPPER = (Path(__file__).parent / "reference" / "definition.toml").read_text(encoding="utf-8")
@@ -269,53 +266,6 @@ def test_scenario_mistakes_are_all_named(tmp_path: Path) -> None:
     assert "Did you mean 'sorting'" in message
 
 
-def test_kt_is_the_kilotonne() -> None:
-    """Pint alone reads kt as the knot."""
-    assert factor("kt", "kg") == pytest.approx(1e6)
-    with pytest.raises(CirlError, match="inconsistent"):
-        factor("kt", "m/s")
-
-
-@pytest.mark.parametrize(
-    ("unit", "instead"),
-    [
-        ("ton", "t (tonne), or short_ton, or long_ton"),
-        ("tons/day", "t (tonne)"),
-        ("ktons", "kt (kilotonne)"),
-        ("kiloton", "kt (kilotonne)"),
-        ("Mtons", "Mt (megatonne)"),
-        ("1/Gton", "Gt (gigatonne), or gigashort_ton"),
-        ("Gtons", "Gt (gigatonne)"),
-        ("Tton", "Tt (teratonne)"),
-        ("mton", "t (metric tonne), or Mt (megatonne)"),
-        ("mt", "t (metric tonne), or Mt (megatonne)"),
-    ],
-)
-def test_tons_are_refused_with_any_prefix(unit: str, instead: str) -> None:
-    """Pint alone takes them for short tons, 9 % off, or for millitonnes; the message says what to write instead."""
-    with pytest.raises(CirlError, match="is read in several ways; write " + re.escape(instead)):
-        factor(unit, "kg")
-
-
-@pytest.mark.parametrize(
-    ("unit", "kg"),
-    [
-        ("tonne", 1e3),
-        ("t", 1e3),
-        ("metric_tons", 1e3),
-        ("Gt", 1e12),
-        ("kilotonne", 1e6),
-        ("short_ton", 907.18474),
-        ("kshort_tons", 907184.74),
-        ("gigashort_ton", 907.18474e9),
-        ("kilolong_ton", 1016.0469088e3),
-    ],
-)
-def test_masses_that_say_which_ton(unit: str, kg: float) -> None:
-    """Spelt out, each of them is understood."""
-    assert factor(unit, "kg") == pytest.approx(kg, rel=1e-12)
-
-
 def test_units_are_converted(tmp_path: Path) -> None:
     """A rate per year is a rate per day, 365.25 times smaller."""
     path = tmp_path / "yearly.toml"
@@ -431,65 +381,3 @@ def test_network_can_be_built_in_python() -> None:
     source = load_network("copper_net")
     with pytest.raises(CirlError, match="used twice"):
         Network(name="twice", nodes=(*source.nodes, source.nodes[0]), arcs=())
-
-
-@pytest.mark.parametrize(
-    ("scenario", "message"),
-    [
-        ('[scenarios.default]\ntitle = "x"', "scenarios.default: the default scenario is what stands outside"),
-        ('[scenarios.other]\nname = "x"', "scenarios.other.name: a scenario cannot set it"),
-        ("[scenarios.other]\narcs = 5", "scenarios.other.arcs: must be a table"),
-        ("[scenarios.other.nodes.mine.initial]\nlow = 1", "scenarios.other.nodes.mine.initial.high: missing"),
-        (
-            '[scenarios.other]\nwithout = ["services", "services.copper_in_use"]',
-            "scenarios.other.without: 'services.copper_in_use' lies in 'services'",
-        ),
-        (
-            '[scenarios.other.nodes.mine]\nwithout = ["control"]',
-            "scenarios.other.nodes.mine.without: unknown key 'without'",
-        ),
-    ],
-)
-def test_scenarios_are_strict(tmp_path: Path, scenario: str, message: str) -> None:
-    """A scenario replaces whole quantities, with their sources, and nothing that it must not."""
-    path = tmp_path / "net.toml"
-    path.write_text((folder("envs") / "copper_net.toml").read_text(encoding="utf-8") + "\n" + scenario + "\n")
-    with pytest.raises(DefinitionError) as raised:
-        read_network(path)
-    assert message in str(raised.value)
-
-
-MODEL = "[scenarios.other.nodes.microalgae.model"
-
-
-@pytest.mark.parametrize(
-    ("scenario", "same"),
-    [
-        (MODEL + '.initial]\nnutrient_umol_l = { low = 5, high = 6, source = "x" }', {"inner": ((20, 30), (5, 6))}),
-        (MODEL + ']\nreward_scale = { value = 2, unit = "1", source = "x" }', {"reward_scale": 2.0}),
-        (MODEL + ']\nkind = "microalgae_monod"', {}),
-        ("[scenarios.other.nodes.microalgae.control]\nhigh = 75", {"high": 75.0}),
-    ],
-)
-def test_scenarios_change_models_and_controls_key_by_key(tmp_path: Path, scenario: str, same: dict[str, Any]) -> None:
-    """What they do not give, stays; to repeat the kind changes nothing."""
-    path = tmp_path / "net.toml"
-    path.write_text((folder("envs") / "net_zero.toml").read_text(encoding="utf-8") + "\n" + scenario + "\n")
-    network = read_network(path)
-    usual, other = (net.compartments["microalgae"] for net in (network, network.scenarios["other"]))
-    assert usual.control is not None
-    if "high" in same:
-        same = {"control": replace(usual.control, **same)}
-    assert other == replace(usual, **same)
-
-
-def test_a_model_or_control_of_another_kind_is_a_new_one(tmp_path: Path) -> None:
-    """Nothing of the old one is left: its ranges and its scale would mean something else."""
-    path, text = tmp_path / "net.toml", (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
-    droop = text[text.index("[scenarios.droop.nodes.microalgae.model]") : text.index("[scenarios.paper_monod]")]
-    path.write_text(text + droop.replace("scenarios.droop", "scenarios.other"))  # without ``without``
-    network = read_network(path)
-    assert network.scenarios["other"].compartments == network.scenarios["droop"].compartments
-    path.write_text(text + "\n" + MODEL + ']\nkind = "microalgae_droop"\nsource = "x"\n')
-    with pytest.raises(DefinitionError, match="biomass_um3_l"):
-        read_network(path)

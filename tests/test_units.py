@@ -1,0 +1,57 @@
+"""Units of definition files."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from cirl_marl import CirlError
+from cirl_marl.units import factor
+
+
+def test_kt_is_the_kilotonne() -> None:
+    """Pint alone reads kt as the knot."""
+    assert factor("kt", "kg") == pytest.approx(1e6)
+    with pytest.raises(CirlError, match="inconsistent"):
+        factor("kt", "m/s")
+
+
+@pytest.mark.parametrize(
+    ("unit", "instead"),
+    [
+        ("ton", "t (tonne), or short_ton, or long_ton"),
+        ("tons/day", "t (tonne)"),
+        ("ktons", "kt (kilotonne)"),
+        ("kiloton", "kt (kilotonne)"),
+        ("Mtons", "Mt (megatonne)"),
+        ("1/Gton", "Gt (gigatonne), or gigashort_ton"),
+        ("Gtons", "Gt (gigatonne)"),
+        ("Tton", "Tt (teratonne)"),
+        ("mton", "t (metric tonne), or Mt (megatonne)"),
+        ("mt", "t (metric tonne), or Mt (megatonne)"),
+    ],
+)
+def test_tons_are_refused_with_any_prefix(unit: str, instead: str) -> None:
+    """Pint alone takes them for short tons, 9 % off, or for millitonnes; the message says what to write instead."""
+    with pytest.raises(CirlError, match="is read in several ways; write " + re.escape(instead)):
+        factor(unit, "kg")
+
+
+@pytest.mark.parametrize(
+    ("unit", "kg"),
+    [
+        ("tonne", 1e3),
+        ("t", 1e3),
+        ("metric_tons", 1e3),
+        ("Gt", 1e12),
+        ("kilotonne", 1e6),
+        ("short_ton", 907.18474),
+        ("kshort_tons", 907184.74),
+        ("gigashort_ton", 907.18474e9),
+        ("kilolong_ton", 1016.0469088e3),
+    ],
+)
+def test_masses_that_say_which_ton(unit: str, kg: float) -> None:
+    """Spelt out, each of them is understood."""
+    assert factor(unit, "kg") == pytest.approx(kg, rel=1e-12)
