@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from cirl_marl.learners.recipe import Learner, Match, Run
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.trainee import derived_seed
 from cirl_marl.learners.views import OneAgent
+from cirl_marl.paper.results import Row
+from cirl_marl.paper.training import run_row
 
 OFF_POLICY = {
     "buffer_size": 1000,
@@ -319,6 +322,19 @@ def test_torch_threads_and_streams_are_left_alone(ppo_recipe: Recipe) -> None:
     train("copper_net", ppo_recipe, horizon=5)
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.rand(2), expected)
+
+
+def test_no_temporary_folders_are_left(
+    tmp_path: Path, ppo_recipe: Recipe, mixed_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Left to itself, Stable-Baselines3 makes one for each model."""
+    (scratch := tmp_path / "scratch").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    train("copper_net", mixed_recipe, horizon=5)
+    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
+    resume(tmp_path / "run", steps=1000)
+    run_row(Row(environment="CopperNet", algorithm="A2C", steps=100))
+    assert list(scratch.iterdir()) == []
 
 
 @pytest.mark.parametrize("options", [{"steps": 0}, {"steps": -5}, {"steps": 1.5}, {"envs": 0}, {"seed": -1}])

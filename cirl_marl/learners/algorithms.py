@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
@@ -141,7 +142,7 @@ def _are_numbers(values: Iterable[object]) -> bool:
 
 
 def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **fixed: Any) -> BaseAlgorithm:
-    """Construct the algorithm on ``env``.
+    """Construct the algorithm on ``env``; it logs nowhere until it is given a logger.
 
     Args:
         name: class name in Stable-Baselines3 or sb3-contrib.
@@ -164,6 +165,8 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         mean = np.zeros(env.action_space.shape or (1,))
         arguments["action_noise"] = NOISES[noise["kind"]](mean, noise["sigma"] * np.ones_like(mean))  # type: ignore[call-arg]
     try:
-        return algorithm_class(name)(POLICIES.get(policy, policy), env, **arguments, **fixed)
+        model = algorithm_class(name)(POLICIES.get(policy, policy), env, **arguments, **fixed)
     except (TypeError, ValueError, AssertionError, KeyError) as error:
         raise RecipeError(f"{name} refuses its parameters {dict(parameters)}: {error}") from error
+    model.set_logger(Logger(None, []))  # left to itself it makes an empty temporary folder when it begins to learn
+    return model

@@ -202,12 +202,9 @@ class Trainee:
             gamma=spec.parameters.get("gamma", 0.99),
         )
 
-    def log_to(self, log: Path | None) -> None:
-        """Write TensorBoard events below the folder ``log``, or nowhere."""
-        if log is not None:
-            self.model.set_logger(configure(str(log / self.name), ["tensorboard"]))
-        else:
-            self.model.set_logger(configure(None, []))
+    def log_to(self, log: Path) -> None:
+        """Write TensorBoard events below the folder ``log``."""
+        self.model.set_logger(configure(str(log / self.name), ["tensorboard"]))
 
 
 def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = None) -> BaseAlgorithm:

@@ -96,9 +96,9 @@ class Training:
                 trainee.follow(known[asked.controller])
 
     def _log(self) -> None:
-        log = self.run.path / "tensorboard" if self.run is not None else None
-        for trainee in self.trainees.values():
-            trainee.log_to(log)
+        if self.run is not None:
+            for trainee in self.trainees.values():
+                trainee.log_to(self.run.path / "tensorboard")
 
     def start(
         self,
