@@ -7,7 +7,8 @@ from pathlib import Path
 
 import cirl_marl
 from cirl_marl.errors import CirlError
-from cirl_marl.learners.run import versions, write_atomically
+from cirl_marl.learners.run import write_atomically
+from cirl_marl.machine import versions
 
 
 def write_sections(document: Path, sections: Mapping[str, str]) -> None:

@@ -29,6 +29,7 @@ from rich.table import Table
 from benchmarks.generated import FreeEnv, Weights, learn_alone, learn_together, random_network, simple_spread
 from cirl_marl import parallel_env
 from cirl_marl.learners import load_recipe, train
+from cirl_marl.machine import processor
 from cirl_marl.parallel_env import NetworkParallelEnv
 from cirl_marl.vector_env import VectorEnv
 
@@ -288,12 +289,7 @@ def _times(slow: Sequence[float], fast: Sequence[float]) -> str:
 
 def _machine() -> Iterator[str]:
     """Yield what was measured on: processor, load by others, versions."""
-    model = platform.processor() or platform.machine()
-    information = Path("/proc/cpuinfo")
-    if information.is_file():
-        lines = information.read_text().splitlines()
-        model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
-    yield f"{model}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before the measurement"
+    yield f"{processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before the measurement"
     found = {distribution.metadata["Name"].lower() for distribution in importlib.metadata.distributions()}
     versions = [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES if name in found]
     yield f"Python {platform.python_version()}, {', '.join(versions)}"

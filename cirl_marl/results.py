@@ -15,7 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cirl_marl.learners.run import RunDirectory, versions
+from cirl_marl.learners.run import RunDirectory
+from cirl_marl.machine import versions
 from cirl_marl.network import Network
 from cirl_marl.writing import definition_of
 

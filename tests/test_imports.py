@@ -13,6 +13,7 @@ PACKAGE = Path(cirl_marl.__file__).parent
 LAYERS = (
     {
         "errors",
+        "machine",
         "units",
         "elements",
         "rowsum",

@@ -14,19 +14,21 @@ import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
-from cirl_marl.learners import Recipe, Training, load_recipe, train
+from cirl_marl.learners import Recipe, Training, algorithms, load_recipe, train
 from cirl_marl.learners.algorithms import algorithm_class
-from cirl_marl.paper import published, session, training, tuned
+from cirl_marl.paper import evaluation, published, session, training, tuned
 from cirl_marl.paper.document import markdown
+from cirl_marl.paper.evaluation import evaluate
 from cirl_marl.paper.plan import planned, study
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
 from cirl_marl.paper.results import Evaluation, Result, Results, Row, thinned
 from cirl_marl.paper.table import table_rows
-from cirl_marl.paper.training import Trained, described, evaluate, outdated, run_row
+from cirl_marl.paper.training import Trained, described, outdated, run_row
 from cirl_marl.paper.tuned import train_tuned
 
 COPPER = ENVIRONMENTS["CopperNet"]
@@ -158,7 +160,7 @@ def test_weights_that_become_nan_are_a_result(
 ) -> None:
     """A learner that breaks shows its episodes until then and the step; there is no policy to evaluate."""
     wild = partial(algorithm_class(algorithm), learning_rate=1e30)
-    monkeypatch.setattr(training, "algorithm_class", lambda _: wild)
+    monkeypatch.setattr(algorithms, "algorithm_class", lambda _: wild)
     arguments = (algorithm, "--steps", "10000", "--out", str(tmp_path))
     assert cirl(monkeypatch, *arguments) == 0
     assert "weights NaN after" in capsys.readouterr().out
@@ -172,6 +174,13 @@ def test_weights_that_become_nan_are_a_result(
     line = next(line for line in markdown([found]).splitlines() if f"| {algorithm} | ours | 0 |" in line)
     assert f"seed 0: weights NaN after {found.steps_done:,} of 10,000 steps" in line
     assert "nan" not in line
+
+
+def test_saturated_sac_raises_its_entropy_coefficient_without_end() -> None:
+    """Its logarithm grows by one learning rate an update on rewards of −10⁵ a step, which ends in NaN."""
+    model = SAC("MlpPolicy", gymnasium.make(COPPER.id), seed=0, learning_starts=20).learn(120)
+    assert model.log_ent_coef is not None
+    assert model.log_ent_coef.item() == pytest.approx(100 * 3e-4, rel=0.01)
 
 
 def test_a_session_goes_on_after_a_row_that_fails(
@@ -282,7 +291,10 @@ def test_table_shows_both_and_what_was_not_run() -> None:
 def test_summary_says_what_was_reached() -> None:
     """Means over the seeds of a tuned recipe are held against the paper's best and against the goal."""
 
-    def line(name: str, algorithm: str, end: float, final: list[float], success: float | None = None) -> list[str]:
+    def line(
+        name: str, algorithm: str, end: float, final: list[float], success: float | None = None, there: float = -2e6
+    ) -> list[str]:
+        ends = Evaluation(episodes=100, mean=there, deviation=0.1, success=None)
         environment = ENVIRONMENTS[name]
         made = result(algorithm)
         runs = [
@@ -291,6 +303,7 @@ def test_summary_says_what_was_reached() -> None:
                 row=Row(environment=name, algorithm=algorithm, recipe="tuned", steps=environment.steps, seed=seed),
                 end_return=end,
                 evaluation=Evaluation(episodes=100, mean=mean, deviation=0.1, success=success),
+                published_ends=ends,
             )
             for seed, mean in enumerate(final)
         ]
@@ -300,7 +313,10 @@ def test_summary_says_what_was_reached() -> None:
     near = line("CarboNet", "PPO", -1e6, [-1.10e5, -1.12e5])
     assert near[1:4] == ["-2.04e6 (ARS)", "-1.00e6 ± 0.00e6", "yes"]
     assert near[5:] == ["-1.07e5", "≥ -1.13e5 (5 % of the optimum)", "yes"]
-    assert line("CarboNet", "PPO", -3e6, [-1.10e5, -1.20e5])[3::4] == ["no", "no"]
+    assert line("CarboNet", "PPO", -3e6, [-1.10e5, -1.20e5])[3::4] == ["yes", "no"]
+    assert line("CarboNet", "PPO", -1e6, [-1.10e5], there=-3e6)[3] == "no"
+    assert line("TransportTruck", "PPO", -1.3e8, [-1.16e8])[3] == "no"
+    assert line("FetchWasteSorting", "TQC-HER", -9.0, [-8.0], 100.0)[3::4] == ["not comparable", "yes"]
     assert line("Reacher", "SAC", -5.0, [-4.0], 94.0)[-1] == "no"
     assert line("Reacher", "SAC", -5.0, [-4.0], 95.0)[4:] == ["-4, s 95 %", "not known", "s ≥ 95 %", "yes"]
     assert line("CO2MicroalgaeDroop", "PPO", 480.0, [450.0])[-2:] == ["", ""]
@@ -362,8 +378,8 @@ def test_results_that_answer_another_question_are_outdated() -> None:
     )
 
 
-def test_every_kept_row_is_of_today() -> None:
-    """The tables show what the environments and recipes of this version give."""
+def test_every_kept_row_is_of_the_definitions_of_today() -> None:
+    """The environments and recipes that it was trained with are defined as they are now."""
     kept = Results(Path(__file__).parent.parent / "benchmarks" / "results" / "paper").all()
     assert len(kept) > 80
     assert [(str(result.row), why) for result in kept if (why := outdated(result))] == []
@@ -458,7 +474,7 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
         options={},
     )
     monkeypatch.setattr(training, "train_published", lambda *_: done)
-    monkeypatch.setattr(training, "EVALUATION_EPISODES", 20)
+    monkeypatch.setattr(evaluation, "EVALUATION_EPISODES", 20)
     found = run_row(Row(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
     assert found.start_return == pytest.approx(np.mean(returns[:window]))
     assert found.end_return == pytest.approx(np.mean(returns[-window:]))

@@ -194,6 +194,18 @@ class TestTasks:
         inputs[:, 0], inputs[0, 3], inputs[1, 4], inputs[:, 5] = (below[1], -below[1]), 0.005, -0.005, 0.0
         np.testing.assert_array_equal(Reacher().success(state, inputs), [True, False, False, False, False, True])
 
+    def test_random_torques_succeed_only_where_signed(self) -> None:
+        """Torques as of an untrained policy: had they to be below 0.005 with their signs, a quarter would do."""
+        robot, rng = Reacher(), np.random.default_rng(0)
+        state, done, signed = starts(robot, 250, 0), np.zeros(250, dtype=bool), np.zeros(250, dtype=bool)
+        for _ in range(50):
+            inputs = np.clip(rng.standard_normal((2, 250)), -1.0, 1.0)
+            state = robot.advance(state, inputs, robot.interval)
+            done |= robot.success(state, inputs)
+            signed |= (state[robot.state_names.index("distance_m")] < 0.04) & (inputs < 0.005).all(axis=0)
+        assert done.mean() < 0.01
+        assert 0.18 < signed.mean() < 0.32
+
     def test_reacher_success_by_kinematics(self) -> None:
         """The tip is where the joint angles put it: arms of 0.1 and 0.11 m; its distance decides, not the library's."""
         robot = Reacher()

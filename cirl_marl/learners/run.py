@@ -21,12 +21,10 @@ from __future__ import annotations
 import csv
 import json
 import os
-import platform
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +33,10 @@ from filelock import FileLock, Timeout
 from cirl_marl.catalogue import load_network
 from cirl_marl.errors import RunError, unknown
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe
+from cirl_marl.machine import versions
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
 
-PACKAGES = (
-    "cirl-marl", "gymnasium", "greenlet", "highspy", "networkx", "numpy", "pettingzoo", "sb3-contrib", "scipy",
-    "stable-baselines3", "torch",
-)  # fmt: skip
 STATES = ("running", "complete", "interrupted", "failed")
 
 
@@ -319,9 +314,3 @@ class MetricsFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python, the platform and every package that bears on a result."""
-    found = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
-    return found | {package: metadata.version(package) for package in PACKAGES}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from cirl_marl.paper.published import ENVIRONMENTS, HARDWARE, SOURCE
 from cirl_marl.paper.results import WINDOW, Result
 from cirl_marl.paper.summary import summary
-from cirl_marl.paper.table import COLUMNS, distinct, notes, table_rows
+from cirl_marl.paper.table import COLUMNS, distinct, markdown_table, notes, table_rows
 
 INTRODUCTION = f"""# The paper's tables, repeated
 
@@ -23,12 +23,13 @@ Published figures: {SOURCE}. Written by `python benchmarks/paper.py --table`, fr
 - final policy: mean return of the trained policy, deterministic, on fresh episodes that no training saw.
 - Several seeds: mean ± standard deviation over them. Where starts are drawn, a mean over n episodes varies by the
   standard deviation of one episode, which the notes give, over √n: figures "better than the optimum" are such chance.
-- Minutes: training alone, on the machine named below, which did other work at the same time; the paper's on a
+- Minutes: training alone, on the machines named below, which did other work at the same time; the paper's on a
   {HARDWARE}. CPU min: processor time, which other work does not lengthen; blank where it was not recorded, and over
   the seeds that have it. Speed on an idle machine: [benchmarks](../benchmarks/README.md).
 - Time limits are truncations here. The published CarboNet and CopperNet end their episodes otherwise
   ([networks.md](networks.md#the-published-carbonet-and-coppernet-where-episodes-start-and-end)): the best return
-  there is −1.593e5 and −4.674e7, here −1.072e5 and −4.604e7 (`pytest tests/test_paper_optima.py`).
+  there is −1.593e5 and −4.674e7, here −1.072e5 and −4.604e7 (`pytest tests/test_paper_optima.py`). So "better" means
+  there: the final policy, in episodes that end as the published ones, against the paper's r_e. Elsewhere: r_e.
 """
 
 
@@ -43,10 +44,9 @@ def markdown(results: Sequence[Result], comment: str = "") -> str:
     if comment:
         parts.append(comment.strip() + "\n")
     for environment in ENVIRONMENTS.values():
-        lines = [f"## {environment.name} ({environment.steps:,} steps)", ""]
-        lines += ["| " + " | ".join(COLUMNS) + " |", "|" + "|".join("-" for _ in COLUMNS) + "|"]
-        lines += ["| " + " | ".join(row) + " |" for row in table_rows(environment, results)]
-        parts.append("\n".join(lines) + "\n\n" + notes(environment, results) + "\n")
+        title = f"## {environment.name} ({environment.steps:,} steps)"
+        table = markdown_table(COLUMNS, table_rows(environment, results))
+        parts.append(f"{title}\n\n{table}\n\n{notes(environment, results)}\n")
     parts.append(_provenance(results))
     return "\n".join(parts)
 
@@ -60,10 +60,11 @@ def _provenance(results: Sequence[Result]) -> str:
         f"{name} {' and '.join(distinct(r.versions[name] for r in results if name in r.versions))}" for name in names
     )
     cpus = ", ".join(distinct(result.machine["cpus"] for result in results))
+    models = ", ".join(distinct(result.machine.get("model", "not recorded in early rows") for result in results))
     threads = ", ".join(distinct(result.machine["torch_threads"] for result in results))
     hours = sum(result.seconds for result in results) / 3600
     days = sorted(result.finished[:10] for result in results)
     return (
         f"## Made with\n\n{len(results)} rows, {hours:.1f} hours of training on {cpus} CPUs "
-        f"({threads} torch thread each, no GPU), {days[0]} to {days[-1]}.\n\n{versions}.\n"
+        f"({models}; {threads} torch thread each, no GPU), {days[0]} to {days[-1]}.\n\n{versions}.\n"
     )

@@ -83,9 +83,11 @@ class Result:
         evaluation: of the final policy; None if its weights became NaN, and there is none.
         settings: hyperparameters that differ from the library's defaults, copies, the environment's id and arguments.
         versions: of Python and the packages.
-        machine: processors, torch threads, load at the end.
+        machine: processors and their model, torch threads, load at the end.
         finished: when, UTC.
         cpu_seconds: processor time of training, which other work on the machine does not lengthen; None if not known.
+        published_ends: of the final policy where episodes end as the published class ends them; None if that is as
+            here, or not known.
     """
 
     row: Row
@@ -101,6 +103,7 @@ class Result:
     machine: dict[str, Any]
     finished: str
     cpu_seconds: float | None = None
+    published_ends: Evaluation | None = None
 
     @property
     def gain(self) -> float:
@@ -122,7 +125,8 @@ class Result:
         """Read what ``asdict`` returned, after a detour through JSON."""
         given = {key: value for key, value in plain.items() if key not in ("gain", "gain_per_step")}
         given["row"] = Row(**given["row"])
-        given["evaluation"] = None if given["evaluation"] is None else Evaluation(**given["evaluation"])
+        for key in ("evaluation", "published_ends"):
+            given[key] = Evaluation(**given[key]) if given.get(key) is not None else None
         given["curve"] = [(int(step), float(value)) for step, value in given["curve"]]
         return cls(**given)
 

@@ -10,10 +10,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from cirl_marl.errors import CirlError
+from cirl_marl.paper.evaluation import Report
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Results, Row
 from cirl_marl.paper.table import environment_table, result_line
-from cirl_marl.paper.training import Report, check_registered, outdated, run_row
+from cirl_marl.paper.training import check_registered, outdated, run_row
 
 REFRESH_S = 0.2
 

@@ -5,18 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from rich.table import Table
 
 from cirl_marl.learners import load_recipe
 from cirl_marl.learners.training import one_torch_thread
+from cirl_marl.paper.evaluation import Report
 from cirl_marl.paper.published import HARDWARE, environment_of
 from cirl_marl.paper.results import WINDOW, Row
-from cirl_marl.paper.table import number
-from cirl_marl.paper.training import Report, Trained, train_published
+from cirl_marl.paper.table import markdown_table, number
+from cirl_marl.paper.training import Trained, train_published
 from cirl_marl.paper.tuned import train_tuned
 
 ENVIRONMENT = "CopperNet"
-RECIPES = {"A2C": "independent_a2c", "PPO": "independent_ppo"}
+RECIPES = (("A2C", "independent_a2c"), ("PPO", "independent_ppo"), ("PPO", "paper_copper_net"))
+"""Algorithm and recipe: those that learners have by default, and the one that is tuned for the result."""
+GOAL = 10.0
+COLUMNS = (
+    "algorithm",
+    "published settings",
+    "ours",
+    "wall time",
+    "processor time",
+    "goal",
+    "met",
+    f"paper, {HARDWARE}",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,42 +50,60 @@ class Comparison:
     ours: Trained
 
     @property
+    def wall_ratio(self) -> float:
+        """How many times as fast a step is in the vectorised run, in wall time, which other work lengthens."""
+        return (self.published.seconds / self.published.steps) / (self.ours.seconds / self.ours.steps)
+
+    @property
     def ratio(self) -> float:
-        """How many times as fast a step is in the vectorised run, in processor time."""
+        """The same in processor time."""
         return (self.published.cpu_seconds / self.published.steps) / (self.ours.cpu_seconds / self.ours.steps)
 
 
 def compare(steps: int, report: Report) -> list[Comparison]:
     """Train A2C and PPO on CopperNet both ways, one after the other."""
     environment = environment_of(ENVIRONMENT)
+    published: dict[str, Trained] = {}
     found = []
     with one_torch_thread():
-        for algorithm, name in RECIPES.items():
+        for algorithm, name in RECIPES:
             row, recipe = Row(environment=ENVIRONMENT, algorithm=algorithm, steps=steps), load_recipe(name)
-            published = train_published(environment, row, report)
+            if algorithm not in published:
+                published[algorithm] = train_published(environment, row, report)
             ours = train_tuned(environment, row, report, recipe)
             found.append(
-                Comparison(algorithm=algorithm, recipe=name, copies=recipe.run.envs, published=published, ours=ours)
+                Comparison(
+                    algorithm=algorithm,
+                    recipe=name,
+                    copies=recipe.run.envs,
+                    published=published[algorithm],
+                    ours=ours,
+                )
             )
     return found
 
 
-def speed_table(comparisons: list[Comparison]) -> Table:
-    """One row an algorithm: seconds, what was learnt, and the ratio of the times per step."""
-    table = Table(title=f"Training time on {ENVIRONMENT}, one CPU core")
-    columns = ("algorithm", "published settings", "r_e", "recipe", "vectorised", "r_e", "ratio", f"paper, {HARDWARE}")
-    for column in columns:
-        table.add_column(column, justify="left" if column in ("algorithm", "recipe") else "right")
-    for row in comparisons:
-        minutes = environment_of(ENVIRONMENT).runs[row.algorithm].minutes
-        table.add_row(
-            row.algorithm,
-            f"{row.published.seconds:.1f} s, {row.published.steps:,} steps",
-            number(float(np.mean(row.published.returns[-WINDOW:]))),
-            f"{row.recipe}, {row.copies} copies",
-            f"{row.ours.seconds:.1f} s, {row.ours.steps:,} steps",
-            number(float(np.mean(row.ours.returns[-WINDOW:]))),
-            f"{row.ratio:.1f} ×",
-            "" if minutes is None else f"{minutes:.1f} min",
-        )
-    return table
+def speed_table(comparisons: list[Comparison]) -> str:
+    """Return a Markdown table: seconds, what was learnt, and how many times as fast a step is."""
+    return markdown_table(COLUMNS, map(_line, comparisons))
+
+
+def _line(row: Comparison) -> tuple[str, ...]:
+    minutes = environment_of(ENVIRONMENT).runs[row.algorithm].minutes
+    return (
+        row.algorithm,
+        _run(row.published),
+        f"`{row.recipe}`, {row.copies} copies: {_run(row.ours)}",
+        f"{row.wall_ratio:.1f} ×",
+        f"{row.ratio:.1f} ×",
+        f"≥ {GOAL:g} ×",
+        "yes" if min(row.wall_ratio, row.ratio) >= GOAL else "no",
+        "" if minutes is None else f"{minutes:.1f} min",
+    )
+
+
+def _run(trained: Trained) -> str:
+    end = float(np.mean(trained.returns[-WINDOW:]))
+    return (
+        f"{trained.seconds:.1f} s ({trained.cpu_seconds:.1f} s processor), {trained.steps:,} steps, r_e {number(end)}"
+    )

@@ -10,7 +10,7 @@ import numpy as np
 
 from cirl_marl.paper.published import ENVIRONMENTS, PaperEnvironment
 from cirl_marl.paper.results import Result
-from cirl_marl.paper.table import NOT_RUN, number, over_seeds
+from cirl_marl.paper.table import NOT_RUN, markdown_table, number, over_seeds
 
 COLUMNS = (
     "environment",
@@ -62,9 +62,7 @@ GOALS: Mapping[str, Goal] = {
 
 def summary(results: Sequence[Result]) -> str:
     """Return a Markdown table with a line for each environment."""
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "|".join("-" for _ in COLUMNS) + "|"]
-    lines += ["| " + " | ".join(_line(environment, results)) + " |" for environment in ENVIRONMENTS.values()]
-    return "\n".join(lines)
+    return markdown_table(COLUMNS, (_line(environment, results) for environment in ENVIRONMENTS.values()))
 
 
 def _line(environment: PaperEnvironment, results: Sequence[Result]) -> tuple[str, ...]:
@@ -91,8 +89,18 @@ def _line(environment: PaperEnvironment, results: Sequence[Result]) -> tuple[str
     if goal is not None:
         reached = successes if goal.figure == "success" else [evaluation.mean for evaluation in played]
         met = _yes(len(reached) == len(tuned) and float(np.mean(reached)) >= goal.least)
-    better = _yes(float(np.mean(end)) > best)
+    better = _better(environment, best, tuned)
     return (environment.name, paper, over_seeds(end), better, final, optimum, asked, met)
+
+
+def _better(environment: PaperEnvironment, best: float, tuned: Sequence[Result]) -> str:
+    """Compare r_e, or what final policies return where the published class ends its episodes otherwise."""
+    if not environment.comparable:
+        return "not comparable"
+    if not environment.published_ends:
+        return _yes(float(np.mean([result.end_return for result in tuned])) > best)
+    played = [result.published_ends.mean for result in tuned if result.published_ends is not None]
+    return _yes(float(np.mean(played)) > best) if played else NOT_RUN
 
 
 def _yes(met: bool) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from cirl_marl.paper.published import PaperEnvironment, Published
-from cirl_marl.paper.results import WINDOW, Result
+from cirl_marl.paper.results import WINDOW, Evaluation, Result
 
 COLUMNS = ("algorithm", "run", "seeds", "r_s", "r_e", "ζ", "ψ", "s (%)", "final policy", "minutes", "CPU min", "remark")
 NUMERIC = COLUMNS[3:11]
@@ -54,6 +54,19 @@ def table_rows(environment: PaperEnvironment, results: Iterable[Result]) -> list
     if not tuned:
         rows.append(_our_row(environment, "", "tuned", []))
     return rows
+
+
+def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Write a table in Markdown.
+
+    >>> print(markdown_table(("a", "b"), [("1", "2")]))
+    | a | b |
+    |-|-|
+    | 1 | 2 |
+    """
+    lines = ("| " + " | ".join(cells) + " |" for cells in (columns, *rows))
+    head, *body = lines
+    return "\n".join([head, "|" + "-|" * len(columns), *body])
 
 
 def number(value: float | None) -> str:
@@ -154,18 +167,26 @@ def _broke(result: Result) -> str:
 def notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
     """Say what final policies played and how much episodes vary, what is the best possible, and what differs."""
     best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
-    own = [
-        (result.row.recipe, result.evaluation)
-        for result in results
-        if result.row.environment == environment.name and result.evaluation is not None
-    ]
-    played = ""
-    if own:
-        episodes = " or ".join(distinct(evaluation.episodes for _, evaluation in own))
-        spread = [evaluation.deviation for recipe, evaluation in own if recipe == "tuned"]
-        varied = f"; those of tuned ones vary by sd {number(float(np.mean(spread)))} an episode" if spread else ""
-        played = f"Final policy: {episodes} episodes a seed{varied}. "
-    return f"{played}Optimum: {best}. {environment.remark}".rstrip()
+    mine = [result for result in results if result.row.environment == environment.name]
+    evaluations = [result.evaluation for result in mine if result.evaluation is not None]
+    tuned = [result for result in mine if result.row.recipe == "tuned"]
+    sentences = []
+    if evaluations:
+        episodes = " or ".join(distinct(evaluation.episodes for evaluation in evaluations))
+        spread = [result.evaluation for result in tuned if result.evaluation is not None]
+        varied = f"; {_spread(spread)}" if spread else ""
+        sentences.append(f"Final policy: {episodes} episodes a seed{varied}.")
+    ended = [result.published_ends.mean for result in tuned if result.published_ends is not None]
+    if ended:
+        sentences.append(f"Tuned ones where episodes end as the published class ends them: {over_seeds(ended)}.")
+    return " ".join([*sentences, f"Optimum: {best}.", environment.remark]).rstrip()
+
+
+def _spread(evaluations: Sequence[Evaluation]) -> str:
+    deviation = float(np.mean([evaluation.deviation for evaluation in evaluations]))
+    if deviation < 1e-9 * max(abs(evaluation.mean) for evaluation in evaluations):
+        return "they are all alike, as the start is fixed"
+    return f"those of tuned ones vary by sd {number(deviation)} an episode"
 
 
 def distinct(values: Iterable[object]) -> list[str]:

@@ -13,7 +13,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import ValidationError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -24,24 +23,18 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from cirl_marl.catalogue import load_network
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluate import EVALUATION_SEEDS, SEED_SPACING
-from cirl_marl.learners.algorithms import algorithm_class
+from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.recipe import Recipe, load_recipe
-from cirl_marl.learners.run import versions
 from cirl_marl.learners.training import one_torch_thread
+from cirl_marl.machine import processor, versions
+from cirl_marl.paper.evaluation import Predict, Report, evaluate, evaluation_episodes, predictor
 from cirl_marl.paper.plan import tuned_recipe
 from cirl_marl.paper.published import PaperEnvironment, environment_of
-from cirl_marl.paper.results import WINDOW, Evaluation, Result, Row, thinned
+from cirl_marl.paper.results import WINDOW, Result, Row, thinned
 from cirl_marl.results import fingerprint
 
-EVALUATION_EPISODES = 100
-EVALUATION_COPIES = 20
 PACKAGES = ("gymnasium-robotics", "mujoco")
 """On which the two robots depend, beside what every training run records."""
-
-Report = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and how much there is."""
-Predict = Callable[[Any, Any, NDArray[np.bool_]], tuple[NDArray[Any], Any]]
-"""From observations, recurrent state and episode starts to deterministic actions and the next recurrent state."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,9 +89,12 @@ def run_row(row: Row, *, report: Report | None = None, success_episodes: int | N
             raise CirlError(f"{row}: no training episode ended; use more steps")
         episodes = evaluation_episodes(environment, success_episodes)
         seed = EVALUATION_SEEDS + SEED_SPACING * row.seed
-        evaluation = None
+        evaluation = published_ends = None
         if trained.predict is not None:
             evaluation = evaluate(environment.id, trained.predict, episodes, seed, report, trained.options)
+            if environment.published_ends:
+                options = trained.options | {"legacy_episode": True}  # its first episode is longer than all others
+                published_ends = evaluate(environment.id, trained.predict, episodes, seed, report, options, warm_up=1)
         threads = torch.get_num_threads()
     window = max(1, min(WINDOW, len(trained.returns) // 2))
     return Result(
@@ -112,17 +108,17 @@ def run_row(row: Row, *, report: Report | None = None, success_episodes: int | N
         evaluation=evaluation,
         settings=trained.settings,
         versions=versions() | {package: metadata.version(package) for package in PACKAGES},
-        machine={"cpus": os.cpu_count(), "torch_threads": threads, "load": os.getloadavg()[0], "device": "cpu"},
+        machine={
+            "cpus": os.cpu_count(),
+            "model": processor(),
+            "torch_threads": threads,
+            "load": os.getloadavg()[0],
+            "device": "cpu",
+        },
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
         cpu_seconds=trained.cpu_seconds,
+        published_ends=published_ends,
     )
-
-
-def evaluation_episodes(environment: PaperEnvironment, success_episodes: int | None) -> int:
-    """Return how many episodes a final policy plays: where successes are counted, as many as asked for."""
-    if not environment.success_episodes:
-        return EVALUATION_EPISODES
-    return environment.success_episodes if success_episodes is None else success_episodes
 
 
 def outdated(result: Result, success_episodes: int | None = None) -> str:
@@ -183,7 +179,7 @@ def train_published(environment: PaperEnvironment, row: Row, report: Report) -> 
     name, _, hindsight = row.algorithm.partition("-")
     policy = "MultiInputPolicy" if hindsight else "MlpPolicy"
     extra: dict[str, Any] = {"replay_buffer_class": HerReplayBuffer} if hindsight else {}
-    model = algorithm_class(name)(policy, env, seed=row.seed, device="cpu", **extra)
+    model = build(name, policy, DummyVecEnv([lambda: env]), extra, seed=row.seed, device="cpu")
     elapsed = stopwatch()
     diverged = False
     try:
@@ -224,15 +220,6 @@ def described(environment: PaperEnvironment) -> dict[str, Any]:
     return found
 
 
-def predictor(model: BaseAlgorithm, normalise: Callable[[Any], Any] = lambda observation: observation) -> Predict:
-    """Return the deterministic policy of ``model`` behind the normalisation that it was trained with."""
-
-    def predict(observation: Any, state: Any, starts: NDArray[np.bool_]) -> tuple[NDArray[Any], Any]:
-        return model.predict(normalise(observation), state, starts, deterministic=True)
-
-    return predict
-
-
 def episodes_of(monitors: list[Monitor[Any, Any]]) -> tuple[list[int], list[float]]:
     """Return when the episodes of several copies ended, in steps summed over the copies, and their returns, in order.
 
@@ -245,44 +232,6 @@ def episodes_of(monitors: list[Monitor[Any, Any]]) -> tuple[list[int], list[floa
     ]
     found.sort()
     return [end for end, _, _ in found], [value for _, _, value in found]
-
-
-def evaluate(
-    id_: str, predict: Predict, episodes: int, seed: int, report: Report, options: dict[str, Any]
-) -> Evaluation:
-    """Return mean return and share of successes of ``episodes`` fresh episodes.
-
-    Each copy plays a fixed number of episodes, so that short ones are not favoured.
-    """
-    copies = min(EVALUATION_COPIES, episodes)
-    env = DummyVecEnv([lambda: Monitor(gymnasium.make(id_, **options))] * copies)
-    env.seed(seed)
-    quota = np.array([(episodes + copy) // copies for copy in range(copies)])
-    played = np.zeros(copies, dtype=int)
-    reached, starts = np.zeros(copies, dtype=bool), np.ones(copies, dtype=bool)
-    returns: list[float] = []
-    successes: list[bool] = []
-    knows_success, state, observation = False, None, env.reset()
-    while (played < quota).any():
-        actions, state = predict(observation, state, starts)
-        observation, _, starts, infos = env.step(actions)
-        for copy, info in enumerate(infos):
-            knows_success |= "success" in info
-            reached[copy] |= bool(info.get("success", False))
-            if starts[copy]:
-                if played[copy] < quota[copy]:
-                    returns.append(float(info["episode"]["r"]))
-                    successes.append(bool(reached[copy]))
-                played[copy] += 1
-                reached[copy] = False
-        report("evaluating", len(returns), episodes)
-    env.close()
-    return Evaluation(
-        episodes=len(returns),
-        mean=float(np.mean(returns)),
-        deviation=float(np.std(returns)),
-        success=100 * float(np.mean(successes)) if knows_success else None,
-    )
 
 
 class Watch(BaseCallback):

@@ -20,17 +20,16 @@ from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
 from cirl_marl.learners.recipe import Learner
 from cirl_marl.learners.trainee import derived_seed
+from cirl_marl.paper.evaluation import Report, predictor
 from cirl_marl.paper.plan import tuned_recipe
 from cirl_marl.paper.published import PaperEnvironment
 from cirl_marl.paper.results import Row
 from cirl_marl.paper.training import (
-    Report,
     Trained,
     Watch,
     check_registered,
     described,
     episodes_of,
-    predictor,
     stopwatch,
 )
 

@@ -51,9 +51,10 @@ class Reacher:
 
     Inputs are the control signals of both joints in [−1, 1], which Gymnasium documents as torques in N·m; the model
     file gears them up by 200. Reward: −|tip − target| − |inputs|², after the step. The task is done while the tip is
-    within 0.04 m of the target and both torques, taken as Gymnasium's, are below 0.005 N·m (arXiv 2505.21536); the
-    speed does not count. Equal seeds and float64 actions give Gymnasium's episodes bit for bit; with float32 actions
-    Gymnasium squares them in float32.
+    within 0.04 m of the target and both torques, taken as Gymnasium's, are below 0.005 N·m (arXiv 2505.21536), which
+    here means their amounts [inferred: signed, any strong push backwards would do]; the speed does not count. Equal
+    seeds and float64 actions give Gymnasium's episodes bit for bit; with float32 actions Gymnasium squares them in
+    float32.
 
     The state holds Gymnasium's ten observations, the distance of tip and target, and the simulator's state.
 
