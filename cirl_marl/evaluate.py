@@ -141,12 +141,21 @@ def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
     return relative(rollout_.episode_circularity - reference, reference)
 
 
+def time_window(network: Network, rollout_: Rollout) -> Floats:
+    """Return 2·c·λ̄ of each episode, shape (B,), mass; c is the criticality that the network states.
+
+    It is the time-window circularity of CIRO7.2: see ``staged.time_window_circularity``.
+    """
+    assert network.objective.criticality is not None
+    return CIRO_FACTOR * network.objective.criticality * rollout_.episode_circularity
+
+
 def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
     """Return the figures of each controller beside those of ``neutral``, ready for JSON.
 
     Each figure is a mean over episodes with its 95 % confidence interval; gains are paired, episode by episode, with
     the neutral controller's from the same start. A network that states the criticality of its material has its
-    time-window circularity as well (see ``staged.time_window_circularity``).
+    time-window circularity as well (see ``time_window``).
     """
     neutral = rollouts["neutral"]
     figures = {}
@@ -159,10 +168,8 @@ def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
             "return": _by_agent(env, run.returns),
             "local_return": _by_agent(env, run.local_returns),
         }
-        criticality = env.network.objective.criticality
-        if criticality is not None:
-            weighted = CIRO_FACTOR * criticality * run.episode_circularity
-            figures[name]["time_window_circularity"] = over_episodes(weighted).as_dict()
+        if env.network.objective.criticality is not None:
+            figures[name]["time_window_circularity"] = over_episodes(time_window(env.network, run)).as_dict()
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}
 
 

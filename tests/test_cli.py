@@ -137,7 +137,7 @@ def test_check_remarks_on_services_that_nobody_owes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without a debtor that acts, stopping everything would pay: that is said, and is no mistake."""
-    owed = 'owed_by = ["quarry", "refill"]'
+    owed = 'owed_by = ["quarry", "disposal"]'
     assert owed in guide()
     for changed, said in (
         (owed, ""),
@@ -427,11 +427,15 @@ def test_improvement_that_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
 
 
-def test_simulate_with_inner_physics(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_simulate_with_inner_physics(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The CSV holds masses on the way and what an agent may see of inner states; the regulator runs where it can."""
     monkeypatch.chdir(tmp_path)
     held = ("simulate", "solids_net", "--control", "scripted", "--set", "sorter=0", "--steps", "40")
     assert run(monkeypatch, *held) == 0
+    figures = re.findall(r"(λ̄ =|time-window circularity) (\S+) kg", capsys.readouterr().out)
+    assert float(figures[1][1]) == pytest.approx(2 * 0.1 * float(figures[0][1]), rel=1e-3)
     header, *rows = (tmp_path / "solids_net_scripted.csv").read_text().splitlines()
     assert len(rows) == 1 + 40
     columns = header.split(",")

@@ -15,7 +15,7 @@ from cirl_marl.controllers import Controller
 from cirl_marl.controllers.named import CONTROLLERS, SETTABLE, named_controller
 from cirl_marl.controllers.planner import Watched
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluate import Rollout, interval_ends, rollout
+from cirl_marl.evaluate import Rollout, interval_ends, rollout, time_window
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
 
@@ -223,10 +223,13 @@ def _actor(
 
 
 def _say_figures(run: Rollout, network: Network) -> None:
-    console.print(
-        f"λ̄ = {float(run.episode_circularity[0]):.5g} {network.mass_unit}, "
-        f"service level {float(run.episode_service[0]):.4f}"
-    )
+    figures = [
+        f"λ̄ = {float(run.episode_circularity[0]):.5g} {network.mass_unit}",
+        f"service level {float(run.episode_service[0]):.4f}",
+    ]
+    if network.objective.criticality is not None:
+        figures.append(f"time-window circularity {float(time_window(network, run)[0]):.5g} {network.mass_unit}")
+    console.print(", ".join(figures))
 
 
 def _held(control: str, settings: list[str]) -> dict[str, float]:
