@@ -49,7 +49,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             legacy_episode: reproduce the step counter of the published classes. It is checked at the start of a step
                 and survives ``reset``: when it has reached the horizon, the state is drawn anew, one step is taken from
                 there, and its time limit is reported as termination. So the first episode has horizon + 1 steps, and
-                each later one horizon − 1 and one more from an unrelated state.
+                each later one horizon − 1 and one more from a fresh start.
             **options: those of ``parallel_env``, but for ``agents``.
 
         Raises:

@@ -1,4 +1,4 @@
-"""A network built in Python: glass bottles of a town, kept in use by a deposit scheme.
+"""A network built in Python: glass bottles of a town, which a deposit scheme keeps from disposal.
 
 Shows the parts of a network, what λ is made of, and a question asked by snapshot and restore: what would circularity be
 if the deposit scheme did nothing?
@@ -21,10 +21,10 @@ network = Network(
     ),
     arcs=(
         Arc(id="glassworks", donor="quarry", recipient="households", rate=5e-4, control=valve, scale=5.0),
-        Arc(id="deposit", donor="households", recipient="landfill", rate=0.05, control=valve, scale=5.0),
+        Arc(id="disposal", donor="households", recipient="landfill", rate=0.05, control=valve, scale=5.0),
     ),
     services=(
-        Service(id="bottles", provider="households", quantity="stock", low=95.0, owed_by=("glassworks", "deposit")),
+        Service(id="bottles", provider="households", quantity="stock", low=95.0, owed_by=("glassworks", "disposal")),
     ),
     episode=Episode(control_interval=1.0, horizon=60),
     objective=Objective(circularity_scale=10.0),
@@ -32,14 +32,14 @@ network = Network(
 
 env = parallel_env(network)
 env.reset(seed=0)
-act = {"glassworks": np.array([-0.6]), "deposit": np.array([-1.0])}
+act = {"glassworks": np.array([-0.6]), "disposal": np.array([-1.0])}
 for _ in range(30):
     env.step(act)
 
 here = env.snapshot()
-acting = env.step(act)[4]["deposit"]["circularity"]
+acting = env.step(act)[4]["disposal"]["circularity"]
 env.restore(here)
-idle = env.step(act | {"deposit": env.neutral_action["deposit"]})[4]["deposit"]["circularity"]
+idle = env.step(act | {"disposal": env.neutral_action["disposal"]})[4]["disposal"]["circularity"]
 
 summary = f"λ = {acting:.2f} t with the deposit scheme, {idle:.2f} t without it on that day"
 print(summary)

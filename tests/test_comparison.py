@@ -158,7 +158,7 @@ def test_other_environments_are_refused(bottles: Network, runs: list[Path], tmp_
     with pytest.raises(RunError, match=r"longer: not the same environment as .*: horizon 15, not 14"):
         compare([runs[0], tmp_path / "longer"])
     train(bottles, "independent_a2c", directory=tmp_path / "alone", steps=320, envs=8, agents=["quarry"])
-    with pytest.raises(RunError, match=r"agents \['quarry'\], not \['quarry', 'refill'\]"):
+    with pytest.raises(RunError, match=r"agents \['quarry'\], not \['quarry', 'disposal'\]"):
         compare([runs[0], tmp_path / "alone"])
     with pytest.raises(RunError, match=r"0: not the same .* the network given: network 'bottles', not 'copper_net'"):
         compare(runs[:1], network="copper_net")

@@ -63,6 +63,13 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert (tmp_path / "runs" / "mine" / "status.json").is_file()
 
 
+def test_readme_example_of_one_agent_runs() -> None:
+    """One compartment learns as printed, but for a shorter training."""
+    code = (ROOT / "README.md").read_text().split("```python\n")[2].split("```")[0]
+    assert ".learn(20_000)" in code
+    exec(compile(code.replace("20_000", "2_048"), "README.md", "exec"), {})
+
+
 def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The whole network shown to newcomers reads without a mistake and can be run."""
     definition = tmp_path / "bottles.toml"
@@ -72,6 +79,17 @@ def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:
     env.reset(seed=0)
     env.step({agent: [0.0] for agent in env.agents})
     assert network.scenario("crisis").nodes[0].initial == (1000.0, 1000.0)
+
+
+def test_own_model_in_the_guide_is_valid(tmp_path: Path) -> None:
+    """The tables shown for a model of one's own belong to a network that can be run."""
+    whole, parts = (part.split("```")[0] for part in (ROOT / "envs" / "README.md").read_text().split("```toml\n")[1:])
+    definition = tmp_path / "brewery.toml"
+    definition.write_text(re.sub(r"\[episode\].*?\n\n", "", whole.split("[nodes.")[0], flags=re.DOTALL) + parts)
+    env = cirl_marl.parallel_env(definition)
+    env.reset(seed=0)
+    infos = env.step({"tank": [0.5]})[-1]
+    assert infos["tank"]["flows"][0] > 0.0
 
 
 def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
