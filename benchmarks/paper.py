@@ -226,7 +226,7 @@ def _compare_speed(steps: int) -> None:
 
     with live_bar(console, "CopperNet") as report:
         found = compare(steps, report)
-    console.print(speed_table(found))
+    console.print(speed_table(found), soft_wrap=True, markup=False)
 
 
 if __name__ == "__main__":
