@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Iterator, Mapping
 from typing import Any
 
 from cirl_marl.compartments import CompartmentModel, model_class
@@ -21,6 +19,7 @@ from cirl_marl.elements import (
     ranged_states,
 )
 from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.mistakes import parameter_mistakes
 from cirl_marl.network import Network
 from cirl_marl.schema import (
     ArcTable,
@@ -45,8 +44,12 @@ NEEDED = {
 }
 """What each law needs, one of the given."""
 
-BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-"""Kinds of the parameters that a definition can give."""
+HINTS = {
+    "rate": "a rate, 1/time, is the flow divided by the stock of its donor (law 'recipient': of its recipient); "
+    "a flow that is known is law = \"exogenous\" with 'flow'",
+    "steps": "the horizon counts control intervals (steps), which have unit '1'",
+}
+"""What else to say where a unit does not fit, by kind of quantity."""
 
 
 class Converter:
@@ -57,8 +60,9 @@ class Converter:
         self.table = table
         self.mistakes: list[str] = []
         mass, time = table.units.mass, table.units.time
-        self.targets = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})", "1": "1"}
+        self.targets = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})", "steps": "1"}
         self.factors: dict[tuple[str, str], float] = {}
+        self.scales: dict[str, float] = {}
 
     def network(self, scenario: str) -> Network:
         """Return the network.
@@ -73,10 +77,14 @@ class Converter:
             except CirlError as error:
                 raise NetworkError(table.name, [f"units.{key}: {error}"]) from None
         episode, objective = table.episode, table.objective
+        for key, kind, scale in (("stock", "mass", table.scales.stock), ("flow", "flow", table.scales.flow)):
+            self.scales[kind] = self._value(scale, kind, f"scales.{key}")
+            if self.scales[kind] <= 0:
+                self.mistakes.append(f"scales.{key}: {scale.value} must be positive")
         nodes = tuple(self._node(id_, node) for id_, node in table.nodes.items())
         arcs = tuple(self._arc(id_, arc) for id_, arc in table.arcs.items())
         services = tuple(self._service(id_, service) for id_, service in table.services.items())
-        horizon = self._value(episode.horizon, "1", "episode.horizon")
+        horizon = self._value(episode.horizon, "steps", "episode.horizon")
         if horizon != int(horizon):
             self.mistakes.append(f"episode.horizon: {horizon} must be a whole number of control intervals")
         settings: dict[str, Any] = {
@@ -121,7 +129,7 @@ class Converter:
             role=node.role,
             initial=(node.initial.low * scale, node.initial.high * scale),
             set_point=self._optional(node.set_point, "mass", f"{where}.set_point"),
-            scale=self._value(node.scale or self.table.scales.stock, "mass", f"{where}.scale"),
+            scale=self._scale(node.scale, "mass", where),
             control=self._control(node.control, model.get("model"), f"{where}.control"),
             **model,
         )
@@ -141,10 +149,8 @@ class Converter:
         batches: tuple[tuple[float, float], ...] = ()
         if arc.batches is not None:
             batches = self._batches(arc.batches, f"{where}.batches")
-        batch = arc.law is Law.BATCH
         model = self._model(arc.model, f"{where}.model")
         rate_kind = {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}.get(arc.law, "rate")
-        default = self.table.scales.stock if batch else self.table.scales.flow
         return Arc(
             id=id_,
             donor=arc.from_,
@@ -158,7 +164,7 @@ class Converter:
             flow=flow,
             times=times,
             set_point=self._optional(arc.set_point, "flow", f"{where}.set_point"),
-            scale=self._value(arc.scale or default, "mass" if batch else "flow", f"{where}.scale"),
+            scale=self._scale(arc.scale, "mass" if arc.law is Law.BATCH else "flow", where),
             pollutant=arc.pollutant,
             control=self._control(arc.control, model.get("model"), f"{where}.control"),
             **model,
@@ -203,7 +209,7 @@ class Converter:
             self.mistakes.append(f"{where}: {error}")
             return {}
         form = {} if table.form is None else {"form": table.form}
-        mistakes = list(_parameter_mistakes(kind, table.parameters, form))
+        mistakes = list(parameter_mistakes(kind, table.parameters, form))
         self.mistakes += (f"{where}: {mistake}" for mistake in mistakes)
         if mistakes:
             return {}
@@ -232,16 +238,28 @@ class Converter:
     def _control(self, control: ControlTable | None, model: CompartmentModel | None, where: str) -> Control | None:
         if control is None:
             return None
-        target = "flow" if control.kind is ControlKind.FLOW else "1"
-        if control.kind is ControlKind.INPUT:
-            target = getattr(model, "input_unit", control.unit)
-        unit = self._factor(control.unit, target, where)
+        target = {
+            ControlKind.RATE: "1",
+            ControlKind.FLOW: "flow",
+            ControlKind.INPUT: control.unit if model is None else getattr(model, "input_unit", None),
+        }[control.kind]
+        if target is None and model is not None and control.unit != "1":
+            self.mistakes.append(
+                f"{where}: unit '{control.unit}': model '{model.kind}' states no input_unit to convert to; "
+                f"give its class one, or write unit = '1' and the numbers as the model takes them"
+            )
+            return None
+        unit = self._factor(control.unit, target or "1", where)
         return Control(
             kind=control.kind,
             low=control.low * unit,
             high=control.high * unit,
             neutral=control.neutral * unit,
         )
+
+    def _scale(self, own: Quantity | None, kind: str, where: str) -> float:
+        """Return a compartment's own reference value, or that of all that state none."""
+        return self.scales[kind] if own is None else self._value(own, kind, f"{where}.scale")
 
     def _value(self, quantity: Quantity, kind: str, where: str) -> float:
         return quantity.value * self._factor(quantity.unit, kind, where)
@@ -255,33 +273,6 @@ class Converter:
             try:
                 self.factors[unit, kind] = factor(unit, self.targets.get(kind, kind))
             except CirlError as error:
-                self.mistakes.append(f"{where}: {error}")
+                self.mistakes.append(f"{where}: {error}" + (f"; {HINTS[kind]}" if kind in HINTS else ""))
                 return 1.0
         return self.factors[unit, kind]
-
-
-def _parameter_mistakes(
-    kind: type[Any], parameters: Mapping[str, bool | float], form: Mapping[str, str]
-) -> Iterator[str]:
-    """Yield what a model does not take, what it needs besides, and numbers and truth values that are none."""
-    known = {name: each for name, each in inspect.signature(kind).parameters.items() if each.kind in BY_NAME}
-    for name in (*parameters, *form):
-        if name not in known:
-            yield unknown("parameter", name, known)
-    for name, parameter in known.items():
-        if parameter.default is parameter.empty and name not in {*parameters, *form}:
-            yield f"{name}: missing" if name == "form" else f"parameters.{name}: missing"
-        elif name in parameters:
-            yield from _type_mistakes(parameter, parameters[name])
-
-
-def _type_mistakes(parameter: inspect.Parameter, value: bool | float) -> Iterator[str]:
-    """Yield it if a value is not of a parameter's kind: true or false, or, unless another default is seen, a number."""
-    default = parameter.default
-    if default is not parameter.empty and not isinstance(default, int | float):
-        yield f"parameters.{parameter.name}: is no number, so that a definition cannot give it"
-        return
-    truth = isinstance(default, bool) or (default is parameter.empty and parameter.annotation in (bool, "bool"))
-    if truth != isinstance(value, bool):
-        needs = "true or false" if truth else "a number"
-        yield f"parameters.{parameter.name}: needs {needs}, got {value!r}"

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from cirl_marl.conversion import Converter
 from cirl_marl.errors import DefinitionError, NetworkError, unknown
-from cirl_marl.mistakes import choices, mistakes_of
+from cirl_marl.mistakes import choices, mistakes_of, toml_mistake
 from cirl_marl.network import Network
 from cirl_marl.schema import NetworkTable
 
@@ -72,13 +72,15 @@ def read_toml(path: Path) -> dict[str, Any]:
         DefinitionError: if it is missing, unreadable or not TOML (with line and column).
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise DefinitionError(str(path), ["no such file"]) from None
     except (OSError, UnicodeDecodeError) as error:
         raise DefinitionError(str(path), [f"cannot be read: {error}"]) from error
+    try:
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise DefinitionError(str(path), [f"not valid TOML: {error}"]) from error
+        raise DefinitionError(str(path), [toml_mistake(error, text)]) from error
 
 
 def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from cirl_marl.errors import NetworkError, unknown
+from cirl_marl.fields import check_numbers, choice
 from cirl_marl.rowsum import Floats
 
 if TYPE_CHECKING:
@@ -48,21 +48,6 @@ class ControlKind(StrEnum):
     INPUT = "input"
 
 
-Choice = TypeVar("Choice", bound=StrEnum)
-
-
-def _choice(owner: str, what: str, kinds: type[Choice], value: str) -> Choice:
-    """Return the member that a value is, or spells.
-
-    Raises:
-        NetworkError: if it is none; names the nearest.
-    """
-    try:
-        return kinds(value)
-    except ValueError:
-        raise NetworkError(owner, [unknown(what, value, kinds)]) from None
-
-
 def ranged_states(model: CompartmentModel) -> tuple[str, ...]:
     """Return the states whose start is drawn from a given range: all, unless the model has a ``start`` of its own."""
     return () if hasattr(model, "start") else model.state_names
@@ -86,8 +71,9 @@ class Control:
     neutral: float
 
     def __post_init__(self) -> None:
-        """Take a kind as definitions spell it."""
-        object.__setattr__(self, "kind", _choice("control", "kind", ControlKind, self.kind))
+        """Refuse what is no number; take a kind as definitions spell it."""
+        check_numbers("control", self)
+        object.__setattr__(self, "kind", choice("control", "kind", ControlKind, self.kind))
 
     def action(self, value: Floats) -> Floats:
         """Return the normalised actions, in [-1, 1], that come closest to physical values."""
@@ -143,8 +129,9 @@ class Node(Compartment):
     initial: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Take a role as definitions spell it."""
-        object.__setattr__(self, "role", _choice(f"node '{self.id}'", "role", Role, self.role))
+        """Refuse what is no number; take a role as definitions spell it."""
+        check_numbers(f"node '{self.id}'", self)
+        object.__setattr__(self, "role", choice(f"node '{self.id}'", "role", Role, self.role))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,8 +167,9 @@ class Arc(Compartment):
     pollutant: bool = True
 
     def __post_init__(self) -> None:
-        """Take a law as definitions spell it."""
-        object.__setattr__(self, "law", _choice(f"arc '{self.id}'", "law", Law, self.law))
+        """Refuse what is no number; take a law as definitions spell it."""
+        check_numbers(f"arc '{self.id}'", self)
+        object.__setattr__(self, "law", choice(f"arc '{self.id}'", "law", Law, self.law))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -279,12 +267,14 @@ Solver = Literal["exact", "rk4", "euler"]
 NetZero = Literal["signed", "abs"]
 Reward = Literal["local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team"]
 Observe = Literal["local", "neighbours", "full", "stocks", "model"]
+Moment = Literal["end", "mean"]
 ServiceQuantity = Literal["stock", "outflow", "flow", "measure"]
 
 SOLVERS: tuple[str, ...] = get_args(Solver)
 NET_ZERO: tuple[str, ...] = get_args(NetZero)
 REWARDS: tuple[str, ...] = get_args(Reward)
 OBSERVE: tuple[str, ...] = get_args(Observe)
+MOMENTS: tuple[str, ...] = get_args(Moment)
 QUANTITIES: tuple[str, ...] = get_args(ServiceQuantity)
 SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})
 MAX_STEPS = 10_000

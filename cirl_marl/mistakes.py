@@ -1,15 +1,44 @@
-"""Validation errors in the words of the file: key, value, nearest valid name."""
+"""Mistakes in definition files, in the words of the file: line or key, value, nearest valid name."""
 
 from __future__ import annotations
 
+import inspect
+import re
+import tomllib
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
 from cirl_marl.errors import unknown
+
+BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+"""Kinds of the parameters that a definition can give."""
+
+
+def toml_mistake(error: tomllib.TOMLDecodeError, text: str) -> str:
+    """Say where ``text`` is not valid TOML, and what to write if it is for a bare word."""
+    word = _bare_word(str(error), text)
+    if word.lower() in ("true", "false"):
+        return f"not valid TOML: {error}: {word}; write {word.lower()}"
+    return f"not valid TOML: {error}" + (f': {word}; text needs quotes, "{word}"' if word else "")
+
+
+def _bare_word(error: str, text: str) -> str:
+    """Return the words without quotes that stand as a value where reading failed; empty if there are none.
+
+    A word that begins with a digit, such as 1/day, fails only where the number in it ends.
+    """
+    place = re.search(r"line (\d+), column (\d+)", error)
+    if place is None or not error.startswith(("Invalid value", "Expected newline", "Unclosed")):
+        return ""
+    line, column = text.split("\n")[int(place[1]) - 1], int(place[2]) - 1
+    start = column if error.startswith("Invalid value") else line.rfind("=", 0, column) + 1
+    found = re.compile(r"[^][{}\"'#,=]*+(?!=)").match(line, start)
+    word = found[0].strip() if found is not None and found.end() > column else ""
+    return word if re.search(r"[^\W\d]", word) else ""
 
 
 def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[str]:
@@ -55,3 +84,30 @@ def _model_at(model: type[BaseModel], location: list[str]) -> type[BaseModel] | 
         if isinstance(current, types.UnionType):
             current = next(arg for arg in typing.get_args(current) if arg is not type(None))
     return current if isinstance(current, type) and issubclass(current, BaseModel) else None
+
+
+def parameter_mistakes(
+    kind: type[Any], parameters: Mapping[str, bool | float], form: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield what a model does not take, what it needs besides, and numbers and truth values that are none."""
+    known = {name: each for name, each in inspect.signature(kind).parameters.items() if each.kind in BY_NAME}
+    for name in (*parameters, *form):
+        if name not in known:
+            yield unknown("parameter", name, known)
+    for name, parameter in known.items():
+        if parameter.default is parameter.empty and name not in {*parameters, *form}:
+            yield f"{name}: missing" if name == "form" else f"parameters.{name}: missing"
+        elif name in parameters:
+            yield from _type_mistakes(parameter, parameters[name])
+
+
+def _type_mistakes(parameter: inspect.Parameter, value: bool | float) -> Iterator[str]:
+    """Yield it if a value is not of a parameter's kind: true or false, or, unless another default is seen, a number."""
+    default = parameter.default
+    if default is not parameter.empty and not isinstance(default, int | float):
+        yield f"parameters.{parameter.name}: is no number, so that a definition cannot give it"
+        return
+    truth = isinstance(default, bool) or (default is parameter.empty and parameter.annotation in (bool, "bool"))
+    if truth != isinstance(value, bool):
+        needs = "true or false" if truth else "a number"
+        yield f"parameters.{parameter.name}: needs {needs}, got {value!r}"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -56,9 +55,8 @@ def problems(network: Network) -> Iterator[str]:
             yield f"units.{key}: {error}"
     if not network.nodes:
         yield "nodes: a network needs at least one"
-    compartments = [c.id for c in (*network.nodes, *network.arcs)]
-    yield from _name_problems("compartment", compartments)
-    yield from _name_problems("service", [service.id for service in network.services])
+    yield from _name_problems([*(("node", n.id) for n in network.nodes), *(("arc", a.id) for a in network.arcs)])
+    yield from _name_problems([("service", service.id) for service in network.services])
     nodes = {node.id: node for node in network.nodes}
     everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
     for node in network.nodes:
@@ -88,8 +86,10 @@ def problems(network: Network) -> Iterator[str]:
     yield from setting_problems(network)
     acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.acting:
-        if agent not in acting:
-            yield f"agents: {unknown('acting compartment', agent, acting)}"
+        if agent in everyone and agent not in acting:
+            yield f"agents: '{agent}' has no control, so that it cannot act"
+        elif agent not in acting:
+            yield f"agents: {unknown('agent', agent, acting)}"
     yield from repeated("agents", network.acting)
 
 
@@ -102,13 +102,18 @@ def _ports(network: Network) -> dict[tuple[str, str], list[str]]:
     return found
 
 
-def _name_problems(kind: str, ids: list[str]) -> Iterator[str]:
-    for id_ in dict.fromkeys(ids):
+def _name_problems(named: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Yield ids that are none, and those used twice, of what shares one set of names, given as (kind, id)."""
+    kinds: dict[str, list[str]] = {}
+    for kind, id_ in named:
+        kinds.setdefault(id_, []).append(kind)
+    for id_, users in kinds.items():
+        who = f"{' and '.join(dict.fromkeys(users))} '{id_}'"
         if not re.fullmatch(IDENTIFIER, id_):
-            yield f"{kind} '{id_}': an id begins with a letter and has lower-case letters, digits and underscores only"
-    for id_, times in Counter(ids).items():
-        if times > 1:
-            yield f"{kind} '{id_}': the id is used twice"
+            yield f"{who}: an id begins with a letter and has lower-case letters, digits and underscores only"
+        if len(users) > 1:
+            shared = "; nodes and arcs share one set of names" if len(set(users)) > 1 else ""
+            yield f"{who}: the id is used twice{shared}"
 
 
 def _node_problems(network: Network, node: Node) -> Iterator[str]:

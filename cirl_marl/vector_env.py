@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from cirl_marl.actuators import Actuators
 from cirl_marl.catalogue import load_network
 from cirl_marl.credit import Credit
-from cirl_marl.elements import REWARDS
+from cirl_marl.elements import MOMENTS, REWARDS
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.observe import ObservationLayout
@@ -87,7 +87,7 @@ class VectorEnv:
         self.network = found
         self.num_envs = num_envs
         self.reward_mode = _choice("reward", found.objective.reward if reward is None else reward, REWARDS)
-        measure = _choice("circularity", circularity, ("end", "mean"))
+        measure = _choice("circularity", circularity, MOMENTS)
         self.dynamics = Dynamics(found)
         self._actuators = Actuators(self.dynamics, agents, num_envs)
         self.agents = self._actuators.agents

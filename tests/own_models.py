@@ -20,6 +20,7 @@ class Fermenter:
     kind: ClassVar[str] = "fermenter"
     state_names: ClassVar[tuple[str, ...]] = ("biomass_g_l", "sugar_g_l")
     input_names: ClassVar[tuple[str, ...]] = ("dilution_per_day",)
+    input_unit: ClassVar[str] = "1/day"
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "after"
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
+import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, cli, learners
 from cirl_marl.catalogue import folder, networks
 from cirl_marl.definition import write_network
@@ -114,6 +115,53 @@ def test_check_takes_names_and_recipes(monkeypatch: pytest.MonkeyPatch, capsys: 
     said = capsys.readouterr().err
     assert "Did you mean 'copper_net'?" in said
     assert "Did you mean 'PPO'?" in said
+
+
+def test_check_tries_recipes_in_a_network(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Scenario, agents, matches and what the algorithms refuse; nothing is trained or written."""
+    network = str(folder("envs") / "carbo_net.toml")
+    good = 'name = "mine"\ntitle = "mine"\n[learner]\nalgorithm = "A2C"\n'
+    agent = cirl_marl.load_network(network).agents[0]
+    named = f'[[match]]\nagents = ["{agent}"]\nalgorithm = "PPO"\n'
+
+    def check(text: str, *options: str) -> tuple[int, str, str]:
+        Path("mine.toml").write_text(text)
+        code = run(monkeypatch, "check", "mine.toml", *options)
+        return code, *capsys.readouterr()
+
+    code, said, _ = check(good + named, "--network", network)
+    assert code == 0
+    assert f"mine.toml: recipe of A2C, PPO, 200,000 steps in 16 copies, in {network}: no mistakes" in said
+    assert "remark" not in said
+    _, said, _ = check(good + named + named, "--network", "carbo_net")
+    assert "mine.toml: remark on carbo_net: nobody learns by match.1" in said
+    for text, message in (
+        (good + '[environment]\nscenario = "papr"\n', "unknown scenario 'papr'. Did you mean 'paper'?"),
+        (
+            good + named.replace(agent, f"{agent}x"),
+            f"match.0.agents: unknown agent '{agent}x'. Did you mean '{agent}'?",
+        ),
+        (
+            good.replace("A2C", "PPO") + "parameters = { batch_size = 0 }\n",
+            "PPO refuses its parameters {'batch_size': 0}",
+        ),
+    ):
+        assert check(text)[0] == 0
+        code, _, said = check(text, "--network", "carbo_net")
+        assert code == 2
+        assert "mine.toml in carbo_net: " in said
+        assert message in said
+    assert [path.name for path in Path().iterdir()] == ["mine.toml"]
+    assert "Did you mean 'carbo_net'?" in check(good, "--network", "crbo_net")[2]
+
+
+@pytest.mark.parametrize("source", ["carbo_net", str(folder("envs") / "carbo_net.toml"), "independent_pp"])
+def test_check_tries_only_recipes_in_a_network(
+    source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A network has no other to fit."""
+    assert run(monkeypatch, "check", source, "--network", "carbo_net") == 2
+    assert f"check {source}: is no recipe; --network names the network that recipes must fit" in capsys.readouterr().err
 
 
 def test_check_runs_into_what_simulations_would(
@@ -453,10 +501,10 @@ def test_simulate_with_inner_physics(
         (["train", "copper_net", "--agents", "independent_pp"], "Did you mean 'independent_ppo'?"),
         (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
         (["train"], "train needs NETWORK, or --resume RUN"),
-        (["train", "--resume", "nowhere"], "unknown run directory 'nowhere'"),
+        (["train", "--resume", "nowhere"], "no run in nowhere (it has no config.json)"),
         (["train", "--resume", "nowhere", "--envs", "5", "--seed", "1"], "leave out --envs, --seed"),
         (["show", "copper_net", "--picture", "picture.pdf"], "needs the name of a .png file"),
-        (["evaluate", "nowhere"], "unknown run directory 'nowhere'"),
+        (["evaluate", "nowhere"], "no run in nowhere (it has no config.json)"),
         (["simulate", "copper_net", "--control", "nutral"], "Did you mean 'neutral'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mien=0"], "Did you mean 'mine'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mine=nan"], "must lie in [-1, 1]"),
@@ -468,11 +516,11 @@ def test_simulate_with_inner_physics(
         (["plan", "net_zero", "--control", "mpc", "--out", "p.csv"], "no bound is proved"),
         (["plan", "copper_net", "--control", "neutral", "--out", "p.txt"], "needs the name of a .csv file"),
         (["plan", "copper_net", "--control", "neutral", "--min-service", "1", "--out", "p.csv"], "goes with mpc"),
-        (["plan", "nowhere", "--out", "p.csv"], "unknown run directory 'nowhere'"),
+        (["plan", "nowhere", "--out", "p.csv"], "no run in nowhere (it has no config.json)"),
         (["pareto", "net_zero", "--out", "new"], "no bound is proved"),
         (["pareto", "coper_net", "--out", "new"], "Did you mean 'copper_net'?"),
         (["compare"], "give a training run or a network"),
-        (["compare", "nowhere"], "unknown run directory 'nowhere'"),
+        (["compare", "nowhere"], "no run in nowhere (it has no config.json)"),
         (["compare", "--network", "coper_net"], "Did you mean 'copper_net'?"),
         (["compare", "--network", "copper_net", "--controllers", "mcp"], "Did you mean 'mpc'?"),
         (

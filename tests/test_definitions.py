@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -141,6 +142,8 @@ def broken(tmp_path: Path, *changes: tuple[str, str]) -> str:
 
 
 RATE = 'rate = { value = 0.82, unit = "1/day"'
+ALONE = 'agents = ["use_to_collection"]'
+HORIZON = 'horizon = { value = 160, unit = "1"'
 REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
 
 
@@ -178,13 +181,18 @@ REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
         ("owed_by = [", 'owed_by = ["mine", "mine", ', ["'copper_in_use'", "owed_by", "'mine' twice"]),
         (RATE, RATE.replace("1/day", "kg"), ["arcs.refinery_to_fabrication.rate", "'kg'", "inconsistent"]),
         (RATE, RATE.replace("1/day", "1/dya"), ["arcs.refinery_to_fabrication.rate", "dya"]),
+        (
+            RATE,
+            RATE.replace("1/day", "t/day"),
+            ["refinery_to_fabrication.rate", "'t/day'", "the flow divided by the stock of its donor", '"exogenous"'],
+        ),
         (REFINERY, REFINERY.replace("kt", "knot"), ["nodes.refinery.initial", "'knot'", "inconsistent"]),
         (REFINERY, REFINERY.replace("kt", "kton"), ["nodes.refinery.initial", "'kton'", "kt (kilotonne)"]),
         (REFINERY, REFINERY.replace("60.0", "-6.0"), ["node 'refinery'", "-6.0", "negative"]),
         (RATE, "rate = 0.82 # {", ["arcs.refinery_to_fabrication.rate", "{ value = …, unit = …, source = … }", "0.82"]),
         (REFINERY, REFINERY.replace("60.0", "95.0"), ["node 'refinery'", "95.0", "90.0", "empty"]),
         ('to = "refinery"', 'to = "mine"', ["arc 'mine_to_refinery'", "zero delay", "'mine'"]),
-        ("[arcs.mine_to_refinery]", "[arcs.mine]", ["'mine'", "twice"]),
+        ("[arcs.mine_to_refinery]", "[arcs.mine]", ["node and arc 'mine': the id is used twice", "one set of names"]),
         ("[nodes.fabrication]", "[nodes.refinery]", ["not valid TOML", "line"]),
         ("[units]", "[units", ["not valid TOML", "line 25"]),
         (
@@ -199,6 +207,12 @@ REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
         ),
         ("horizon = { value = 160", "horizon = { value = 16.5", ["horizon", "16.5", "whole number"]),
         ("horizon = { value = 160", "horizon = { value = 0", ["horizon", "0"]),
+        (
+            HORIZON,
+            HORIZON.replace('"1"', '"day"'),
+            ["episode.horizon", "'day'", "counts control intervals", "unit '1'"],
+        ),
+        (HORIZON, HORIZON.replace('"1"', '"steps"'), ["episode.horizon", "'steps'", "counts control intervals"]),
         ('mass = "kt"', 'mass = "day"', ["units.mass", "'day'"]),
         ("neutral = 40, high = 120", "neutral = 140, high = 120", ["'use_to_collection'", "140", "120"]),
         ("low = 0, neutral = 40", "low = -5, neutral = 40", ["'use_to_collection'", "-5", "reverse"]),
@@ -229,9 +243,14 @@ REFINERY = 'initial = { low = 60.0, high = 90.0, unit = "kt"'
             ["scenarios.paper.nodes", "'user'", "'use'"],
         ),
         (
-            'agents = ["use_to_collection"]',
-            'agents = ["use_to_colection"]',
+            ALONE,
+            ALONE.replace("colle", "cole"),
             ["agents", "Did you mean 'use_to_collection'"],
+        ),
+        (
+            ALONE,
+            ALONE.replace("use_to_collection", "landfill"),
+            ["scenarios.paper.agents: 'landfill' has no control, so that it cannot act"],
         ),
     ],
 )
@@ -240,6 +259,43 @@ def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, said: list[str])
     message = broken(tmp_path, (old, new))
     for fragment in said:
         assert fragment in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('role = "landfill"', "role = landfill", ': landfill; text needs quotes, "landfill"'),
+        ('mass = "kt"', "mass = kt  # metric", ': kt; text needs quotes, "kt"'),
+        (RATE, RATE.replace('"1/day"', "1/day"), ': 1/day; text needs quotes, "1/day"'),
+        (RATE, RATE.replace('"1/day"', "one per day"), ': one per day; text needs quotes, "one per day"'),
+        (ALONE, ALONE.replace('"', ""), ': use_to_collection; text needs quotes, "use_to_collection"'),
+        (RATE, "pollutant = True\n" + RATE, ": True; write true"),
+        ('mass = "kt"', 'mass = "kt', ""),
+        ('mass = "kt"', "mass = ", ""),
+        ('mass = "kt"', 'mass = "kt" tonnes', ""),
+        (RATE, RATE.replace("0.82", "0.82.1"), ""),
+        (RATE, RATE.replace("0.82,", "0.82"), ""),
+        ("[nodes.mine]", "[nodes.mine a]", ""),
+    ],
+)
+def test_words_without_quotes(tmp_path: Path, old: str, new: str, said: str) -> None:
+    """A bare word where a value should be needs quotes; other faults of TOML are told as its reader tells them."""
+    message = broken(tmp_path, (old, new))
+    line = COPPER[: COPPER.index(old)].count("\n") + 1
+    assert re.search(rf"not valid TOML: .*\(at line {line}, column \d+\){re.escape(said)}$", message)
+
+
+def test_a_default_is_refused_once(tmp_path: Path) -> None:
+    """Not at each compartment that takes it, at a key that the file does not have."""
+    stock, flow = 'stock = { value = 100, unit = "kt"', 'flow = { value = 86.8, unit = "kt/day"'
+    for old, new, said in (
+        (stock, stock.replace("kt", "kton"), "scales.stock: unit 'kton': 'kton' is read in several ways"),
+        (stock, stock.replace("100", "0"), "scales.stock: 0.0 must be positive"),
+        (flow, flow.replace("kt/day", "kt"), "scales.flow: unit 'kt' is inconsistent"),
+    ):
+        message = broken(tmp_path, (old, new))
+        assert said in message
+        assert len(message.splitlines()) == 1
 
 
 def test_all_mistakes_are_named_at_once(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ LAYERS = (
         "errors",
         "machine",
         "units",
+        "fields",
         "elements",
         "rowsum",
         "validate",

@@ -260,8 +260,17 @@ def test_store_without_outflow_of_its_own() -> None:
     ("attempt", "message"),
     [
         (lambda: started("copper_net", None), r"'copper_net' \(default\) .* rate controls .*bilinear.* refinery, fab"),
+        (
+            lambda: started("copper_net", None),
+            r"Let only agents act that set flows: in Python agents=\['use_to_collection'\], on the command line "
+            r"--scenario paper$",
+        ),
+        (
+            lambda: LinearSystem.of(load_network("copper_net").with_options(episode={"horizon": 3})),
+            r"agents=\['use_to_collection'\], on the command line --scenario NAME, one where only these act$",
+        ),
         (lambda: started("solids_net", None), r"'solids_net' .* batches move along 'first_use'"),
-        (lambda: started("net_zero", None), r"inner physics drives 'emission'"),
+        (lambda: started("net_zero", None), r"inner physics drives 'emission'.*\. No choice of agents makes it one$"),
         (lambda: started("carbo_net", None, agents=["urban_to_capture"]), r"out of bounds, 'urban_air' = -782\.8"),
         (
             lambda: started("carbo_net", None, agents=["urban_to_capture"], set_points={"capture": 1e4}),

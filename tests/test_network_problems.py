@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cirl_marl import (
@@ -74,13 +75,17 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
         ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.nan)),)}, r"times \(0.0, nan\) must start at 0"),
         ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.inf)),)}, r"times \(0.0, inf\) must .* be finite"),
         ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(math.nan, 1.0)),)}, r"times \(nan, 1.0\) must start at 0"),
-        ({"services": (OWED, OWED)}, "service 's': the id is used twice"),
+        ({"services": (OWED, OWED)}, "service 's': the id is used twice$"),
+        ({"nodes": (A, B, B)}, "node 'b': the id is used twice$"),
+        ({"arcs": (replace(LINK, id="b"),)}, "node and arc 'b': the id is used twice; nodes and arcs share one set"),
+        ({"acting": ("b",)}, "agents: 'b' has no control, so that it cannot act"),
+        ({"acting": ("c",)}, "agents: unknown agent 'c'. Known: none"),
         (
             {"arcs": (DELAYED,), "services": (replace(OWED, provider="a", quantity="outflow"),)},
             "service 's': quantity 'outflow': 'a' gives batches to k, which count on arrival; ask for the 'flow'",
         ),
         ({"objective": Objective(tracked=("a", "a"))}, "tracked: names 'a' twice"),
-        ({"nodes": (replace(A, id="Mine 1"), B), "arcs": ()}, "compartment 'Mine 1': an id begins with a letter"),
+        ({"nodes": (replace(A, id="Mine 1"), B), "arcs": ()}, "node 'Mine 1': an id begins with a letter"),
         ({"nodes": (replace(A, **DIGESTER), B)}, "'digester' needs a control of kind 'input' for dilution_per_day"),
         ({"nodes": (replace(A, control=VALVE, **DIGESTER), B)}, "needs a control of kind 'input'.*not rate"),
         (
@@ -102,6 +107,38 @@ def test_networks_that_cannot_be_simulated(changes: dict[str, Any], said: str) -
     network = Network(name="two", nodes=(A, B), arcs=(LINK,))
     with pytest.raises(NetworkError, match=said):
         replace(network, **changes)
+
+
+@pytest.mark.parametrize(
+    ("element", "changes", "said"),
+    [
+        (A, {"initial": 5.0}, "node 'a': initial must be (low, high), got 5.0; write (5.0, 5.0)"),
+        (A, {"initial": (1.0, 2.0, 3.0)}, "node 'a': initial must be (low, high), got (1.0, 2.0, 3.0)"),
+        (A, {"initial": ("1", "2")}, "node 'a': initial must be (low, high), got ('1', '2')"),
+        (A, {"initial": None}, "node 'a': initial must be (low, high), got None"),
+        (A, {"inner": (4.0, 6.0)}, "one pair for each inner state, got (4.0, 6.0); write ((4.0, 6.0),)"),
+        (A, {"inner": 4.0}, "node 'a': inner must be ((low, high), …), one pair for each inner state, got 4.0"),
+        (A, {"set_point": (4.0, 6.0)}, "node 'a': set_point must be a number, got (4.0, 6.0)"),
+        (DELAYED, {"batches": (0.0, 1.0)}, "batches must be ((time, mass), …), got (0.0, 1.0); write ((0.0, 1.0),)"),
+        (DELAYED, {"batches": ((0.0, 1.0), (2.0,))}, "batches must be ((time, mass), …), got ((0.0, 1.0), (2.0,))"),
+        (FED, {"flow": 1.0}, "arc 'k': flow must be (value, …), got 1.0; write (1.0,)"),
+        (FED, {"times": 0.0}, "arc 'k': times must be (time, …), got 0.0; write (0.0,)"),
+        (LINK, {"rate": None}, "arc 'k': rate must be a number, got None"),
+        (VALVE, {"low": (0.0, 2.0)}, "control: low must be a number, got (0.0, 2.0)"),
+    ],
+)
+def test_numbers_are_given_as_they_are_needed(element: Any, changes: dict[str, Any], said: str) -> None:
+    """A single number for a pair, a pair for a list of pairs: named at once, with what to write."""
+    with pytest.raises(NetworkError) as raised:
+        replace(element, **changes)
+    assert str(raised.value).endswith(said)
+
+
+def test_numbers_may_come_from_arrays() -> None:
+    """Lists and arrays of numbers are numbers too."""
+    given: list[Any] = [[1, 2], np.array([1.0, 2.0]), (np.float32(1.0), np.int64(2))]
+    for initial in given:
+        assert tuple(replace(A, initial=initial).initial) == (1, 2)
 
 
 TRUCK: dict[str, Any] = {

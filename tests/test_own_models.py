@@ -84,7 +84,9 @@ def test_kinds_of_the_library_keep_their_names() -> None:
     ("kind", "said"),
     [
         ("own_models:Fermentor", "has no attribute 'Fermentor'"),
-        ("no_such_module:Fermenter", "No module named 'no_such_module'"),
+        ("no_such_module:Fermenter", "No module named 'no_such_module'; install it, or run with PYTHONPATH pointing"),
+        ("no_such_package.models:Fermenter", "No module named 'no_such_package'; install it, or run with PYTHONPATH"),
+        ("own_models.inner:Fermenter", "No module named 'own_models.inner'; 'own_models' is not a package$"),
         ("own_models:np", "is no class of compartment models, but <module 'numpy'"),
         (":Fermenter", "kind ':Fermenter': write where the class is, as 'package.module:Class'"),
         (".own_models:Fermenter", "kind '.own_models:Fermenter': write where the class is"),
@@ -101,11 +103,49 @@ def test_places_without_a_model_are_named(kind: str, said: str) -> None:
 
 
 def test_modules_that_cannot_be_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fault in the user's own module is told as such."""
+    """A fault in the user's own module is told as such; what it imports itself is not taken for it."""
     (tmp_path / "faulty_models.py").write_text("rate = 1 / 0\n")
+    (tmp_path / "needy_models.py").write_text("import no_such_library\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(CirlError, match="'faulty_models:Mine': importing it failed: ZeroDivisionError: division by"):
         model_class("faulty_models:Mine")
+    with pytest.raises(CirlError, match=r"'needy_models:Mine': No module named 'no_such_library'$"):
+        model_class("needy_models:Mine")
+
+
+@pytest.mark.parametrize(
+    ("unit", "stated", "said"),
+    [
+        ("1/day", True, None),
+        ("1/hour", True, None),
+        ("parsec", True, "unit 'parsec' is inconsistent: a quantity in '1/day' is needed"),
+        ("1", True, "unit '1' is inconsistent: a quantity in '1/day' is needed"),
+        ("1", False, None),
+        ("1/hour", False, "unit '1/hour': model 'fermenter' states no input_unit to convert to"),
+        ("parsec", False, "unit 'parsec': model 'fermenter' states no input_unit to convert to"),
+    ],
+)
+def test_units_of_inputs_of_own_models(
+    unit: str, stated: bool, said: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Converted to the unit that the class states; of one that states none only numbers without unit are read."""
+    if not stated:
+        monkeypatch.delattr(Fermenter, "input_unit")
+    network, path = brewery(), tmp_path / "brewery.toml"
+    write_network(network, path)
+    text = path.read_text()
+    own = "1/day" if stated else "1"
+    written = f'low = 0.05, neutral = 0.2, high = 0.5, unit = "{own}"'
+    assert written in text
+    path.write_text(text.replace(written, written.replace(own, unit)))
+    if said is not None:
+        with pytest.raises(DefinitionError, match=f"nodes.tank.control: {said}"):
+            load_network(path)
+        return
+    control = load_network(path).nodes[0].control
+    assert control is not None
+    hours = 24.0 if unit == "1/hour" else 1.0
+    assert (control.low, control.neutral, control.high) == pytest.approx((0.05 * hours, 0.2 * hours, 0.5 * hours))
 
 
 @pytest.mark.parametrize(

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import jsonschema
 import pytest
 
 import cirl_marl
-from cirl_marl import DefinitionError, RecipeError
+from cirl_marl import CirlError, DefinitionError, RecipeError, VectorEnv
 from cirl_marl.catalogue import folder
 from cirl_marl.learners import Recipe, load_recipe, train
-from cirl_marl.learners.algorithms import algorithms, checked_parameters, parameters_of
-from cirl_marl.learners.recipe import Learner, Normalisation, recipe_schema
+from cirl_marl.learners.algorithms import algorithms, parameter_mistakes, parameters_of, policy_parameters_of
+from cirl_marl.learners.recipe import Learner, Match, Normalisation, Options, recipe_schema
 
 GOOD = """
 name = "mine"
@@ -65,7 +66,36 @@ def test_published_schema_is_up_to_date() -> None:
         ("n_steps", "n_step", "unknown parameter of PPO 'n_step'. Did you mean 'n_steps'?"),
         ("[learner]", "[lerner]", "unknown key 'lerner'. Did you mean 'learner'?"),
         ("title", "titel", "unknown key 'titel'. Did you mean 'title'?"),
-        ("[learner]", '[environment]\nrewrad = "local"\n[learner]', "unknown option 'rewrad'. Did you mean 'reward'?"),
+        ("[learner]", '[environment]\nrewrad = "local"\n[learner]', "unknown key 'rewrad'. Did you mean 'reward'?"),
+        (
+            "[learner]",
+            '[environment]\nreward = "mix"\n[learner]',
+            "environment.reward: unknown value 'mix'. Did you mean 'mixed'?",
+        ),
+        (
+            "[learner]",
+            '[environment]\nobserve = "ful"\n[learner]',
+            "environment.observe: unknown value 'ful'. Did you mean 'full'?",
+        ),
+        (
+            "[learner]",
+            '[environment]\ncircularity = "ends"\n[learner]',
+            "environment.circularity: unknown value 'ends'. Did you mean 'end'?",
+        ),
+        ("[learner]", "[environment]\ncircularity_weight = 1.5\n[learner]", "less than or equal to 1, got 1.5"),
+        (
+            "[learner]",
+            "[environment]\ncircularity_weight = nan\n[learner]",
+            "circularity_weight: Input should be a fin",
+        ),
+        ("[learner]", '[environment]\ncircularity_weight = "1"\n[learner]', "should be a valid number, got '1'"),
+        (
+            "[learner]",
+            "[environment]\nhorizon = 2.0\n[learner]",
+            "environment.horizon: Input should be a valid integer",
+        ),
+        ("[learner]", "[environment]\nscenario = 1\n[learner]", "environment.scenario: Input should be a valid string"),
+        ("[learner]", '[match]\nrole = "landfill"\nalgorithm = "A2C"\n[learner]', "match: write [[match]], with two b"),
         (
             "[learner]",
             '[[match]]\nalgorithm = "SAC"\n[learner]',
@@ -86,7 +116,35 @@ def test_published_schema_is_up_to_date() -> None:
         ("n_steps = 8", "learning_rate = { linear_from = 1e-3 }", "learning_rate: needs a number, or linear_from and"),
         ("n_steps = 8", 'batch_size = "a"', "parameters.batch_size: PPO needs int, got 'a'"),
         ("n_steps = 8", "n_epochs = 2.5", "parameters.n_epochs: PPO needs int, got 2.5"),
-        ("n_steps = 8", "gamma = true", "parameters.gamma: PPO needs float, got True"),
+        ("n_steps = 8", "gamma = true", "parameters.gamma: PPO needs float in [0, 1], got True"),
+        ("n_steps = 8", "gamma = nan", "learner.parameters.gamma: must be a finite number, got nan"),
+        ("n_steps = 8", "gamma = 1.01", "learner.parameters.gamma: PPO needs float in [0, 1], got 1.01"),
+        ("n_steps = 8", "gae_lambda = -0.1", "learner.parameters.gae_lambda: PPO needs float in [0, 1], got -0.1"),
+        ("n_steps = 8", "ent_coef = inf", "learner.parameters.ent_coef: must be a finite number, got inf"),
+        ("n_steps = 8", 'learning_rate = "a"', "learning_rate: needs a number, or linear_from and linear_to: 'a'"),
+        (
+            "n_steps = 8",
+            "learning_rate = { linear_from = nan, linear_to = 0 }",
+            "learning_rate.linear_from: must be a f",
+        ),
+        (
+            "n_steps = 8",
+            "policy_kwargs = { optimizer_kwargs = { betas = [0.9, inf] } }",
+            "learner.parameters.policy_kwargs.optimizer_kwargs.betas.1: must be a finite number, got inf",
+        ),
+        (
+            "n_steps = 8",
+            'policy_kwargs = { activation_fn = "tanh" }',
+            "parameters.policy_kwargs.activation_fn: MlpPolicy needs type[torch.nn.modules.module.Module], got 'tanh'",
+        ),
+        (
+            "n_steps = 8",
+            "policy_kwargs = { net_ach = [8] }",
+            "parameters.policy_kwargs: unknown parameter of MlpPolicy 'net_ach'. Did you mean 'net_arch'?",
+        ),
+        ("n_steps = 8", "policy_kwargs = { net_arch = [8.5] }", "policy_kwargs.net_arch: MlpPolicy needs list[int] |"),
+        ("n_steps = 8", "policy_kwargs = { use_sde = true }", "unknown parameter of MlpPolicy 'use_sde'"),
+        ("n_steps = 8", "policy_kwargs = 3", "parameters.policy_kwargs: PPO needs dict[str, Any] | None, got 3"),
         ("n_steps = 8", "target_kl = [1.0]", "parameters.target_kl: PPO needs float | None, got [1.0]"),
     ],
 )
@@ -100,25 +158,73 @@ def test_mistakes_are_named(tmp_path: Path, old: str, new: str, message: str) ->
     assert message in str(raised.value)
 
 
+def test_mistakes_of_all_kinds_are_named_together(tmp_path: Path) -> None:
+    """Those that the shape of the file shows, and those of what it says, in every table; none that is not there."""
+    text = GOOD.replace("title", "titel").replace("n_steps = 8", "gamma = 2.0, clip_range = nan")
+    text += '[run]\nsteps = 0\n[environment]\nreward = "mix"\nhorizon = 0\n'
+    text += '[[match]]\nrole = "landfill"\nalgorithm = "A2C"\npolicy = "MlpPolcy"\n'
+    text += 'demonstrations = { controller = "neutral", steps = 9 }\nparameters = { vf_coef = -inf }\n'
+    with pytest.raises(DefinitionError) as raised:
+        load_recipe(write(tmp_path, text))
+    assert sorted(problem.partition(": ")[0] for problem in raised.value.problems) == [
+        "environment.horizon",
+        "environment.reward",
+        "learner.parameters.clip_range",
+        "learner.parameters.gamma",
+        "match.0.demonstrations",
+        "match.0.parameters.vf_coef",
+        "match.0.policy",
+        "run.steps",
+        "titel",
+        "title",
+    ]
+
+
+def test_options_are_those_of_the_environment() -> None:
+    """Recipes may say what ``VectorEnv`` takes, in its words."""
+    taken = set(inspect.signature(VectorEnv).parameters) - {"network", "num_envs", "agents"}
+    assert set(Options.model_fields) == taken
+    words = get_args(Options.model_fields["circularity"].annotation)
+    with pytest.raises(CirlError, match=rf"unknown circularity 'ends'.* Known: {', '.join(words)}\."):
+        VectorEnv("copper_net", num_envs=1, circularity="ends")
+
+
 def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
     """Unknown agents, and values that the algorithm refuses, are errors before anything is trained or written."""
-    path = write(tmp_path, GOOD + '[[match]]\nagents = ["mien"]\nalgorithm = "A2C"\n')
-    with pytest.raises(RecipeError, match=r"unknown agent 'mien'\. Did you mean 'mine'"):
-        train("copper_net", path, directory=tmp_path / "run")
-    for refused in ("n_steps = 1", "batch_size = 0", "policy_kwargs = { net_ach = [8] }"):
+    matches = '[[match]]\nkind = "arc"\nalgorithm = "A2C"\n[[match]]\nagents = ["mien", "ues"]\nalgorithm = "A2C"\n'
+    with pytest.raises(RecipeError) as raised:
+        train("copper_net", write(tmp_path, GOOD + matches), directory=tmp_path / "run")
+    assert "match.1.agents: unknown agent 'mien'. Did you mean 'mine'?" in str(raised.value)
+    assert "match.1.agents: unknown agent 'ues'. Did you mean 'use'?" in str(raised.value)
+    for refused in ("n_steps = 1", "batch_size = 0"):
         path = write(tmp_path, GOOD.replace("n_steps = 8", refused))
         with pytest.raises(RecipeError, match="agent 'refinery': PPO refuses its parameters"):
             train("copper_net", path, envs=1, directory=tmp_path / "run")
-    with pytest.raises(cirl_marl.CirlError, match=r"unknown option 'observ'\. Did you mean 'observe'"):
-        train("copper_net", write(tmp_path, GOOD), observ="full")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "nearest"),
+    [("observ", "observe"), ("seeds", "seed"), ("step", "steps"), ("env", "envs"), ("agent", "agents")],
+)
+def test_options_of_training_are_matched_with_all_that_it_takes(option: str, nearest: str, ppo_recipe: Recipe) -> None:
+    """Those of the environment and its own."""
+    with pytest.raises(CirlError, match=rf"unknown option '{option}'\. Did you mean '{nearest}'\?") as raised:
+        train("copper_net", ppo_recipe, **cast(Any, {option: 0}))
+    assert all(name in str(raised.value) for name in ("scenario", "directory", "callbacks", "report"))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"environment": {"rewrad": "local"}}, "unknown option 'rewrad'. Did you mean 'reward'"),
-        ({"environment": {"num_envs": 3}}, "unknown option 'num_envs'"),
+        ({"environment": {"rewrad": "local"}}, "unknown key 'rewrad'. Did you mean 'reward'"),
+        ({"environment": {"num_envs": 3}}, "unknown key 'num_envs'"),
+        (
+            {"environment": {"reward": "mix"}},
+            "recipe 'small': environment.reward: unknown value 'mix'. Did you mean 'mix",
+        ),
+        ({"learner": Learner(algorithm="PPO", parameters={"gamma": float("nan")})}, "parameters.gamma: must be a fin"),
+        ({"match": [Match(role="landfill", algorithm="PPP")]}, "match.0.algorithm: unknown algorithm 'PPP'"),
         ({"learner": Learner(algorithm="SAC", policy="CentralCriticPolicy")}, "unknown policy of SAC"),
         (
             {
@@ -139,15 +245,20 @@ def test_recipes_of_python_are_checked_like_files(changes: dict[str, Any], messa
 
 def test_lists_stand_for_tuples() -> None:
     """TOML has no tuples; the library takes some parameters as such."""
-    checked_parameters("SAC", {"train_freq": [1, "episode"]})
-    with pytest.raises(RecipeError, match=r"train_freq: SAC needs int \| tuple\[int, str\]"):
-        checked_parameters("SAC", {"train_freq": ["episode", 1]})
+    assert list(parameter_mistakes("SAC", "MlpPolicy", {"train_freq": [1, "episode"]})) == []
+    (mistake,) = parameter_mistakes("SAC", "MlpPolicy", {"train_freq": ["episode", 1]})
+    assert mistake == "parameters.train_freq: SAC needs int | tuple[int, str], got ['episode', 1]"
 
 
 def test_parameters_are_those_of_the_library() -> None:
-    """Recipes may set what the constructors take, and nothing that the training sets itself."""
+    """Recipes may set what the constructors take, and nothing that the training or the algorithm sets itself."""
     assert {"learning_rate", "gamma", "n_steps"} <= set(parameters_of("PPO"))
     assert not {"env", "seed", "device"} & set(parameters_of("SAC"))
     assert {"PPO", "A2C", "SAC", "TD3", "DDPG", "TQC", "ARS", "TRPO"} <= set(algorithms())
-    for name in algorithms():
-        checked_parameters(name, {key: parameter.default for key, parameter in parameters_of(name).items()})
+    for name, algorithm in algorithms().items():
+        own = {key: parameter.default for key, parameter in parameters_of(name).items()}
+        for policy in (*algorithm.policy_aliases, "CentralCriticPolicy"):
+            of_policy = policy_parameters_of(name, policy)
+            assert of_policy and "action_space" not in of_policy
+            defaults = {key: parameter.default for key, parameter in of_policy.items()}
+            assert list(parameter_mistakes(name, policy, own | {"policy_kwargs": defaults})) == []

@@ -56,8 +56,6 @@ def test_half_written_runs_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> No
     train("copper_net", ppo_recipe, directory=directory, horizon=5)
     with pytest.raises(RunError, match="not empty"):
         train("copper_net", ppo_recipe, directory=directory, horizon=5)
-    with pytest.raises(RunError, match="unknown run directory"):
-        Trained(tmp_path / "elsewhere")
     for name in ("config.json", "status.json", "network.toml"):
         broken = tmp_path / f"without_{name}"
         shutil.copytree(directory, broken)
@@ -74,6 +72,23 @@ def test_half_written_runs_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> No
     (directory / "status.json").write_text('{"state": "run')
     with pytest.raises(RunError, match=r"status.json: cannot be read"):
         Trained(directory)
+
+
+def test_directories_without_a_run_are_named(tmp_path: Path) -> None:
+    """With the runs beside them, if there are any."""
+    (tmp_path / "runs" / "empty").mkdir(parents=True)
+    for name in ("first", "empty"):
+        with pytest.raises(RunError) as raised:
+            Trained(tmp_path / "runs" / name)
+        assert str(raised.value) == f"no run in {tmp_path / 'runs' / name} (it has no config.json)"
+    first = tmp_path / "runs" / "first"
+    first.mkdir()
+    (first / "config.json").write_text("{}")
+    with pytest.raises(RunError) as raised:
+        Trained(tmp_path / "runs" / "frist")
+    missing = tmp_path / "runs" / "frist"
+    beside = f"unknown run '{missing}'. Did you mean '{first}'? Known: {first}."
+    assert str(raised.value) == f"no run in {missing} (it has no config.json): {beside}"
 
 
 def test_run_directory_describes_what_was_trained(tmp_path: Path, ppo_recipe: Recipe) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -18,6 +18,9 @@ from cirl_marl.errors import CirlError
 from cirl_marl.evaluate import Rollout, interval_ends, rollout, time_window
 from cirl_marl.network import Network
 from cirl_marl.vector_env import VectorEnv
+
+if TYPE_CHECKING:
+    from cirl_marl.learners import Recipe
 
 
 @app.command("networks")
@@ -67,18 +70,23 @@ def check(
         list[str],
         typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue."),
     ],
+    network: Annotated[
+        str | None, typer.Option(help="Check that recipes fit this network too: scenario, agents, matches, algorithms.")
+    ] = None,
 ) -> None:
     """Check networks and recipes and name every mistake; exit code 2 if there is one.
 
-    What is no mistake but seldom meant is said as a remark.
+    What is no mistake but seldom meant is said as a remark. Nothing is trained.
     """
     faulty = False
     for source in sources:
         try:
             if _is_recipe(source):
-                _check_recipe(source)
-            else:
+                _check_recipe(source, network)
+            elif network is None:
                 _check_network(source)
+            else:
+                raise CirlError(f"check {source}: is no recipe; --network names the network that recipes must fit")
         except CirlError as error:
             faulty = True
             errors.print(plain(error), highlight=False, soft_wrap=True)
@@ -95,12 +103,28 @@ def _is_recipe(source: str) -> bool:
     return bool({"learner", "run", "match"} & set(read_toml(Path(source))))
 
 
-def _check_recipe(source: str) -> None:
+def _check_recipe(source: str, network: str | None) -> None:
     from cirl_marl.learners.recipe import load_recipe
 
     recipe = load_recipe(source)
+    idle = [] if network is None else _idle_matches(source, recipe, load_network(network))
     algorithms = ", ".join(dict.fromkeys(learner.algorithm for _, learner in recipe.learners()))
-    say(f"{source}: recipe of {algorithms}, {recipe.run.steps:,} steps in {recipe.run.envs} copies: no mistakes")
+    fit = "" if network is None else f", in {network}"
+    say(f"{source}: recipe of {algorithms}, {recipe.run.steps:,} steps in {recipe.run.envs} copies{fit}: no mistakes")
+    for match in idle:
+        say(f"{source}: remark on {network}: nobody learns by {match}")
+
+
+def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
+    """Prepare a training, as far as it goes without training, and return the matches by which nobody learns."""
+    from cirl_marl.learners.launch import prepared
+
+    try:
+        trainees = prepared(network, recipe).trainees.values()
+    except CirlError as error:
+        raise CirlError(f"{source} in {network.name}: {error}") from error
+    busy = {id(trainee.spec) for trainee in trainees}
+    return [where for where, learner in recipe.learners()[1:] if id(learner) not in busy]
 
 
 def _check_network(source: str) -> None:

@@ -104,7 +104,9 @@ def _elsewhere(place: str) -> type[Any]:
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise CirlError(f"compartment kind '{place}': {error}") from error
+        lost = isinstance(error, ModuleNotFoundError) and error.name == module.split(".")[0]
+        remedy = "; install it, or run with PYTHONPATH pointing to the folder that it lies in" if lost else ""
+        raise CirlError(f"compartment kind '{place}': {error}{remedy}") from error
     except Exception as error:
         raise CirlError(f"compartment kind '{place}': importing it failed: {type(error).__name__}: {error}") from error
     if not isinstance(found, type):

@@ -28,8 +28,8 @@ class CompartmentModel(Protocol):
     - ``measure_names`` and ``measures(state, inputs)``, shape (measures, B): what services and observers may read;
     - ``success(state, inputs)``, shape (B,): whether the task is done, reported in the infos of the agent;
     - ``observed``: names of the states that an agent sees, by default all;
-    - ``input_unit``: unit of all inputs, as pint reads it, to which definitions are converted; without it bounds of
-      controls are taken as they are given;
+    - ``input_unit``: unit of all inputs, as pint reads it, to which definitions are converted; without it they give
+      bounds of controls as numbers without unit, ``unit = "1"``;
     - ``bounds``: lowest and highest value of states and inputs, by name, between which the equations hold; starts and
       controls beyond are refused;
     - ``context_names``: keyword arguments that ``derivative`` or ``advance`` takes from the network, shape (B,) each:

@@ -77,7 +77,8 @@ class LinearSystem:
         actuators = Actuators(laws, agents, 1)
         inputs, acting = actuators.agents, actuators.acting
         if problems := list(_nonlinear(network, inputs)):
-            raise CirlError(f"'{network.name}' ({network.scenario_name}) is no linear system: {'; '.join(problems)}")
+            problem = f"is no linear system: {'; '.join(problems)}. {_remedy(network)}"
+            raise CirlError(f"'{network.name}' ({network.scenario_name}) {problem}")
         controls = np.repeat(laws.neutral[:, None], 1 + len(acting), axis=1)
         controls[acting] = np.eye(1 + len(acting))[1:]
         rate, units = laws.rate(controls), np.eye(laws.unit + 1)  # no input, then one unit of each
@@ -244,11 +245,23 @@ def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:
     refused = {ControlKind.RATE: "rate controls multiply flows (bilinear)", ControlKind.INPUT: "inputs set no flows"}
     for kind, reason in refused.items():
         if acting := [a for a in agents if (control := network.compartments[a].control) and control.kind is kind]:
-            yield f"{reason}, let others act (agents=...) than {', '.join(acting)}"
+            yield f"{reason}: {', '.join(acting)}"
     reasons = {Law.COMPARTMENT: "inner physics drives", Law.BATCH: "batches move along"}
     for arc in network.arcs:
         if reason := reasons.get(arc.law, "a time series drives" if arc.times else ""):
             yield f"{reason} '{arc.id}'"
+
+
+def _remedy(network: Network) -> str:
+    """Say which agents leave a network linear, and where they can be chosen."""
+    able = [agent for agent in network.controllable if not any(_nonlinear(network, [agent]))]
+    others = network.scenarios.items()
+    linear = [name for name, other in others if other.agents and not any(_nonlinear(other, other.agents))]
+    if not able and not linear:
+        return "No choice of agents makes it one"
+    ways = [f"in Python agents={able}"] if able else []
+    ways.append(f"on the command line --scenario {linear[0] if linear else 'NAME, one where only these act'}")
+    return f"Let only agents act that set flows: {', '.join(ways)}"
 
 
 def _targets(network: Network, set_points: Mapping[str, float] | None) -> dict[str, float]:

@@ -6,16 +6,16 @@ import copy
 import importlib
 import inspect
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import MultiInputActorCriticPolicy
+from stable_baselines3.common.policies import BasePolicy, MultiInputActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
@@ -24,10 +24,15 @@ from cirl_marl.learners.central_critic import CentralCriticPolicy
 
 MODULES = ("stable_baselines3", "sb3_contrib")
 CENTRAL_CRITIC = "CentralCriticPolicy"
-POLICIES = {CENTRAL_CRITIC: CentralCriticPolicy}
+POLICIES: Mapping[str, type[BasePolicy]] = {CENTRAL_CRITIC: CentralCriticPolicy}
 """Policies that Stable-Baselines3 has no name for."""
 
 RESERVED = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "device", "_init_setup_model")
+SET_BY_ALGORITHM = ("self", "observation_space", "action_space", "lr_schedule", "use_sde")
+"""What an algorithm hands to the constructor of its policy by itself."""
+
+SHARES = ("gamma", "gae_lambda", "tau")
+"""Discount factors, and how far a target network moves: numbers in [0, 1], which their annotations do not say."""
 NOISES: Mapping[str, type[ActionNoise]] = {
     "normal": NormalActionNoise,
     "ornstein_uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -63,43 +68,94 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 def parameters_of(name: str) -> dict[str, inspect.Parameter]:
     """Return the constructor parameters that a recipe may set."""
-    signature = inspect.signature(algorithm_class(name).__init__)
-    return {name: parameter for name, parameter in signature.parameters.items() if name not in RESERVED}
+    return _parameters(algorithm_class(name), RESERVED)
 
 
-def checked_parameters(name: str, parameters: Mapping[str, Any]) -> None:
-    """Refuse parameters that the algorithm does not have, and values of another type than its constructor states.
+def policy_parameters_of(name: str, policy: str) -> dict[str, inspect.Parameter] | None:
+    """Return what ``policy_kwargs`` may hold for an algorithm and its policy; None if it has no such policy."""
+    classes = {**algorithm_class(name).policy_aliases, **POLICIES}
+    return _parameters(classes[policy], SET_BY_ALGORITHM) if policy in classes else None
 
-    Raises:
-        RecipeError: naming the parameter, and the nearest that exists or the type that it needs.
+
+def _parameters(made: type, reserved: Iterable[str]) -> dict[str, inspect.Parameter]:
+    signature = inspect.signature(made.__init__)  # type: ignore[misc]
+    return {name: parameter for name, parameter in signature.parameters.items() if name not in reserved}
+
+
+def algorithm_mistakes(name: str, policy: str, parameters: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong with an algorithm, its policy and its parameters: key, value and what would do."""
+    known = algorithms()
+    if name not in known:
+        yield f"algorithm: {unknown('algorithm', name, known)}"
+        return
+    aliases = known[name].policy_aliases
+    fit = [alias for alias in aliases if not alias.startswith(("Cnn", "MultiInput"))]
+    if aliases.get("MultiInputPolicy") is MultiInputActorCriticPolicy:
+        fit.append(CENTRAL_CRITIC)
+    if policy not in fit:
+        yield f"policy: {unknown(f'policy of {name} for vectors', policy, fit)}"
+    yield from parameter_mistakes(name, policy, parameters)
+
+
+def parameter_mistakes(name: str, policy: str, parameters: Mapping[str, Any]) -> Iterator[str]:
+    """Yield parameters that there are not, values of another type than the constructor states, and numbers like NaN.
+
+    The constructor is that of the algorithm, and for ``policy_kwargs`` that of the policy.
     """
-    known = parameters_of(name)
-    for parameter, value in parameters.items():
-        if parameter not in known:
-            raise RecipeError(f"parameters: {unknown(f'parameter of {name}', parameter, known)}")
-        if parameter == "learning_rate" and isinstance(value, Mapping):
-            if not (set(value) == {"linear_from", "linear_to"} and _are_numbers(value.values())):
-                raise RecipeError(f"parameters.learning_rate: needs a number, or linear_from and linear_to: {value!r}")
-        elif parameter == "action_noise" and value is not None:
-            _check_noise(value)
+    known, of_policy = parameters_of(name), policy_parameters_of(name, policy)
+    for key, value in parameters.items():
+        if key == "policy_kwargs" and isinstance(value, Mapping) and of_policy is not None:
+            for argument, each in value.items():
+                yield from _argument_mistakes("parameters.policy_kwargs", policy, of_policy, argument, each)
         else:
-            _check_type(name, known[parameter], value)
+            yield from _argument_mistakes("parameters", name, known, key, value)
 
 
-def _check_noise(noise: object) -> None:
-    if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"} or not _are_numbers([noise["sigma"]]):
-        raise RecipeError(f"parameters.action_noise: needs kind and a number sigma, got {noise!r}")
-    if noise["kind"] not in NOISES:
-        raise RecipeError(f"parameters.action_noise: {unknown('kind', noise['kind'], NOISES)}")
+def _argument_mistakes(
+    where: str, owner: str, known: Mapping[str, inspect.Parameter], name: str, value: object
+) -> Iterator[str]:
+    """Yield what is wrong with one keyword argument of a constructor that takes ``known``."""
+    if name not in known:
+        yield f"{where}: {unknown(f'parameter of {owner}', name, known)}"
+        return
+    place = f"{where}.{name}"
+    mistakes = list(_not_finite(place, value))
+    yield from mistakes
+    if mistakes or _takes(known[name], value):
+        return
+    if name in WRITTEN:
+        yield from WRITTEN[name](place, value)
+    else:
+        yield f"{place}: {owner} needs {_needed(known[name])}, got {value!r}"
 
 
-def _check_type(name: str, parameter: inspect.Parameter, value: object) -> None:
-    stated = TypeAdapter(parameter.annotation, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
-    try:
-        stated.validate_python(_as_tuple(value))
-    except ValidationError:
-        needs = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
-        raise RecipeError(f"parameters.{parameter.name}: {name} needs {needs}, got {value!r}") from None
+def _not_finite(place: str, value: object) -> Iterator[str]:
+    """Yield every number that is not finite, in tables and lists as well."""
+    if isinstance(value, float | np.floating) and not math.isfinite(value):
+        yield f"{place}: must be a finite number, got {value!r}"
+    elif isinstance(value, Mapping | list | tuple):
+        for key, each in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _not_finite(f"{place}.{key}", each)
+
+
+def _takes(parameter: inspect.Parameter, value: object) -> bool:
+    """Whether a value is of the type that a constructor states."""
+    stated = parameter.annotation
+    if parameter.name in SHARES:
+        stated = Annotated[stated, Field(ge=0, le=1)]
+    checked = TypeAdapter[Any](stated, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
+    for form in (value, _as_tuple(value)):
+        try:
+            checked.validate_python(form)
+        except ValidationError:
+            continue
+        return True
+    return False
+
+
+def _needed(parameter: inspect.Parameter) -> str:
+    stated = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
+    return f"{stated} in [0, 1]" if parameter.name in SHARES else stated
 
 
 def _as_tuple(value: Any) -> Any:
@@ -107,38 +163,32 @@ def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def checked_policy(name: str, policy: str) -> None:
-    """Refuse a policy that the algorithm does not have.
+def _rate_mistakes(place: str, rate: object) -> Iterator[str]:
+    if not isinstance(rate, Mapping) or set(rate) != {"linear_from", "linear_to"} or not _are_numbers(rate.values()):
+        yield f"{place}: needs a number, or linear_from and linear_to: {rate!r}"
 
-    Raises:
-        RecipeError: naming the nearest that it has.
-    """
-    aliases = algorithm_class(name).policy_aliases
-    known = [alias for alias in aliases if not alias.startswith(("Cnn", "MultiInput"))]
-    if aliases.get("MultiInputPolicy") is MultiInputActorCriticPolicy:
-        known.append(CENTRAL_CRITIC)
-    if policy not in known:
-        raise RecipeError(f"policy: {unknown(f'policy of {name} for vectors', policy, known)}")
+
+def _noise_mistakes(place: str, noise: object) -> Iterator[str]:
+    if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"} or not _are_numbers([noise["sigma"]]):
+        yield f"{place}: needs kind and a number sigma, got {noise!r}"
+    elif noise["kind"] not in NOISES:
+        yield f"{place}: {unknown('kind', noise['kind'], NOISES)}"
+
+
+def _are_numbers(values: Iterable[object]) -> bool:
+    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+
+
+WRITTEN: Mapping[str, Callable[[str, object], Iterator[str]]] = {
+    "learning_rate": _rate_mistakes,
+    "action_noise": _noise_mistakes,
+}
+"""Parameters that recipes may write as tables, which ``build`` turns into the objects that the library takes."""
 
 
 def has_replay_buffer(name: str) -> bool:
     """Return whether the algorithm learns from what it keeps of the past."""
     return issubclass(algorithm_class(name), OffPolicyAlgorithm)
-
-
-def checked_off_policy(name: str) -> None:
-    """Refuse an algorithm that has no replay buffer to keep demonstrations in.
-
-    Raises:
-        RecipeError: naming those that have one.
-    """
-    if not has_replay_buffer(name):
-        fit = [other for other in algorithms() if has_replay_buffer(other)]
-        raise RecipeError(f"demonstrations: {name} has no replay buffer to keep them in; use one of {', '.join(fit)}")
-
-
-def _are_numbers(values: Iterable[object]) -> bool:
-    return all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values)
 
 
 def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **fixed: Any) -> BaseAlgorithm:
@@ -155,13 +205,15 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
     Raises:
         RecipeError: for unknown parameters or values that the algorithm refuses.
     """
-    checked_parameters(name, parameters)
+    mistakes = list(parameter_mistakes(name, policy, parameters))
+    if mistakes:
+        raise RecipeError("; ".join(mistakes))
     arguments = {key: _as_tuple(value) for key, value in copy.deepcopy(dict(parameters)).items()}
     rate = arguments.get("learning_rate")
     if isinstance(rate, Mapping):
         arguments["learning_rate"] = LinearSchedule(rate["linear_from"], rate["linear_to"], 1.0)
     noise = arguments.get("action_noise")
-    if noise is not None:
+    if isinstance(noise, Mapping):
         mean = np.zeros(env.action_space.shape or (1,))
         arguments["action_noise"] = NOISES[noise["kind"]](mean, noise["sigma"] * np.ones_like(mean))  # type: ignore[call-arg]
     try:

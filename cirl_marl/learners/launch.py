@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -61,11 +62,40 @@ def train(
         CirlError: for input that cannot be used, before anything is written.
         LearnerError: if a learner fails; what was learnt is saved first.
     """
+    parameters = inspect.signature(train).parameters.values()
+    known = (*OPTIONS, *(parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY))
+    for option in options:
+        if option not in known:
+            raise CirlError(unknown("option", option, known))
+    with ExitStack() as claims:
+        claims.enter_context(global_streams_claimed())
+        training = prepared(network, recipe, steps=steps, envs=envs, seed=seed, agents=agents, **options)
+        training.check_callbacks(callbacks or {})
+        if directory is not None:
+            run = _create(Path(directory), training.config, training.env.network)
+            claims.enter_context(run.claimed())
+            training.keep_in(run)
+        training.start(callbacks=callbacks, report=report)
+    return training
+
+
+def prepared(
+    network: str | Path | Network,
+    recipe: str | Path | Recipe,
+    *,
+    steps: int | None = None,
+    envs: int | None = None,
+    seed: int = 0,
+    agents: Sequence[str] | None = None,
+    **options: Any,
+) -> Training:
+    """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written.
+
+    Raises:
+        CirlError: for input that cannot be used.
+    """
     found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     found.check()
-    for option in options:
-        if option not in OPTIONS:
-            raise CirlError(unknown("option", option, OPTIONS))
     given = {name: value for name, value in options.items() if value is not None}
     settings = found.environment | {n: v.item() if isinstance(v, np.generic) else v for n, v in given.items()}
     copies = found.run.envs if envs is None else _whole("envs", envs, 1)
@@ -85,16 +115,7 @@ def train(
         options=settings,
     )
     found.check_demonstrations(config.steps)
-    with ExitStack() as claims:
-        claims.enter_context(global_streams_claimed())
-        training = Training(config, env)
-        training.check_callbacks(callbacks or {})
-        if directory is not None:
-            run = _create(Path(directory), config, env.network)
-            claims.enter_context(run.claimed())
-            training.keep_in(run)
-        training.start(callbacks=callbacks, report=report)
-    return training
+    return Training(config, env)
 
 
 def resume(

@@ -2,36 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StrictStr, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
 
 from cirl_marl.catalogue import recipe_path
 from cirl_marl.definition import read_toml
-from cirl_marl.elements import Node, Role
+from cirl_marl.elements import Moment, Node, Observe, Reward, Role
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
-from cirl_marl.learners.algorithms import (
-    CENTRAL_CRITIC,
-    algorithm_class,
-    algorithms,
-    checked_off_policy,
-    checked_parameters,
-    checked_policy,
-)
+from cirl_marl.learners.algorithms import CENTRAL_CRITIC, algorithm_mistakes, algorithms, has_replay_buffer
 from cirl_marl.learners.views import Scheme, View, view_of
 from cirl_marl.mistakes import mistakes_of
 from cirl_marl.network import Network
+from cirl_marl.schema import Number
 from cirl_marl.vector_env import VectorEnv
-
-OPTIONS = ("reward", "observe", "circularity", "circularity_weight", "horizon", "scenario")
-"""What a recipe may say of the environment."""
 
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Options(_Table):
+    """What a recipe may say of the environment; None takes the definition's."""
+
+    reward: Reward | None = None
+    observe: Observe | None = None
+    circularity: Moment = "end"
+    circularity_weight: Annotated[Number, Field(ge=0, le=1)] | None = None
+    horizon: Annotated[int, Field(strict=True, gt=0)] | None = None
+    scenario: StrictStr | None = None
+
+
+OPTIONS = tuple(Options.model_fields)
 
 
 class Normalisation(_Table):
@@ -79,32 +85,22 @@ class Learner(_Table):
         None, description="of an off-policy learner: whose transitions fill its replay buffer before it acts itself"
     )
 
-    def check(self) -> None:
-        """Refuse algorithms, parameters and policies that there are not.
-
-        Raises:
-            RecipeError: naming the key, the value and the nearest that there is.
-        """
-        algorithm_class(self.algorithm)
-        checked_parameters(self.algorithm, self.parameters)
-        checked_policy(self.algorithm, self.policy)
+    def mistakes(self) -> Iterator[str]:
+        """Yield what is wrong whatever the network and the number of steps: key, value and what would do."""
+        yield from algorithm_mistakes(self.algorithm, self.policy, self.parameters)
         if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
-            raise RecipeError(f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true")
+            yield f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true"
 
-    def check_demonstrations(self, steps: int) -> None:
-        """Refuse demonstrations that the algorithm cannot keep, or that a run of ``steps`` has no room for.
-
-        Raises:
-            RecipeError: naming the key.
-        """
-        if self.demonstrations is None:
+    def demonstration_mistakes(self, steps: int) -> Iterator[str]:
+        """Yield why the algorithm cannot keep its demonstrations, or why a run of ``steps`` has no room for them."""
+        if self.demonstrations is None or self.algorithm not in algorithms():
             return
-        checked_off_policy(self.algorithm)
+        if not has_replay_buffer(self.algorithm):
+            fit = ", ".join(filter(has_replay_buffer, algorithms()))
+            yield f"demonstrations: {self.algorithm} has no replay buffer to keep them in; use one of {fit}"
         if self.demonstrations.steps > steps * self.share_of_steps:
             share = "" if self.share_of_steps == 1 else f" times share_of_steps {self.share_of_steps}"
-            raise RecipeError(
-                f"demonstrations.steps: {self.demonstrations.steps} is more than the {steps} steps of the run{share}"
-            )
+            yield f"demonstrations.steps: {self.demonstrations.steps} is more than the {steps} steps of the run{share}"
 
 
 class Match(Learner):
@@ -171,6 +167,13 @@ class Recipe(_Table):
     learner: Learner
     match: list[Match] = []
 
+    @field_validator("match", mode="before")
+    @classmethod
+    def _has_two_brackets(cls, match: object) -> object:
+        if isinstance(match, Mapping):
+            raise PydanticCustomError("one_bracket", "write [[match]], with two brackets")
+        return match
+
     def learner_of(self, agent: str, network: Network) -> Learner:
         """Return the learner of ``agent``: that of the first match that fits, else the common one."""
         return next((match for match in self.match if match.fits(agent, network)), self.learner)
@@ -196,20 +199,20 @@ class Recipe(_Table):
         Raises:
             RecipeError: naming every mistake.
         """
-        mistakes = list(self.mistakes())
-        if mistakes:
-            raise RecipeError(f"recipe '{self.name}': {'; '.join(mistakes)}")
+        self._refuse(self.mistakes())
 
     def check_agents(self, agents: Sequence[str]) -> None:
         """Refuse matches that name agents which do not act.
 
         Raises:
-            RecipeError: naming the agent and the nearest that acts.
+            RecipeError: naming the match, the agent and the nearest that acts.
         """
-        for match in self.match:
-            for agent in match.agents or ():
-                if agent not in agents:
-                    raise RecipeError(f"recipe '{self.name}': match.agents: {unknown('agent', agent, agents)}")
+        self._refuse(
+            f"match.{i}.agents: {unknown('agent', agent, agents)}"
+            for i, match in enumerate(self.match)
+            for agent in match.agents or ()
+            if agent not in agents
+        )
 
     def check_demonstrations(self, steps: int) -> None:
         """Refuse demonstrations that an algorithm cannot keep, or that a run of ``steps`` has no room for.
@@ -217,25 +220,29 @@ class Recipe(_Table):
         Raises:
             RecipeError: naming the learner and the key.
         """
-        for where, learner in self.learners():
-            try:
-                learner.check_demonstrations(steps)
-            except RecipeError as error:
-                raise RecipeError(f"recipe '{self.name}': {where}.{error}") from None
+        self._refuse(self.demonstration_mistakes(steps))
+
+    def _refuse(self, mistakes: Iterable[str]) -> None:
+        found = "; ".join(mistakes)
+        if found:
+            raise RecipeError(f"recipe '{self.name}': {found}")
 
     def mistakes(self) -> Iterator[str]:
-        """Yield what is wrong whatever the network and the number of steps: key, value and the nearest valid name."""
-        for key in self.environment:
-            if key not in OPTIONS:
-                yield f"environment: {unknown('option', key, OPTIONS)}"
+        """Yield what is wrong whatever the network and the number of steps: key, value and what would do."""
+        try:
+            Options.model_validate(self.environment)
+        except ValidationError as error:
+            yield from (f"environment.{mistake}" for mistake in mistakes_of(error, Options))
         for i, match in enumerate(self.match):
             if match.kind is None and match.role is None and match.agents is None:
                 yield f"match.{i}: fits every agent; give kind, role or agents"
         for where, learner in self.learners():
-            try:
-                learner.check()
-            except RecipeError as error:
-                yield f"{where}.{error}"
+            yield from (f"{where}.{mistake}" for mistake in learner.mistakes())
+
+    def demonstration_mistakes(self, steps: int) -> Iterator[str]:
+        """Yield what is wrong with demonstrations in a run of ``steps``: learner, key and value."""
+        for where, learner in self.learners():
+            yield from (f"{where}.{mistake}" for mistake in learner.demonstration_mistakes(steps))
 
     def learners(self) -> tuple[tuple[str, Learner], ...]:
         """Return every learner and what messages call its table."""
@@ -259,16 +266,20 @@ def load_recipe(name: str | Path) -> Recipe:
     """
     path = recipe_path(name)
     document = read_toml(path)
+    mistakes: list[str] = []
     try:
         recipe = Recipe.model_validate(document)
     except ValidationError as error:
-        raise DefinitionError(str(path), mistakes_of(error, Recipe)) from None
-    mistakes = list(recipe.mistakes())
-    if not mistakes:
-        try:
-            recipe.check_demonstrations(recipe.run.steps)
-        except RecipeError as error:
-            mistakes.append(str(error))
+        mistakes += mistakes_of(error, Recipe)
+        recipe = _sound_part(document, {str(item["loc"][0]) for item in error.errors()})
+    mistakes += [*recipe.mistakes(), *recipe.demonstration_mistakes(recipe.run.steps)]
     if mistakes:
         raise DefinitionError(str(path), mistakes)
     return recipe
+
+
+def _sound_part(document: Mapping[str, Any], faulty: Set[str]) -> Recipe:
+    """Return a recipe of the keys that are not ``faulty``, so that mistakes in what they hold are named as well."""
+    stand_in = {"name": "?", "title": "?", "run": {"steps": 2**53}, "learner": {"algorithm": "PPO"}}
+    kept = {key: value for key, value in document.items() if key not in faulty}
+    return Recipe.model_validate(kept | {key: stand_in[key] for key in faulty & stand_in.keys()})

@@ -265,11 +265,12 @@ class RunDirectory:
 
     def _json(self, name: str) -> dict[str, Any]:
         path = self.path / name
-        if not self.path.is_dir():
-            beside = self.path.parent.glob("*/config.json")
-            raise RunError(unknown("run directory", self.path, sorted(str(config.parent) for config in beside)))
+        if not (self.path / "config.json").is_file():
+            beside = sorted(str(config.parent) for config in self.path.parent.glob("*/config.json"))
+            others = f": {unknown('run', self.path, beside)}" if beside else ""
+            raise RunError(f"no run in {self.path} (it has no config.json){others}")
         if not path.is_file():
-            raise RunError(f"{path}: missing; {self.path} is not a run directory, or it was not written to the end")
+            raise RunError(f"{path}: missing; the run directory is incomplete")
         try:
             value: dict[str, Any] = json.loads(path.read_text())
         except ValueError as error:
