@@ -169,7 +169,7 @@ def test_goal_task_in_copies(normalise: bool) -> None:
     envs = [Monitor(GoalEnv("solids_net", "sorter", scenario="paper_fetch", horizon=4)) for _ in range(COPIES)]
     env: Any = DummyVecEnv([lambda env=env: env for env in envs])  # type: ignore[misc]
     env = VecNormalize(env) if normalise else env
-    parameters = SMALL | {"batch_size": 8}
+    parameters = SMALL | {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}}  # of its own, as SAC writes into it
     model = SAC("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, seed=1, device="cpu", **parameters)  # type: ignore[arg-type]
     demonstrate(model, 20, in_copies("scripted", envs, [0, 1]))
     buffer: Any = model.replay_buffer

@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
-from cirl_marl.learners import Recipe, Training, algorithms, load_recipe, train
-from cirl_marl.learners.algorithms import algorithm_class
+from cirl_marl.learners import Recipe, Training, load_recipe, train
+from cirl_marl.learners.algorithms import build
 from cirl_marl.paper import evaluation, published, session, training, tuned
 from cirl_marl.paper.document import markdown
 from cirl_marl.paper.evaluation import evaluate
@@ -159,8 +159,11 @@ def test_weights_that_become_nan_are_a_result(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A learner that breaks shows its episodes until then and the step; there is no policy to evaluate."""
-    wild = partial(algorithm_class(algorithm), learning_rate=1e30)
-    monkeypatch.setattr(algorithms, "algorithm_class", lambda _: wild)
+
+    def wild(name: str, policy: str, env: VecEnv, parameters: dict[str, Any], **fixed: Any) -> BaseAlgorithm:
+        return build(name, policy, env, parameters | {"learning_rate": 1e30}, **fixed)
+
+    monkeypatch.setattr(training, "build", wild)
     arguments = (algorithm, "--steps", "10000", "--out", str(tmp_path))
     assert cirl(monkeypatch, *arguments) == 0
     assert "weights NaN after" in capsys.readouterr().out
