@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.main
@@ -67,7 +68,9 @@ def test_readme_example_of_one_agent_runs() -> None:
     """One compartment learns as printed, but for a shorter training."""
     code = (ROOT / "README.md").read_text().split("```python\n")[2].split("```")[0]
     assert ".learn(20_000)" in code
-    exec(compile(code.replace("20_000", "2_048"), "README.md", "exec"), {})
+    names: dict[str, Any] = {}
+    exec(compile(code.replace("20_000", "2_048"), "README.md", "exec"), names)
+    assert names["model"].num_timesteps == 2_048
 
 
 def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 import cirl_marl
@@ -16,7 +18,7 @@ from cirl_marl import VectorEnv
 from cirl_marl.controllers import Constant
 from cirl_marl.evaluate import EVALUATION_SEEDS, SEED_SPACING, rollout
 from cirl_marl.network import Floats
-from cirl_marl.paper.evaluation import EVALUATION_COPIES, EVALUATION_EPISODES
+from cirl_marl.paper.evaluation import EVALUATION_COPIES, EVALUATION_EPISODES, evaluate
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Result, Results
 
@@ -78,6 +80,20 @@ def test_tuned_policies_beat_the_papers_best_in_its_episodes(name: str) -> None:
     assert all(evaluation is not None and papers < evaluation.mean <= best for evaluation in there)
 
 
+@pytest.mark.parametrize(("name", "action", "published"), [("CopperNet", -1.0, -4.43e8), ("CarboNet", 1.0, -7.07e7)])
+def test_constant_actions_return_what_the_paper_reports(name: str, action: float, published: float) -> None:
+    """Evaluated in episodes that end as the published ones; the first of a copy is longer and does not count."""
+
+    def predict(observation: Any, state: Any, starts: NDArray[np.bool_]) -> tuple[NDArray[Any], Any]:
+        del starts
+        return np.full((len(observation), 1), action, dtype=np.float32), state
+
+    made = ENVIRONMENTS[name].id, predict, 4, 0, lambda *_: None, {"legacy_episode": True}
+    found = evaluate(*made, warm_up=1)
+    assert found.mean == pytest.approx(published, rel=2e-3)
+    assert evaluate(*made).mean < found.mean
+
+
 def play(name: str, act: Callable[[VectorEnv], Floats], seed: int) -> float:
     """Return the mean return in the evaluation episodes of a seed; ``act`` returns actions, shape (copies,)."""
     made = gymnasium.registry[ENVIRONMENTS[name].id].kwargs
@@ -110,10 +126,10 @@ def burn(env: VectorEnv) -> Floats:
 @pytest.mark.parametrize(
     ("name", "best", "within"),
     [
-        ("TransportTruck", hold(0.0), 0.01),
-        ("Incinerator", burn, 0.01),
+        ("TransportTruck", hold(0.0), 0.002),
+        ("Incinerator", burn, 0.007),
         ("CO2MicroalgaeMonod", hold(-1.0), 1e-6),
-        ("CO2MicroalgaeDroop", hold(1.0), 1e-3),
+        ("CO2MicroalgaeDroop", hold(1.0), 1e-4),
     ],
 )
 def test_tuned_policies_against_the_best_in_the_same_episodes(
