@@ -54,9 +54,14 @@ def test_mixed_recipe_mixes() -> None:
 
 
 def test_published_schema_is_up_to_date() -> None:
-    """``agents/recipe.schema.json`` is what the code gives."""
+    """``agents/recipe.schema.json`` is what the code gives, options of the environment included."""
     published = json.loads((folder("agents") / "recipe.schema.json").read_text())
     assert published == recipe_schema()
+    document: dict[str, Any] = {"name": "mine", "title": "Mine", "learner": {"algorithm": "PPO"}}
+    jsonschema.validate(document | {"environment": {"reward": "mixed", "horizon": 9}}, published)
+    for wrong in ({"rewrad": "mixed"}, {"reward": "mix"}, {"horizon": 0}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(document | {"environment": wrong}, published)
 
 
 @pytest.mark.parametrize(
@@ -114,8 +119,9 @@ def test_published_schema_is_up_to_date() -> None:
         ("[learner]", "[run]\nsteps = 0\n[learner]", "run.steps: Input should be greater than 0, got 0"),
         ("[learner]", '[learner]\npolicy = "MlpPolcy"', "unknown policy of PPO for vectors 'MlpPolcy'. Did you mean"),
         ("n_steps = 8", "learning_rate = { linear_from = 1e-3 }", "learning_rate: needs a number, or linear_from and"),
-        ("n_steps = 8", 'batch_size = "a"', "parameters.batch_size: PPO needs int, got 'a'"),
-        ("n_steps = 8", "n_epochs = 2.5", "parameters.n_epochs: PPO needs int, got 2.5"),
+        ("n_steps = 8", 'batch_size = "a"', "parameters.batch_size: PPO needs int above 0, got 'a'"),
+        ("n_steps = 8", "n_epochs = 2.5", "parameters.n_epochs: PPO needs int above 0, got 2.5"),
+        ("n_steps = 8", "n_steps = 0", "parameters.n_steps: PPO needs int above 0, got 0"),
         ("n_steps = 8", "gamma = true", "parameters.gamma: PPO needs float in [0, 1], got True"),
         ("n_steps = 8", "gamma = nan", "learner.parameters.gamma: must be a finite number, got nan"),
         ("n_steps = 8", "gamma = 1.01", "learner.parameters.gamma: PPO needs float in [0, 1], got 1.01"),
@@ -196,7 +202,7 @@ def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:
         train("copper_net", write(tmp_path, GOOD + matches), directory=tmp_path / "run")
     assert "match.1.agents: unknown agent 'mien'. Did you mean 'mine'?" in str(raised.value)
     assert "match.1.agents: unknown agent 'ues'. Did you mean 'use'?" in str(raised.value)
-    for refused in ("n_steps = 1", "batch_size = 0"):
+    for refused in ("n_steps = 1", "policy_kwargs = { optimizer_kwargs = { lrr = 1.0 } }"):
         path = write(tmp_path, GOOD.replace("n_steps = 8", refused))
         with pytest.raises(RecipeError, match="agent 'refinery': PPO refuses its parameters"):
             train("copper_net", path, envs=1, directory=tmp_path / "run")

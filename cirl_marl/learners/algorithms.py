@@ -31,8 +31,14 @@ RESERVED = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "devi
 SET_BY_ALGORITHM = ("self", "observation_space", "action_space", "lr_schedule", "use_sde")
 """What an algorithm hands to the constructor of its policy by itself."""
 
-SHARES = ("gamma", "gae_lambda", "tau")
-"""Discount factors, and how far a target network moves: numbers in [0, 1], which their annotations do not say."""
+SHARE = (Field(ge=0, le=1), "in [0, 1]")
+COUNT = (Field(gt=0), "above 0")
+BOUNDS = {
+    **dict.fromkeys(("gamma", "gae_lambda", "tau"), SHARE),
+    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "buffer_size", "n_delta"), COUNT),
+}
+"""Ranges that the annotations of parameters do not say: discount factors and how far a target network moves; numbers
+of steps, passes, transitions and perturbations."""
 NOISES: Mapping[str, type[ActionNoise]] = {
     "normal": NormalActionNoise,
     "ornstein_uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -141,8 +147,8 @@ def _not_finite(place: str, value: object) -> Iterator[str]:
 def _takes(parameter: inspect.Parameter, value: object) -> bool:
     """Whether a value is of the type that a constructor states."""
     stated = parameter.annotation
-    if parameter.name in SHARES:
-        stated = Annotated[stated, Field(ge=0, le=1)]
+    if parameter.name in BOUNDS:
+        stated = Annotated[stated, BOUNDS[parameter.name][0]]
     checked = TypeAdapter[Any](stated, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
     for form in (value, _as_tuple(value)):
         try:
@@ -155,7 +161,7 @@ def _takes(parameter: inspect.Parameter, value: object) -> bool:
 
 def _needed(parameter: inspect.Parameter) -> str:
     stated = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
-    return f"{stated} in [0, 1]" if parameter.name in SHARES else stated
+    return f"{stated} {BOUNDS[parameter.name][1]}" if parameter.name in BOUNDS else stated
 
 
 def _as_tuple(value: Any) -> Any:

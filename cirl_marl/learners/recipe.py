@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictStr, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictStr, ValidationError, WithJsonSchema, field_validator
 from pydantic_core import PydanticCustomError
 
 from cirl_marl.catalogue import recipe_path
@@ -163,7 +163,7 @@ class Recipe(_Table):
     name: str
     title: str
     run: Run = Run()
-    environment: dict[str, Any] = {}
+    environment: Annotated[dict[str, Any], WithJsonSchema(Options.model_json_schema())] = {}
     learner: Learner
     match: list[Match] = []
 
