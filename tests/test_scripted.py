@@ -182,7 +182,7 @@ def inside(run_of: VectorEnv, name: str, run: Any) -> Floats:
 
 
 def test_scripts_are_worth_having() -> None:
-    """The truck brings 3 items within 4 s and rests at home; the freeboard is nearer to 1000 °C than under neutral."""
+    """The truck brings 3 items in 4 s and rests at home; half-way the freeboard is far nearer to 1000 °C than neutral."""
     env = VectorEnv("solids_net", num_envs=1, scenario="reacher")
     scripted, neutral = (rollout(env, controller, seed=6) for controller in (Scripted({"sorter": 0.0}), Neutral()))
     aboard = inside(env, "truck.destination_m", scripted) > 0.0
@@ -191,8 +191,8 @@ def test_scripts_are_worth_having() -> None:
     assert (trips < 4.0).all()
     assert abs(inside(env, "truck.position_m", scripted)[-1]) < 0.5
     assert inside(env, "truck.position_m", scripted).max() < 10.6, "drove past the incinerator"
-    worst = [np.abs(inside(env, "incinerator.freeboard_degc", run) - 1000.0)[200:].max() for run in (scripted, neutral)]
-    assert worst[0] < 0.25 * worst[1]
+    worst = [np.abs(inside(env, "incinerator.freeboard_degc", run) - 1000.0)[700:].max() for run in (scripted, neutral)]
+    assert worst[0] < min(0.25 * worst[1], 20.0)
     assert (scripted.returns.sum(axis=0) > neutral.returns.sum(axis=0)).all()
 
 

@@ -71,7 +71,8 @@ class Incinerator:
     the reference inventories; R ∝ θ = exp(T_A(1/T_ref − 1/T_w)); P = 6/70·R_w; gas leaves after a residence time;
     R_g = R_w − P + R_c, so mass is conserved; heat h·R_g, a share of it in the bed; bed and freeboard exchange
     U(T_g − T_w); and Q_ext ≤ U_rec(T_g − T_a), for nothing cools below ambient. A cold bed does not ignite: start it
-    hot (M 2400, M_c 150, M_w 36, M_f 37 kg, T_w 300, T_g 1000 °C); Q_ext ≈ 6.4·10⁵ kJ/min (11 MW) then holds 1000 °C.
+    hot (M 2400, M_c 150, M_w 36, M_f 37.5 kg, T_w 300, T_g 1000 °C). Q_ext = 3.56·10⁵ kJ/min holds 1000 °C there while
+    the bed is as warm; the plant comes to rest at 1000 °C, hours later, with 6.44·10⁵ kJ/min (11 MW).
 
     Source: published code of arXiv 2505.21536, "not taken from a real incinerator", after Magnanelli et al., Energy 209
     (2020) 118426; its only units are min and °C, kg and kJ are inferred. The reference trajectory is reproduced to the

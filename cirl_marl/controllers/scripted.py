@@ -105,8 +105,8 @@ def incinerator(seen: Seen, model: Incinerator) -> Floats:
     return HOLD_KJ_MIN + GAIN_KJ_MIN_K * (seen["freeboard_degc"] - model.target_degc)[None]
 
 
-HOLD_KJ_MIN, GAIN_KJ_MIN_K = 6.4e5, 3e4
-"""Heat that the stationary plant gives at 1000 °C, and a gain that leaves it some degrees off elsewhere. [chosen]"""
+HOLD_KJ_MIN, GAIN_KJ_MIN_K = 3.56e5, 3e4
+"""Heat that holds 1000 °C at the reference inventory, and a gain that leaves it some degrees off elsewhere. [chosen]"""
 
 SCRIPTS: dict[str, Script] = {
     "fetch": fetch,
