@@ -25,8 +25,7 @@ from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextC
 
 from cirl_marl.errors import CirlError
 from cirl_marl.paper.document import markdown
-from cirl_marl.paper.plan import planned, study
-from cirl_marl.paper.published import environment_of
+from cirl_marl.paper.plan import minutes, overview, planned, study
 from cirl_marl.paper.results import Results, Row
 from cirl_marl.paper.session import live_bar
 from cirl_marl.paper.table import result_line
@@ -47,7 +46,9 @@ def main(
     recipe: Annotated[str | None, typer.Option(help="published or tuned; default: both.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each row; default: the paper's.")] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Seeds of each row; default: 3, of slow learners 1.")] = None,
-    episodes: Annotated[int | None, typer.Option(min=1, help="Evaluation episodes that count successes.")] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Evaluation episodes; default: 100, where successes count the paper's.")
+    ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Rows at a time.")] = 1,
     table: Annotated[bool, typer.Option("--table", help="Run nothing, only write the tables.")] = False,
     speed: Annotated[bool, typer.Option("--speed", help="Only compare training times on CopperNet.")] = False,
@@ -107,7 +108,9 @@ class Study:
         self._failed: list[Row] = []
         self._again = True
         self._running: list[Job] = []
-        console.print(f"{len(rows)} rows, {len(rows) - len(self._queue)} done, results in {results.path}")
+        results.prepare()
+        overall = overview(rows, self._queue)
+        console.print(f"{overall}; results in {results.path}", soft_wrap=True, highlight=False)
 
     def _is_done(self, row: Row) -> bool:
         again = outdated(self._results.read(row), self._episodes) if self._results.has(row) else ""
@@ -124,7 +127,7 @@ class Study:
         columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
             finished = 0.0
-            whole = bars.add_task("all rows", total=sum(_minutes(row) for row in self._queue))
+            whole = bars.add_task("all rows", total=sum(minutes(row) for row in self._queue))
             try:
                 while self._queue or self._running or self._retry():
                     while self._queue and len(self._running) < self._jobs:
@@ -136,9 +139,9 @@ class Study:
                         bars.update(job.bar, description=f"{job.row}: {PHASES[phase]}", completed=done, total=total)
                         if job.process.exitcode is not None:
                             self._finish(job, bars)
-                            finished += _minutes(job.row)
+                            finished += minutes(job.row)
                         elif PHASES[phase] == "training":
-                            underway += _minutes(job.row) * done / total
+                            underway += minutes(job.row) * done / total
                     bars.update(whole, completed=finished + underway)
             finally:
                 for job in self._running:
@@ -197,19 +200,11 @@ def work(row: Row, folder: str, episodes: int | None, state: Any) -> None:
     try:
         from cirl_marl.paper.training import run_row
 
-        results.write(run_row(row, report=report, success_episodes=episodes))
+        results.write(run_row(row, report=report, episodes=episodes))
         log.write("done\n")
     except BaseException:
         log.write(traceback.format_exc())
         raise SystemExit(1) from None
-
-
-def _minutes(row: Row) -> float:
-    """Guess how long a row takes, relative to others: as long as it took the authors."""
-    environment = environment_of(row.environment)
-    published = environment.runs.get(row.algorithm)
-    minutes = 2.0 if row.recipe == "tuned" else (published.minutes if published else None) or 40.0
-    return minutes * row.steps / environment.steps
 
 
 def _names(text: str) -> tuple[str, str | None]:

@@ -41,13 +41,16 @@ class LearnerError(RuntimeError):
 
 
 def unknown(kind: str, name: object, known: Iterable[object]) -> str:
-    """Say that ``name`` is no ``kind``, with the nearest match and all options.
+    """Say that ``name`` is no ``kind``, with the nearest match, whatever the case of its letters, and all options.
 
     >>> unknown("law", "donnor", ["donor", "recipient"])
     "unknown law 'donnor'. Did you mean 'donor'? Known: donor, recipient."
+    >>> unknown("algorithm", "ppo", ["A2C", "PPO"])
+    "unknown algorithm 'ppo'. Did you mean 'PPO'? Known: A2C, PPO."
     """
     options = [str(option) for option in known]
-    match = difflib.get_close_matches(str(name), options, n=1, cutoff=0.5)
-    hint = f" Did you mean '{match[0]}'?" if match else ""
+    written = {option.lower(): option for option in options}
+    match = difflib.get_close_matches(str(name).lower(), written, n=1, cutoff=0.5)
+    hint = f" Did you mean '{written[match[0]]}'?" if match else ""
     shown = ", ".join(options[:30]) + (f", … ({len(options)} in all)" if len(options) > 30 else "")
     return f"unknown {kind} '{name}'.{hint} Known: {shown or 'none'}."

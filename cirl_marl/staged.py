@@ -36,11 +36,15 @@ def staged_circularity(
         trucked: when m_u arrived at the incinerator, t_in + T_s + T_truck.
         used: when the sorted part did, t_in + T_s + T_second-use.
 
+    Raises:
+        CirlError: if s is no percentage.
+
     References: Zocco, Corti, Malvezzi, CiRL (arXiv 2505.21536), network N_s.
 
     >>> staged_circularity([0.0, 1.0, 5.0, 9.0], mass=10, success=80, left=0.5, trucked=4, used=8)
     array([ -0., -10., -12., -20.])
     """
+    _check_percentage(success)
     at = np.asarray(time, dtype=float)
     unsorted = mass * (1.0 - success / 100.0)
     lost: Floats = mass * (at > left) + unsorted * (at >= trucked) + (mass - unsorted) * (at >= used)
@@ -86,8 +90,7 @@ def time_window_circularity(
     """
     if len(masses) != len(criticality):
         raise CirlError(f"{len(masses)} masses, but {len(criticality)} criticalities")
-    if not 0.0 <= success <= 100.0:
-        raise CirlError(f"success is {success!r}; it must be a percentage")
+    _check_percentage(success)
     finite = all(0.0 <= time < np.inf for time in (use, sorting, truck, incineration))
     if not finite or truck > use or use == 0.0:
         raise CirlError(f"times use {use!r}, sorting {sorting!r}, truck {truck!r}, incineration {incineration!r}")
@@ -95,3 +98,8 @@ def time_window_circularity(
     window = use + sorting + use + incineration
     stages = (use + sorting + truck) + (2.0 - success / 100.0) * (use - truck) + 2.0 * incineration
     return -CIRO_FACTOR * weighted * stages / window
+
+
+def _check_percentage(success: float) -> None:
+    if not 0.0 <= success <= 100.0:
+        raise CirlError(f"success is {success!r}; it must be a percentage")

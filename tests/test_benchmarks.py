@@ -50,12 +50,12 @@ def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
         paper.main(out=tmp_path, only=only, recipe="published", steps=20)
     assert ended.value.exit_code == 1
     said = capsys.readouterr().out
-    assert "1 rows, 0 done" in said
+    assert "rows: 1, done: 0" in said
     assert said.count("no training episode ended") == 2
     paper.main(out=tmp_path, only=only, recipe="published", steps=60)
-    assert "1 rows, 1 done" not in capsys.readouterr().out
+    assert "rows: 1, done: 1" not in capsys.readouterr().out
     paper.main(out=tmp_path, only=only, recipe="published", steps=60)
-    assert "1 rows, 1 done" in capsys.readouterr().out
+    assert "rows: 1, done: 1" in capsys.readouterr().out
     paper.main(out=tmp_path / "new", only=["CopperNet"], table=True)
     assert (tmp_path / "new" / "paper_tables.md").is_file()
     assert paper.DOCUMENT.read_bytes() == published

@@ -116,7 +116,8 @@ def test_row_is_trained_kept_and_not_run_again(
     """Every finished training episode counts, also of ARS; a second call shows the same figures without training."""
     arguments = (algorithm, "--steps", str(steps), "--out", str(tmp_path))
     assert cirl(monkeypatch, *arguments) == 0
-    shown = capsys.readouterr().out
+    begun, _, shown = capsys.readouterr().out.partition("\n")
+    assert begun.startswith("rows: 1, done: 0, to go by the paper's training times: 0 min; results in ")
     assert f"{steps} of 200,000" in shown
     (path,) = tmp_path.iterdir()
     kept = json.loads(path.read_text())
@@ -142,7 +143,7 @@ def test_row_is_trained_kept_and_not_run_again(
 
     monkeypatch.setattr(session, "run_row", lambda *_, **__: pytest.fail("the row was run again"))
     assert cirl(monkeypatch, *arguments) == 0
-    assert capsys.readouterr().out == shown
+    assert capsys.readouterr().out.partition("\n") == (f"rows: 1, done: 1; results in {tmp_path}", "\n", shown)
 
 
 def test_same_seed_same_figures() -> None:
@@ -180,7 +181,7 @@ def test_weights_that_become_nan_are_a_result(
 
 
 def test_saturated_sac_raises_its_entropy_coefficient_without_end() -> None:
-    """Its logarithm grows by one learning rate an update on rewards of −10⁵ a step, which ends in NaN."""
+    """Its logarithm grows by one learning rate an update on rewards of −10⁶ a step, which ends in NaN."""
     model = SAC("MlpPolicy", gymnasium.make(COPPER.id), seed=0, learning_starts=20).learn(120)
     assert model.log_ent_coef is not None
     assert model.log_ent_coef.item() == pytest.approx(100 * 3e-4, rel=0.01)
@@ -359,6 +360,10 @@ def test_names_choose_rows() -> None:
     assert [row.algorithm for row in planned("FetchWasteSorting", "TQC-HER", recipe=None)] == ["TQC-HER"] * 2
     with pytest.raises(CirlError, match=r"unknown algorithm of the paper 'PP0'\. Did you mean 'PPO'"):
         planned(None, "PP0", recipe="tuned")
+    with pytest.raises(CirlError, match=r"unknown algorithm of the paper 'ppo'\. Did you mean 'PPO'"):
+        planned("CopperNet", "ppo")
+    with pytest.raises(CirlError, match="A2C is an algorithm, which comes after an environment: Reacher, Tran"):
+        planned("A2C", None)
     with pytest.raises(CirlError, match=r"no tuned recipe .* for A2C"):
         planned(None, "A2C", recipe="tuned")
 
@@ -369,6 +374,7 @@ def test_results_that_answer_another_question_are_outdated() -> None:
     assert kept.evaluation is not None
     assert outdated(kept) == ""
     assert "played 50 episodes, not 100" in outdated(replace(kept, evaluation=replace(kept.evaluation, episodes=50)))
+    assert "played 100 episodes, not 7" in outdated(kept, episodes=7)
     now = described(COPPER)
     assert outdated(replace(kept, settings=now)) == ""
     assert "definition" in outdated(replace(kept, settings=now | {"definition_sha256": "0" * 64}))
@@ -382,16 +388,30 @@ def test_results_that_answer_another_question_are_outdated() -> None:
 
 
 def test_every_kept_row_is_of_the_definitions_of_today() -> None:
-    """The environments and recipes that it was trained with are defined as they are now."""
-    kept = Results(Path(__file__).parent.parent / "benchmarks" / "results" / "paper").all()
+    """The environments and recipes that it was trained with are those of today, and the document shows them."""
+    root = Path(__file__).parent.parent
+    folder = root / "benchmarks" / "results" / "paper"
+    kept = Results(folder).all()
     assert len(kept) > 80
     assert [(str(result.row), why) for result in kept if (why := outdated(result))] == []
+    text = markdown(kept, (folder / "comment.md").read_text(encoding="utf-8"))
+    assert text == (root / "docs" / "paper_tables.md").read_text(encoding="utf-8")
+
+
+def test_results_need_a_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A path that cannot be one is refused before anything is trained."""
+    monkeypatch.setattr(session, "run_row", lambda *_, **__: pytest.fail("a row was run"))
+    (tmp_path / "file").touch()
+    assert cirl(monkeypatch, "A2C", "--out", str(tmp_path / "file")) == 2
+    assert f"{tmp_path / 'file'}: results need a directory" in capsys.readouterr().err
 
 
 def test_goal_task_learns_with_hindsight(toy: PaperEnvironment) -> None:
     """Successes count when they come, in the number of episodes asked for."""
     del toy
-    found = run_row(Row(environment="Toy", algorithm="SAC-HER", steps=110), success_episodes=40)
+    found = run_row(Row(environment="Toy", algorithm="SAC-HER", steps=110), episodes=40)
     assert found.evaluation == Evaluation(episodes=40, mean=-10.0, deviation=0.0, success=50.0)
     assert found.end_return == -10.0
     assert found.settings["policy"] == "MultiInputPolicy"

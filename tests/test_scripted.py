@@ -182,7 +182,7 @@ def inside(run_of: VectorEnv, name: str, run: Any) -> Floats:
 
 
 def test_scripts_are_worth_having() -> None:
-    """The truck brings 3 items in 4 s and rests at home; half-way the freeboard is far nearer to 1000 °C than neutral."""
+    """The truck brings 3 items in 4 s and rests at home; from half-way the freeboard is nearer to 1000 °C."""
     env = VectorEnv("solids_net", num_envs=1, scenario="reacher")
     scripted, neutral = (rollout(env, controller, seed=6) for controller in (Scripted({"sorter": 0.0}), Neutral()))
     aboard = inside(env, "truck.destination_m", scripted) > 0.0

@@ -62,3 +62,6 @@ def test_times_without_meaning_are_refused(changes: dict[str, Any], message: str
     assert time_window_circularity(**usual) < 0.0
     with pytest.raises(CirlError, match=message):
         time_window_circularity(**(usual | changes))
+    if "success" in changes:
+        with pytest.raises(CirlError, match=message):
+            staged_circularity([1.0], mass=7.0, left=0.0, trucked=3.0, used=6.0, **changes)

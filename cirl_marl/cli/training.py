@@ -99,19 +99,21 @@ def paper(
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; default: the paper's.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="How many seeds: 0, 1, …")] = 1,
     recipe: Annotated[str, typer.Option(help="published: the paper's settings; tuned: ours.")] = "published",
-    episodes: Annotated[int | None, typer.Option(min=1, help="Evaluation episodes that count successes.")] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Evaluation episodes; default: 100, where successes count the paper's.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Results, one file a row; a row that is done is not run again.")] = Path(
         "runs/paper"
     ),
 ) -> None:
-    """Repeat the CiRL paper's training runs and show their figures beside the published ones."""
+    """Repeat the CiRL paper's training runs, half a day in all, and show their figures beside the published ones."""
     from cirl_marl.paper.plan import planned
     from cirl_marl.paper.results import Results
     from cirl_marl.paper.session import run_session
 
     rows = planned(environment, algorithm, steps=steps, seeds=seeds, recipe=recipe)
     try:
-        failed = run_session(rows, Results(out), console, success_episodes=episodes)
+        failed = run_session(rows, Results(out), console, episodes=episodes)
     except KeyboardInterrupt:
         message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
         console.print(message, soft_wrap=True, highlight=False)

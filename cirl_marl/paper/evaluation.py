@@ -24,11 +24,9 @@ Predict = Callable[[Any, Any, NDArray[np.bool_]], tuple[NDArray[Any], Any]]
 """From observations, recurrent state and episode starts to deterministic actions and the next recurrent state."""
 
 
-def evaluation_episodes(environment: PaperEnvironment, success_episodes: int | None) -> int:
-    """Return how many episodes a final policy plays: where successes are counted, as many as asked for."""
-    if not environment.success_episodes:
-        return EVALUATION_EPISODES
-    return environment.success_episodes if success_episodes is None else success_episodes
+def evaluation_episodes(environment: PaperEnvironment, asked: int | None) -> int:
+    """Return how many episodes a final policy plays: as many as ``asked``, else 100, or the paper's that succeed."""
+    return asked or environment.success_episodes or EVALUATION_EPISODES
 
 
 def predictor(model: BaseAlgorithm, normalise: Callable[[Any], Any] = lambda observation: observation) -> Predict:

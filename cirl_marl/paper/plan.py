@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from cirl_marl.catalogue import recipes
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.paper.published import ALGORITHMS, BOX_ALGORITHMS, ENVIRONMENTS, GOAL_ALGORITHMS, chosen, environment_of
@@ -34,6 +36,8 @@ def planned(
     """
     if recipe is not None and recipe not in RECIPES:
         raise CirlError(f"--recipe: {unknown('recipe', recipe, RECIPES)}")
+    if environment in ALGORITHMS:
+        raise CirlError(f"{environment} is an algorithm, which comes after an environment: {', '.join(ENVIRONMENTS)}")
     if algorithm is not None and algorithm not in ALGORITHMS:
         raise CirlError(unknown("algorithm of the paper", algorithm, ALGORITHMS))
     rows = []
@@ -65,6 +69,27 @@ def study(*, steps: int | None = None, seeds: int | None = None, recipe: str | N
 
     wanted = [row for row in rows if row.recipe == "tuned" or row.algorithm in FAST or row.seed < (seeds or 1)]
     return sorted(wanted, key=order)
+
+
+def minutes(row: Row) -> float:
+    """Guess how long a row takes: as long as it took the authors, of a tuned one two minutes."""
+    environment = environment_of(row.environment)
+    published = environment.runs.get(row.algorithm)
+    whole = 2.0 if row.recipe == "tuned" else (published.minutes if published else None) or 40.0
+    return whole * row.steps / environment.steps
+
+
+def overview(rows: Sequence[Row], left: Sequence[Row]) -> str:
+    """Say how many rows there are, how many of them are done, and how long those that are ``left`` may take.
+
+    >>> rows = [Row(environment="Reacher", algorithm=name, steps=100_000, seed=0) for name in ("SAC", "PPO")]
+    >>> overview(rows, rows[:1])
+    "rows: 2, done: 1, to go by the paper's training times: 22 min"
+    """
+    to_go = sum(map(minutes, left))
+    takes = f"{to_go:.0f} min" if to_go < 120 else f"{to_go / 60:.0f} h"
+    done = f"rows: {len(rows)}, done: {len(rows) - len(left)}"
+    return f"{done}, to go by the paper's training times: {takes}" if left else done
 
 
 def tuned_recipe(environment: str) -> str | None:

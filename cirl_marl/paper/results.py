@@ -162,9 +162,20 @@ class Results:
         """
         return _read(self.file(row))
 
+    def prepare(self) -> None:
+        """Make the directory.
+
+        Raises:
+            RunError: if the path cannot be one.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RunError(f"{self.path}: results need a directory: {error.strerror}") from error
+
     def write(self, result: Result) -> None:
         """Keep a result, in one step."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        self.prepare()
         figures = {"gain": result.gain, "gain_per_step": result.gain_per_step}
         text = _one_line_each(asdict(result) | figures)
         write_atomically(self.file(result.row), lambda partial: partial.write_text(text))

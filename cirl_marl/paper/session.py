@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from cirl_marl.errors import CirlError
 from cirl_marl.paper.evaluation import Report
+from cirl_marl.paper.plan import overview
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Results, Row
 from cirl_marl.paper.table import environment_table, result_line
@@ -19,26 +20,29 @@ from cirl_marl.paper.training import check_registered, outdated, run_row
 REFRESH_S = 0.2
 
 
-def run_session(rows: Sequence[Row], results: Results, console: Console, *, success_episodes: int | None) -> list[Row]:
+def run_session(rows: Sequence[Row], results: Results, console: Console, *, episodes: int | None) -> list[Row]:
     """Run the rows that are not done, show the tables of their environments, and return the rows that failed.
 
     Raises:
-        CirlError: if an environment is missing, before anything is run.
+        CirlError: if an environment is missing or results cannot be kept there, before anything is run.
         KeyboardInterrupt: after Ctrl-C; the row that ran leaves nothing.
     """
     environments = [ENVIRONMENTS[name] for name in dict.fromkeys(row.environment for row in rows)]
     for environment in environments:
         check_registered(environment)
+    results.prepare()
+    changed = {row: outdated(results.read(row), episodes) for row in rows if results.has(row)}
+    left = [row for row in rows if row not in changed or changed[row]]
+    console.print(f"{overview(rows, left)}; results in {results.path}", soft_wrap=True, highlight=False)
     failed: list[Row] = []
     for i, row in enumerate(rows):
-        again = outdated(results.read(row), success_episodes) if results.has(row) else ""
-        if again:
-            console.print(f"{row}: once more, as {again}", soft_wrap=True, highlight=False)
-        if again or not results.has(row):
+        if changed.get(row):
+            console.print(f"{row}: once more, as {changed[row]}", soft_wrap=True, highlight=False)
+        if row in left:
             title = f"{i + 1} of {len(rows)}: {row.environment} {row.algorithm}, seed {row.seed}"
             try:
                 with live_bar(console, title) as bar:
-                    results.write(run_row(row, report=bar, success_episodes=success_episodes))
+                    results.write(run_row(row, report=bar, episodes=episodes))
             except CirlError as error:
                 failed.append(row)
                 console.print(f"{row}: failed: {error}", soft_wrap=True, markup=False, highlight=False)

@@ -62,13 +62,13 @@ class Trained:
     options: dict[str, Any]
 
 
-def run_row(row: Row, *, report: Report | None = None, success_episodes: int | None = None) -> Result:
+def run_row(row: Row, *, report: Report | None = None, episodes: int | None = None) -> Result:
     """Train and evaluate one row.
 
     Args:
         row: what to run.
         report: called now and then.
-        success_episodes: evaluation episodes where the environment knows a success; None takes the paper's number.
+        episodes: that the final policy plays; None takes 100, or the paper's number where it counts successes.
 
     Raises:
         CirlError: if the environment is missing in this version, or no training episode ended.
@@ -87,7 +87,7 @@ def run_row(row: Row, *, report: Report | None = None, success_episodes: int | N
             trained = train_tuned(environment, row, report)
         if not trained.returns:
             raise CirlError(f"{row}: no training episode ended; use more steps")
-        episodes = evaluation_episodes(environment, success_episodes)
+        episodes = evaluation_episodes(environment, episodes)
         seed = EVALUATION_SEEDS + SEED_SPACING * row.seed
         evaluation = published_ends = None
         if trained.predict is not None:
@@ -121,17 +121,17 @@ def run_row(row: Row, *, report: Report | None = None, success_episodes: int | N
     )
 
 
-def outdated(result: Result, success_episodes: int | None = None) -> str:
+def outdated(result: Result, episodes: int | None = None) -> str:
     """Return in what a result differs from what its row would give today; empty if in nothing that is known.
 
     Args:
         result: of a row that is done.
-        success_episodes: as for ``run_row``.
+        episodes: as for ``run_row``.
     """
     environment, settings = environment_of(result.row.environment), result.settings
-    episodes = evaluation_episodes(environment, success_episodes)
-    if result.evaluation is not None and result.evaluation.episodes != episodes:
-        return f"its policy played {result.evaluation.episodes} episodes, not {episodes}"
+    wanted = evaluation_episodes(environment, episodes)
+    if result.evaluation is not None and result.evaluation.episodes != wanted:
+        return f"its policy played {result.evaluation.episodes} episodes, not {wanted}"
     recorded = settings.get("definition_sha256")
     if recorded is not None and recorded != described(environment).get("definition_sha256"):
         return "the definition of the environment is another now"
