@@ -10,6 +10,8 @@ import numpy as np
 from cirl_marl.elements import ControlKind, Law, Role
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.units import factor
+from cirl_marl.validate_settings import is_whole
 from cirl_marl.vector_env import VectorEnv
 
 COARSE = 0.01
@@ -23,9 +25,10 @@ SHORT = 20
 
 
 def remarks(network: Network) -> Iterator[str]:
-    """Yield what whoever wrote ``network`` may not have meant: idle agents and debtors, and steps that are too long."""
+    """Yield what whoever wrote ``network`` may not have meant: idle agents and debtors, batches, steps too long."""
     yield from _apart(network)
     yield from _without_effect(network)
+    yield from _departures(network)
     yield from _aimless(network)
     yield from _unpaid(network)
     yield from _coarse(network)
@@ -49,6 +52,23 @@ def _without_effect(network: Network) -> Iterator[str]:
         recipient = network.nodes[network.node_index[arc.recipient]]
         if not arc.pollutant and recipient.role is not Role.ENVIRONMENT:
             yield f"arc '{arc.id}': pollutant = false says nothing here, as '{arc.recipient}' is no environment"
+
+
+def _departures(network: Network) -> Iterator[str]:
+    """Yield batches that leave after the episode, or that a station cannot finish."""
+    interval, horizon = network.episode.control_interval, network.episode.horizon
+    for arc in network.arcs:
+        recipient = network.nodes[network.node_index[arc.recipient]]
+        batch_kg = getattr(recipient.model, "batch_kg", None)
+        for time, mass in arc.batches:
+            at = f"arc '{arc.id}': batch at {time:g} {network.time_unit}"
+            if round(time / interval) >= horizon:
+                yield f"{at}: an episode ends at {horizon * interval:g} {network.time_unit}, so that it never leaves"
+            if batch_kg is not None and not is_whole(mass * factor(network.mass_unit, "kg") / batch_kg):
+                yield (
+                    f"{at}: {mass:g} {network.mass_unit} are no whole number of batches of {batch_kg:g} kg, as "
+                    f"'{recipient.id}' makes them, so that a part of it waits there"
+                )
 
 
 def _coarse(network: Network) -> Iterator[str]:

@@ -79,9 +79,17 @@ def problems(network: Network) -> Iterator[str]:
                     f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', on the arc or on its "
                     f"donor '{node.id}'; it has {len(sets_flow)}"
                 )
-    for (donor, port), arcs in _ports(network).items():
+    carrying = _ports(network)
+    for (donor, port), arcs in carrying.items():
         if len(arcs) > 1:
             yield f"arc '{arcs[1]}': port '{port}' of '{donor}' has the arc '{arcs[0]}' already"
+    for node in network.nodes:
+        for port in getattr(node.model, "ports", ()):
+            if (node.id, port) not in carrying:
+                yield (
+                    f"node '{node.id}': what its model releases to port '{port}' would stay; give it an arc of law "
+                    f"'batch' with by = '{node.id}' and port = '{port}'"
+                )
     yield from service_problems(network)
     yield from setting_problems(network)
     acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)

@@ -142,8 +142,8 @@ def test_check_tries_recipes_in_a_network(monkeypatch: pytest.MonkeyPatch, capsy
             f"match.0.agents: unknown agent '{agent}x'. Did you mean '{agent}'?",
         ),
         (
-            good.replace("A2C", "PPO") + "parameters = { batch_size = 0 }\n",
-            "PPO refuses its parameters {'batch_size': 0}",
+            good.replace("A2C", "PPO") + "parameters.policy_kwargs.optimizer_kwargs = { lrr = 1.0 }\n",
+            "PPO refuses its parameters {'policy_kwargs': {'optimizer_kwargs': {'lrr': 1.0}}}",
         ),
     ):
         assert check(text)[0] == 0
@@ -212,6 +212,22 @@ def test_check_remarks_on_what_has_no_effect(
     assert "node 'attic': no arc begins or ends here" in printed
     assert "there is no service, so that agents with reward 'mixed' do best to stop whatever flows" in printed
     assert "node 'shop'" not in printed
+
+
+def test_check_remarks_on_batches_that_never_leave_or_never_end(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Departures at the end of the episode or later, and masses that are no whole batches of the station."""
+    text = (folder("envs") / "solids_net.toml").read_text(encoding="utf-8")
+    usual = 'times = [0, 8], time_unit = "s", masses = [300, 300]'
+    assert usual in text
+    Path("late.toml").write_text(text.replace(usual, 'times = [0, 28], time_unit = "s", masses = [250, 600]'))
+    assert run(monkeypatch, "check", "late.toml") == 0
+    printed = capsys.readouterr().out
+    first = "arc 'first_use': batch at 0 s: 250 kg are no whole number of batches of 300 kg, as 'sorter' makes them"
+    assert f"remark on scenario 'default': {first}" in printed
+    assert "arc 'first_use': batch at 28 s: an episode ends at 28 s, so that it never leaves" in printed
+    assert "600 kg" not in printed
 
 
 def idle_network() -> Network:

@@ -182,6 +182,8 @@ def test_what_a_station_releases_fits_its_arcs() -> None:
     ):
         with pytest.raises(NetworkError, match=said):
             replace(network, arcs=tuple(changed if arc is unsorted else arc for arc in network.arcs))
+    with pytest.raises(NetworkError, match="node 'sorter': what its model releases to port 'unsorted' would stay"):
+        replace(network, arcs=tuple(arc for arc in network.arcs if arc is not unsorted))
     assert sorted_.rate == unsorted.rate
 
 

@@ -36,7 +36,8 @@ class CompartmentModel(Protocol):
       on a node ``stock_kg``, what it holds; on a batch arc whose vehicle it is ``load_kg``, what that carries;
     - ``receive(state, mass_kg)``: the state after a delivery of ``mass_kg``, shape (B,);
     - ``ports``, ``released(state)``, shape (ports, B), and ``complete(state)``, shape (B,): units released into batch
-      arcs in the last step, and whether that completed a batch; ``unit_kg``: the mass of one, if the model needs it;
+      arcs in the last step, and whether that completed a batch; ``unit_kg`` and ``batch_kg``: the mass of a
+      unit and of a batch, if the model needs them;
     - ``goal_reward(achieved, desired)`` with ``observation_names``, ``achieved_names`` and ``desired_names``: a task
       with goals, for ``GoalEnv``;
     - ``robot``: the model that acts within this one;

@@ -54,6 +54,11 @@ class SortingStation:
         """Mass of what is released at a time."""
         return self.item_kg
 
+    @property
+    def batch_kg(self) -> float:
+        """Mass of a batch."""
+        return self.items_per_batch * self.item_kg
+
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""
         check_form(self.form, tuple(ROBOTS))
