@@ -93,6 +93,8 @@ def test_volume_ratios_of_net_zero() -> None:
     misprinted = model_class("digester_published")().outflow(balanced, none)[0]
     assert model_class("digester_published")(misprint=False).outflow(balanced, none)[0] == corrected
     assert misprinted == pytest.approx(175.08, abs=5e-3)
+    assert digester.partial_pressure(balanced)[0] == pytest.approx(0.3909, abs=5e-5)
+    assert digester.partial_pressure(balanced, balanced[3] - balanced[4])[0] == pytest.approx(-1.885, abs=5e-4)
     per_biovolume, per_litre = uptake_after(15.0, 50.0, "published")
     assert per_biovolume == pytest.approx(0.2702, abs=1e-4)
     assert per_litre == pytest.approx(0.0135, abs=5e-5)
