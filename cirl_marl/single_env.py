@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.catalogue import load_network
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Network
-from cirl_marl.parallel_env import NetworkParallelEnv
+from cirl_marl.parallel_env import OPTIONS, NetworkParallelEnv
 from cirl_marl.state import Snapshot
+
+SHARED = ("reward", "render_mode")
+"""What the PettingZoo view takes besides its options, and this one as well."""
 
 
 class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -57,6 +60,12 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if "agents" in options:
             raise CirlError("a single-agent environment takes agent=, not agents=")
+        for option in options:
+            if option not in (*OPTIONS, *SHARED):
+                own = ("agent", "scenario", "legacy_episode")
+                raise CirlError(unknown("option", option, (*OPTIONS, *own, *SHARED)))
+        if not isinstance(agent, str | None):
+            raise CirlError(f"agent must be the name of one agent, got {agent!r}")
         chosen = None if agent is None else [agent]
         found = load_network(network) if isinstance(network, str | Path) else network
         scenario = _scenario_of(found, scenario, agent)

@@ -76,6 +76,8 @@ class VectorEnv:
             CirlError: for an unknown network, scenario, agent or option.
         """
         found = load_network(network) if isinstance(network, str | Path) else network
+        if not isinstance(found, Network):
+            raise CirlError(f"network must be a name of the catalogue, a file or a Network, got {found!r}")
         found = found.scenario(scenario)
         for name, value in (("num_envs", num_envs), ("horizon", found.episode.horizon if horizon is None else horizon)):
             if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
@@ -325,7 +327,7 @@ class VectorEnv:
 
 
 def _share(weight: float) -> float:
-    if isinstance(weight, bool) or not isinstance(weight, int | float) or not 0 <= weight <= 1:
+    if isinstance(weight, bool) or not isinstance(weight, int | float | np.number) or not 0 <= weight <= 1:
         raise CirlError(f"circularity_weight must be a number in [0, 1], got {weight!r}")
     return float(weight)
 

@@ -253,6 +253,14 @@ def test_misspelt_options_name_the_nearest() -> None:
     """Options of the environments and of ``with_options`` are checked."""
     with pytest.raises(CirlError, match=r"unknown option 'horzon'\. Did you mean 'horizon'"):
         parallel_env("copper_net", horzon=3)
+    with pytest.raises(CirlError, match=r"unknown option 'horzon'\. Did you mean 'horizon'.*agent, .*legacy_episode"):
+        single_agent_env("copper_net", "mine", horzon=3)
+    with pytest.raises(CirlError, match=r"agent must be the name of one agent, got \['mine'\]"):
+        single_agent_env("copper_net", ["mine"])  # type: ignore[arg-type]
+    for make in (parallel_env, vector_env, single_agent_env):
+        with pytest.raises(CirlError, match=r"network must be a name of the catalogue, a file or a Network, got 3"):
+            make(3)  # type: ignore[arg-type]
+    assert VectorEnv("copper_net", circularity_weight=np.float32(0.5)).network.objective.circularity_weight == 0.5  # type: ignore[arg-type]
     with pytest.raises(CirlError, match=r"unknown field 'horzon'\. Did you mean 'horizon'"):
         load_network("copper_net").with_options(episode={"horzon": 3})
     with pytest.raises(CirlError, match=r"unknown group 'episod'\. Did you mean 'episode'"):

@@ -20,7 +20,7 @@ from cirl_marl.comparison import compare
 from cirl_marl.comparison.contenders import differences
 from cirl_marl.comparison.files import FILES, write_comparison
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.learners import Progress, RunDirectory, load_recipe, train
+from cirl_marl.learners import Progress, Recipe, RunDirectory, Training, load_recipe, resume, train
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
 from cirl_marl.pareto import pareto
@@ -232,6 +232,23 @@ def test_evaluation_has_the_gap(runs: list[Path]) -> None:
     assert gap is not None
     assert figures["controllers"]["trained"]["gap"]["value"] == pytest.approx(float(gap.mean()))
     assert json.loads((runs[1] / "evaluation.json").read_text()) == figures
+
+
+def test_figures_are_of_the_checkpoint_that_acted(tmp_path: Path, ppo_recipe: Recipe) -> None:
+    """A run that is trained on while it is evaluated has newer policies, which are evaluated next time."""
+    train("copper_net", ppo_recipe, directory=tmp_path)
+    run = RunDirectory(tmp_path)
+    moved: list[Training] = []
+
+    def train_on(what: str, share: float) -> None:
+        if not moved and what == "neutral":
+            moved.append(resume(tmp_path, steps=160))
+
+    figures, _, _ = evaluate_run(run, episodes=2, bounds=False, progress=train_on)
+    assert (figures["checkpoint"], run.checkpoint.name) == ("000000040-complete", "000000080-complete")
+    again, _, _ = evaluate_run(run, episodes=2, bounds=False)
+    assert again["checkpoint"] == "000000080-complete"
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == again
 
 
 def test_reports_keep_the_gap(runs: list[Path]) -> None:

@@ -510,6 +510,23 @@ def test_tuned_robot_trains_in_copies(toy: PaperEnvironment) -> None:
     assert (trained.steps, trained.returns) == (120, [-10.0] * 12)
 
 
+def test_rows_of_other_seeds_have_starts_of_their_own(toy: PaperEnvironment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The copies of a row begin from seeds that no copy of another row has."""
+    given: dict[int, list[int]] = {0: [], 1: []}
+    reset = Toy.reset
+    for seed, seeds in given.items():
+
+        def recorded(self: Toy, *, seed: int | None = None, options: Any = None, kept: list[int] = seeds) -> Any:
+            kept += [] if seed is None else [seed]
+            return reset(self, seed=seed, options=options)
+
+        monkeypatch.setattr(Toy, "reset", recorded)
+        row = Row(environment="Toy", algorithm="SAC", recipe="tuned", steps=120, seed=seed)
+        train_tuned(toy, row, lambda *_: None, recipe("SAC", learning_starts=100, batch_size=16))
+    assert given[0]
+    assert not set(given[0]) & set(given[1])
+
+
 def test_rows_that_cannot_run_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
     """Too few steps for an episode, and an environment that is not there, are errors."""
     with pytest.raises(CirlError, match="no training episode ended"):

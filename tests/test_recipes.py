@@ -109,7 +109,7 @@ def test_published_schema_is_up_to_date() -> None:
         (
             '"PPO"\nparameters = { n_steps = 8',
             '"SAC"\nparameters = { action_noise = 3',
-            "needs kind and a number sigma, got 3",
+            "needs kind and a number sigma of at least 0, got 3",
         ),
         (
             '"PPO"\nparameters = { n_steps = 8',
@@ -118,16 +118,45 @@ def test_published_schema_is_up_to_date() -> None:
         ),
         ("[learner]", "[run]\nsteps = 0\n[learner]", "run.steps: Input should be greater than 0, got 0"),
         ("[learner]", '[learner]\npolicy = "MlpPolcy"', "unknown policy of PPO for vectors 'MlpPolcy'. Did you mean"),
-        ("n_steps = 8", "learning_rate = { linear_from = 1e-3 }", "learning_rate: needs a number, or linear_from and"),
-        ("n_steps = 8", 'batch_size = "a"', "parameters.batch_size: PPO needs int above 0, got 'a'"),
-        ("n_steps = 8", "n_epochs = 2.5", "parameters.n_epochs: PPO needs int above 0, got 2.5"),
-        ("n_steps = 8", "n_steps = 0", "parameters.n_steps: PPO needs int above 0, got 0"),
+        (
+            "n_steps = 8",
+            "learning_rate = { linear_from = 1e-3 }",
+            "learning_rate: needs a number of at least 0, or two such, l",
+        ),
+        ("n_steps = 8", 'batch_size = "a"', "parameters.batch_size: PPO needs int of at least 1, got 'a'"),
+        ("n_steps = 8", "n_epochs = 2.5", "parameters.n_epochs: PPO needs int of at least 1, got 2.5"),
+        ("n_steps = 8", "n_steps = 0", "parameters.n_steps: PPO needs int of at least 1, got 0"),
+        ("n_steps = 8", "clip_range = -0.2", "parameters.clip_range: PPO needs float | Callable"),
+        ("n_steps = 8", "target_kl = -1", "parameters.target_kl: PPO needs float | None of at least 0, got -1"),
+        (
+            "n_steps = 8",
+            "learning_rate = { linear_from = 1e-3, linear_to = -1e-3 }",
+            "learning_rate: needs a number of at least 0, or two such",
+        ),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
+            '"SAC"\nparameters = { train_freq = [0, "step"]',
+            "parameters.train_freq: SAC needs int | tuple[int, str] of at least 1, got [0, 'step']",
+        ),
+        (
+            '"PPO"\nparameters = { n_steps = 8',
+            '"SAC"\nparameters = { action_noise = { kind = "normal", sigma = -0.1 }',
+            "needs kind and a number sigma of at least 0",
+        ),
+        ("[learner]", '[run]\nsteps = "9"\n[learner]', "run.steps: Input should be a valid integer, got '9'"),
+        ("[learner]", "[run]\nenvs = true\n[learner]", "run.envs: Input should be a valid integer, got True"),
+        ("[learner]", '[learner]\nbootstrap = "no"', "learner.bootstrap: Input should be a valid boolean, got 'no'"),
+        ("[learner]", "[learner]\nnormalise = { clip_reward = inf }", "clip_reward: Input should be a finite number"),
         ("n_steps = 8", "gamma = true", "parameters.gamma: PPO needs float in [0, 1], got True"),
         ("n_steps = 8", "gamma = nan", "learner.parameters.gamma: must be a finite number, got nan"),
         ("n_steps = 8", "gamma = 1.01", "learner.parameters.gamma: PPO needs float in [0, 1], got 1.01"),
         ("n_steps = 8", "gae_lambda = -0.1", "learner.parameters.gae_lambda: PPO needs float in [0, 1], got -0.1"),
         ("n_steps = 8", "ent_coef = inf", "learner.parameters.ent_coef: must be a finite number, got inf"),
-        ("n_steps = 8", 'learning_rate = "a"', "learning_rate: needs a number, or linear_from and linear_to: 'a'"),
+        (
+            "n_steps = 8",
+            'learning_rate = "a"',
+            "learning_rate: needs a number of at least 0, or two such, linear_from and linear_to: 'a'",
+        ),
         (
             "n_steps = 8",
             "learning_rate = { linear_from = nan, linear_to = 0 }",
@@ -151,7 +180,7 @@ def test_published_schema_is_up_to_date() -> None:
         ("n_steps = 8", "policy_kwargs = { net_arch = [8.5] }", "policy_kwargs.net_arch: MlpPolicy needs list[int] |"),
         ("n_steps = 8", "policy_kwargs = { use_sde = true }", "unknown parameter of MlpPolicy 'use_sde'"),
         ("n_steps = 8", "policy_kwargs = 3", "parameters.policy_kwargs: PPO needs dict[str, Any] | None, got 3"),
-        ("n_steps = 8", "target_kl = [1.0]", "parameters.target_kl: PPO needs float | None, got [1.0]"),
+        ("n_steps = 8", "target_kl = [1.0]", "parameters.target_kl: PPO needs float | None of at least 0, got [1.0]"),
     ],
 )
 def test_mistakes_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -253,7 +282,7 @@ def test_lists_stand_for_tuples() -> None:
     """TOML has no tuples; the library takes some parameters as such."""
     assert list(parameter_mistakes("SAC", "MlpPolicy", {"train_freq": [1, "episode"]})) == []
     (mistake,) = parameter_mistakes("SAC", "MlpPolicy", {"train_freq": ["episode", 1]})
-    assert mistake == "parameters.train_freq: SAC needs int | tuple[int, str], got ['episode', 1]"
+    assert mistake == "parameters.train_freq: SAC needs int | tuple[int, str] of at least 1, got ['episode', 1]"
 
 
 def test_parameters_are_those_of_the_library() -> None:

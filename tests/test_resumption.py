@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
 from cirl_marl import CirlError, LearnerError, RecipeError, RunError
@@ -56,6 +58,42 @@ def test_resumed_exploration_is_fresh(tmp_path: Path, ctrl_c_after: Any) -> None
     model = resume(tmp_path).trainees["use"].model
     drawn = model.replay_buffer.actions[:40, 0, 0]  # type: ignore[attr-defined]
     assert len(np.unique(drawn)) == 40
+
+
+def test_returns_of_several_steps_end_where_a_run_was_stopped(tmp_path: Path, ctrl_c_after: Any) -> None:
+    """19 transitions were kept; the next begins an episode, so that no return goes on into it."""
+    parameters = {"learning_starts": 100, "buffer_size": 100, "n_steps": 3}
+    recipe = Recipe(
+        name="x", title="x", run=Run(steps=40, envs=1), learner=Learner(algorithm="SAC", parameters=parameters)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
+    model = resume(tmp_path).trainees["use"].model
+    assert isinstance(model, SAC)
+    assert isinstance(model.replay_buffer, NStepReplayBuffer)
+    assert model.replay_buffer.pos == 40
+    for row, last in ((10, 12), (16, 18), (17, 18), (18, 18), (19, 21)):
+        sample = model.replay_buffer._get_samples(np.array([row]))
+        np.testing.assert_array_equal(sample.next_observations[0], model.replay_buffer.next_observations[last, 0])
+        assert sample.discounts is not None
+        assert sample.discounts.item() == pytest.approx(0.99 ** (last - row + 1))
+        assert sample.dones.item() == 0.0
+
+
+def test_a_run_that_goes_on_says_so(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:
+    """What is not saved yet is not called saved: the state is that of a running training from the first step."""
+    with pytest.raises(KeyboardInterrupt):
+        train("copper_net", ppo_recipe, directory=tmp_path, report=ctrl_c_after(70))
+    seen: list[tuple[str, int, int, int]] = []
+
+    def watch(now: Progress) -> None:
+        status = RunDirectory(tmp_path).status
+        seen.append((status["state"], status["joint_steps"], now.env_steps, now.total))
+
+    resume(tmp_path, report=watch)
+    assert seen[0] == ("running", 35, 2, 10)
+    assert seen[-1] == ("running", 44, 20, 20)  # the rollout that was interrupted is begun anew
+    assert all(done <= total for _, _, done, total in seen)
 
 
 def test_misspelt_callbacks_leave_nothing_behind(tmp_path: Path, ppo_recipe: Recipe) -> None:

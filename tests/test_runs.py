@@ -17,6 +17,7 @@ from cirl_marl import RunError, VectorEnv
 from cirl_marl.controllers.trained import Trained
 from cirl_marl.evaluate import rollout
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
+from cirl_marl.learners import run as learners_run
 from cirl_marl.learners.recipe import Learner, Normalisation, Run
 from cirl_marl.learners.run import write_atomically
 
@@ -208,6 +209,25 @@ def test_failed_writing_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
         write_atomically(path, write)
     assert [each.name for each in tmp_path.iterdir()] == ["kept.txt"]
     assert path.read_text() == "old"
+
+
+def test_checkpoints_are_on_the_disk_before_they_count(
+    tmp_path: Path, ppo_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every file of a checkpoint, then its folder, then the status that names it."""
+    synced: list[Path] = []
+    sync = learners_run._sync
+
+    def recorded(path: Path) -> None:
+        sync(path)
+        synced.append(path)
+
+    monkeypatch.setattr(learners_run, "_sync", recorded)
+    train("copper_net", ppo_recipe, directory=tmp_path, agents=["mine"])
+    names = [path.name for path in synced]
+    end = names.index("000000040-complete.partial")
+    assert set(names[end - 2 : end]) == {"mine.zip", "mine.normaliser.pkl"}
+    assert names[end + 1 : end + 3] == ["checkpoints", ".status.partial.json"]
 
 
 def test_metrics_survive_a_crash(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:

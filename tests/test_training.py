@@ -199,6 +199,18 @@ def test_lockstep_equals_plain_learning_where_agents_do_not_meet(ppo_recipe: Rec
     assert_same(lone, {f"a.{name}": value for name, value in model.policy.state_dict().items()})
 
 
+class CountsEnds(BaseCallback):
+    """Counts how often it is told that training has ended."""
+
+    ends = 0
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        self.ends += 1
+
+
 def test_different_rollouts_and_shares_finish_cleanly(ppo_recipe: Recipe) -> None:
     """Learners with different ``n_steps`` and different budgets end without waiting for each other."""
     parameters = ppo_recipe.learner.parameters
@@ -207,7 +219,9 @@ def test_different_rollouts_and_shares_finish_cleanly(ppo_recipe: Recipe) -> Non
         Match(agents=["use"], algorithm="A2C", parameters={"n_steps": 4}, share_of_steps=0.3),
         Match(agents=["sorting"], algorithm="ARS", parameters={"n_delta": 1}, share_of_steps=0.5),
     ]
-    training = train("copper_net", ppo_recipe.model_copy(update={"match": matches}), horizon=5)
+    ends = {agent: CountsEnds() for agent in ("mine", "use", "sorting", "refinery")}
+    training = train("copper_net", ppo_recipe.model_copy(update={"match": matches}), horizon=5, callbacks=ends)
+    assert {agent: callback.ends for agent, callback in ends.items()} == dict.fromkeys(ends, 1)
     steps = {agent: trainee.model.num_timesteps for agent, trainee in training.trainees.items()}
     assert steps["mine"] == 84  # 14 rollouts of 3 steps in 2 copies: the first count of at least 80
     assert steps["use"] == 24

@@ -34,6 +34,7 @@ class Entry:
         name: of its row.
         seed: training seed; None if nothing was trained.
         run: where it was trained.
+        checkpoint: name of the checkpoint that acted; empty if nothing was trained.
         rollout: its episodes.
         gain: circularity gain over neutral control from the same start, shape (episodes,).
         bound: the highest λ̄ of any episode from the same start with at least the same mean service level, shape
@@ -43,6 +44,7 @@ class Entry:
     name: str
     seed: int | None
     run: RunDirectory | None
+    checkpoint: str
     rollout: Rollout
     gain: Floats
     bound: Floats | None
@@ -164,14 +166,18 @@ def compare(
     if network is None and scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; runs have their own")
     found = load_network(network) if isinstance(network, str | Path) else network
+    from cirl_marl.controllers.trained import Trained  # it needs torch
+
     asked = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
     everyone = controllers if "neutral" in controllers else ["neutral", *controllers]
     entered, env = contenders(asked, everyone, None if found is None else found.scenario(scenario), min_service)
     first = first_seed(seed)
     share = 1 / (len(entered) + (len({each.name for each in entered}) if bounds else 0))
-    rollouts = []
+    rollouts, checkpoints = [], []
     for place, contender in enumerate(entered):
-        watched = Watched(contender.controller(), _told(progress, contender.name, place * share, share))
+        controller = contender.controller()
+        checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
+        watched = Watched(controller, _told(progress, contender.name, place * share, share))
         rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.acted))
     measure, proved = _unproved(len(entered), "")
     if bounds:
@@ -187,8 +193,8 @@ def compare(
     plain = [contender.run is None and contender.name == "neutral" for contender in entered]
     neutral = rollouts[plain.index(True)]
     entries = tuple(
-        Entry(contender.name, contender.seed, contender.run, run, gain(run, neutral), bound)
-        for contender, run, bound in zip(entered, rollouts, proved, strict=True)
+        Entry(contender.name, contender.seed, contender.run, checkpoint, run, gain(run, neutral), bound)
+        for contender, checkpoint, run, bound in zip(entered, checkpoints, rollouts, proved, strict=True)
     )
     return Comparison(env.network, env.agents, first, entries, measure)
 

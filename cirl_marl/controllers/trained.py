@@ -17,7 +17,12 @@ from cirl_marl.vector_env import VectorEnv
 
 
 class Trained:
-    """Acts by the deterministic policies of a run's newest checkpoint, with their normalisers frozen."""
+    """Acts by the deterministic policies of a run's newest checkpoint, with their normalisers frozen.
+
+    Attributes:
+        run: the run.
+        checkpoint: the folder from which the policies were loaded; a run that is being trained has others later.
+    """
 
     def __init__(self, run: str | Path | RunDirectory) -> None:
         """Load every policy.
@@ -26,7 +31,8 @@ class Trained:
             RunError: if the run is incomplete or a file of it cannot be read.
         """
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
-        folder, groups = self.run.checkpoint, self.run.groups()
+        self.checkpoint = folder = self.run.checkpoint
+        groups = self.run.groups()
         env = self.run.make_env(1)
         self._seen = env.layout.names
         self._views = {group.name: group.view(env) for group in groups}

@@ -7,10 +7,10 @@ import importlib
 import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
@@ -31,14 +31,13 @@ RESERVED = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "devi
 SET_BY_ALGORITHM = ("self", "observation_space", "action_space", "lr_schedule", "use_sde")
 """What an algorithm hands to the constructor of its policy by itself."""
 
-SHARE = (Field(ge=0, le=1), "in [0, 1]")
-COUNT = (Field(gt=0), "above 0")
 BOUNDS = {
-    **dict.fromkeys(("gamma", "gae_lambda", "tau"), SHARE),
-    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "buffer_size", "n_delta"), COUNT),
+    **dict.fromkeys(("gamma", "gae_lambda", "tau"), (0.0, 1.0)),
+    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "n_delta"), (1.0, math.inf)),
+    **dict.fromkeys(("learning_rate", "learning_starts", "clip_range", "target_kl"), (0.0, math.inf)),
 }
-"""Ranges that the annotations of parameters do not say: discount factors and how far a target network moves; numbers
-of steps, passes, transitions and perturbations."""
+"""Lowest and highest number of parameters whose annotations do not say it: discount factors and how far a target
+network moves; numbers of steps, passes, transitions and perturbations; rates and distances."""
 NOISES: Mapping[str, type[ActionNoise]] = {
     "normal": NormalActionNoise,
     "ornstein_uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -145,11 +144,13 @@ def _not_finite(place: str, value: object) -> Iterator[str]:
 
 
 def _takes(parameter: inspect.Parameter, value: object) -> bool:
-    """Whether a value is of the type that a constructor states."""
-    stated = parameter.annotation
-    if parameter.name in BOUNDS:
-        stated = Annotated[stated, BOUNDS[parameter.name][0]]
-    checked = TypeAdapter[Any](stated, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
+    """Whether a value is of the type that a constructor states, and within its bounds."""
+    number = value[0] if isinstance(value, list | tuple) and value else value
+    if parameter.name in BOUNDS and isinstance(number, int | float):
+        low, high = BOUNDS[parameter.name]
+        if not low <= number <= high:
+            return False
+    checked = TypeAdapter[Any](parameter.annotation, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
     for form in (value, _as_tuple(value)):
         try:
             checked.validate_python(form)
@@ -161,7 +162,10 @@ def _takes(parameter: inspect.Parameter, value: object) -> bool:
 
 def _needed(parameter: inspect.Parameter) -> str:
     stated = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
-    return f"{stated} {BOUNDS[parameter.name][1]}" if parameter.name in BOUNDS else stated
+    if parameter.name not in BOUNDS:
+        return stated
+    low, high = BOUNDS[parameter.name]
+    return f"{stated} of at least {low:g}" if high == math.inf else f"{stated} in [{low:g}, {high:g}]"
 
 
 def _as_tuple(value: Any) -> Any:
@@ -170,19 +174,19 @@ def _as_tuple(value: Any) -> Any:
 
 
 def _rate_mistakes(place: str, rate: object) -> Iterator[str]:
-    if not isinstance(rate, Mapping) or set(rate) != {"linear_from", "linear_to"} or not _are_numbers(rate.values()):
-        yield f"{place}: needs a number, or linear_from and linear_to: {rate!r}"
+    if not isinstance(rate, Mapping) or set(rate) != {"linear_from", "linear_to"} or not _are_amounts(rate.values()):
+        yield f"{place}: needs a number of at least 0, or two such, linear_from and linear_to: {rate!r}"
 
 
 def _noise_mistakes(place: str, noise: object) -> Iterator[str]:
-    if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"} or not _are_numbers([noise["sigma"]]):
-        yield f"{place}: needs kind and a number sigma, got {noise!r}"
+    if not isinstance(noise, Mapping) or set(noise) != {"kind", "sigma"} or not _are_amounts([noise["sigma"]]):
+        yield f"{place}: needs kind and a number sigma of at least 0, got {noise!r}"
     elif noise["kind"] not in NOISES:
         yield f"{place}: {unknown('kind', noise['kind'], NOISES)}"
 
 
-def _are_numbers(values: Iterable[object]) -> bool:
-    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+def _are_amounts(values: Iterable[object]) -> bool:
+    return all(isinstance(value, int | float) and not isinstance(value, bool) and value >= 0 for value in values)
 
 
 WRITTEN: Mapping[str, Callable[[str, object], Iterator[str]]] = {

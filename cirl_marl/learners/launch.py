@@ -148,8 +148,7 @@ def resume(
         config = _extended(run, config, steps)
         training = Training(config, run.make_env(config.envs), run)
         training.check_callbacks(callbacks or {})
-        if steps is not None:
-            run.extend(config)
+        run.go_on(config)
         training.keep_in(run)
         training.start(callbacks=callbacks, report=report)
     return training

@@ -23,6 +23,10 @@ from cirl_marl.vector_env import Infos, VectorEnv
 StepHook = Callable[[Infos, NDArray[np.bool_]], None]
 
 
+class BudgetSpent(GreenletExit):  # type: ignore[misc]
+    """Raised in a learner that would go on beyond its joint steps."""
+
+
 class Interrupted(Exception):
     """Raised by a step hook to end training early; what was learnt is kept."""
 
@@ -76,7 +80,7 @@ class Lockstep:
             learners: by name, what learns; returns when it has learnt enough.
             actors: by name, what acts for ever once its learner is done, so that the others' world goes on.
             streams: by name, its random streams.
-            budgets: by name, joint steps after which a learner that has not returned is stopped.
+            budgets: by name, joint steps after which a learner that has not returned is stopped by ``BudgetSpent``.
             hook: called after each joint step, in the caller's random streams; may raise ``Interrupted``.
 
         Raises:
@@ -165,7 +169,7 @@ class Lockstep:
     def _stop_learning(self, name: str) -> None:
         """End ``learn()`` of a learner that has used up its steps; it goes on acting from its next turn."""
         self._learning.discard(name)
-        self._enter(name, lambda: self._coroutines[name].throw(GreenletExit))
+        self._enter(name, lambda: self._coroutines[name].throw(BudgetSpent))
 
     def _end(self) -> None:
         self._learning = set(self.seats)

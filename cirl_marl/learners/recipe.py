@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictStr, ValidationError, WithJsonSchema, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    StrictBool,
+    StrictStr,
+    ValidationError,
+    WithJsonSchema,
+    field_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from cirl_marl.catalogue import recipe_path
@@ -21,6 +31,9 @@ from cirl_marl.network import Network
 from cirl_marl.schema import Number
 from cirl_marl.vector_env import VectorEnv
 
+Count = Annotated[int, Field(strict=True, gt=0)]
+Limit = Annotated[Number, Field(gt=0)]
+
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -33,7 +46,7 @@ class Options(_Table):
     observe: Observe | None = None
     circularity: Moment = "end"
     circularity_weight: Annotated[Number, Field(ge=0, le=1)] | None = None
-    horizon: Annotated[int, Field(strict=True, gt=0)] | None = None
+    horizon: Count | None = None
     scenario: StrictStr | None = None
 
 
@@ -43,10 +56,10 @@ OPTIONS = tuple(Options.model_fields)
 class Normalisation(_Table):
     """Running normalisation by Stable-Baselines3's ``VecNormalize``, one per agent, saved with its policy."""
 
-    observation: bool = True
-    reward: bool = True
-    clip_observation: Annotated[float, Field(gt=0)] = 10.0
-    clip_reward: Annotated[float, Field(gt=0)] = 10.0
+    observation: StrictBool = True
+    reward: StrictBool = True
+    clip_observation: Limit = 10.0
+    clip_reward: Limit = 10.0
 
     @property
     def any(self) -> bool:
@@ -58,7 +71,7 @@ class Demonstrations(_Table):
     """A controller that acts in the learner's place at first, while the learner keeps what it sees."""
 
     controller: Literal["neutral", "random", "scripted", "lqr", "mpc", "optimum"]
-    steps: Annotated[int, Field(gt=0)] = Field(
+    steps: Count = Field(
         description="environment steps, summed over the copies; they are the first of the run and count as such"
     )
 
@@ -75,15 +88,23 @@ class Learner(_Table):
     )
     parameters: dict[str, Any] = {}
     normalise: Normalisation = Normalisation()
-    bootstrap: bool = Field(
+    bootstrap: StrictBool = Field(
         True, description="whether the learner expects more to come after a time limit; if not, the episode is all"
     )
-    share_of_steps: Annotated[float, Field(gt=0, le=1)] = Field(
+    share_of_steps: Annotated[Number, Field(gt=0, le=1)] = Field(
         1.0, description="share of the run during which the agent learns; after it, it only acts"
     )
     demonstrations: Demonstrations | None = Field(
         None, description="of an off-policy learner: whose transitions fill its replay buffer before it acts itself"
     )
+
+    def steps_of(self, steps: int) -> int:
+        """Return during how many of the ``steps`` of a run it learns, rounded up.
+
+        >>> Learner(algorithm="PPO", share_of_steps=0.55).steps_of(100)
+        55
+        """
+        return math.ceil(round(steps * self.share_of_steps, 6))
 
     def mistakes(self) -> Iterator[str]:
         """Yield what is wrong whatever the network and the number of steps: key, value and what would do."""
@@ -98,7 +119,7 @@ class Learner(_Table):
         if not has_replay_buffer(self.algorithm):
             fit = ", ".join(filter(has_replay_buffer, algorithms()))
             yield f"demonstrations: {self.algorithm} has no replay buffer to keep them in; use one of {fit}"
-        if self.demonstrations.steps > steps * self.share_of_steps:
+        if self.demonstrations.steps > self.steps_of(steps):
             share = "" if self.share_of_steps == 1 else f" times share_of_steps {self.share_of_steps}"
             yield f"demonstrations.steps: {self.demonstrations.steps} is more than the {steps} steps of the run{share}"
 
@@ -124,8 +145,8 @@ class Match(Learner):
 class Run(_Table):
     """How long and in how many copies; the command line overrides it."""
 
-    steps: Annotated[int, Field(gt=0)] = Field(200_000, description="environment steps, summed over the copies")
-    envs: Annotated[int, Field(gt=0)] = Field(16, description="copies of the environment")
+    steps: Count = Field(200_000, description="environment steps, summed over the copies")
+    envs: Count = Field(16, description="copies of the environment")
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,11 +45,21 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
         write(temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
+        _sync(temporary)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Have a file, or the names in a folder, on the disk before anything else is done."""
+    if os.name == "nt" and path.is_dir():
+        return  # Windows does not open folders
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_json(path: Path, value: object) -> None:
@@ -185,8 +195,8 @@ class RunDirectory:
         status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "reason": reason}
         write_json(self.path / "status.json", status)
 
-    def extend(self, config: RunConfig) -> None:
-        """Let the run go on to the steps of ``config``, which is the run's but for these."""
+    def go_on(self, config: RunConfig) -> None:
+        """Say that the run goes on, to the steps of ``config``, which is the run's but for these."""
         write_json(self.path / "config.json", config.as_dict())
         status = self.status
         self.set_status("running", status["joint_steps"], status["checkpoint"])
@@ -243,8 +253,11 @@ class RunDirectory:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         write(partial)
+        for path in (*partial.iterdir(), partial):
+            _sync(path)
         shutil.rmtree(folder, ignore_errors=True)
         partial.replace(folder)
+        _sync(folder.parent)
         before = self.status["checkpoint"] if state == "failed" else None
         counts = before or folder.name
         self.set_status(state, int(counts.partition("-")[0]), counts, reason)

@@ -6,6 +6,7 @@ import gzip
 import io
 import math
 import pickle
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 from sb3_contrib import ARS
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cirl_marl.errors import RecipeError, RunError
 from cirl_marl.learners.algorithms import algorithm_class, build
 from cirl_marl.learners.demonstrations import Demonstrator, demonstrate
+from cirl_marl.learners.lockstep import BudgetSpent
 from cirl_marl.learners.recipe import Learner
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams, global_streams_kept
@@ -92,6 +96,14 @@ class Trainee:
                 self.model = build(spec.algorithm, spec.policy, self.env, parameters, seed=self._seed, device="cpu")
             except RecipeError as error:
                 raise RecipeError(f"{self.seat.title}: {error}") from error
+        if self.seat.num_envs > 1 and isinstance(self.model, OffPolicyAlgorithm):
+            frequency = self.model.train_freq
+            assert isinstance(frequency, TrainFreq)
+            if frequency.unit is TrainFrequencyUnit.EPISODE:
+                raise RecipeError(
+                    f"{self.seat.title}: parameters.train_freq: {spec.algorithm} learns after whole episodes in a "
+                    f"single environment only, not in {self.seat.num_envs}; give a number of steps"
+                )
         return self
 
     def load(self, folder: Path) -> Trainee:
@@ -123,11 +135,14 @@ class Trainee:
         found = (buffer.observation_space, buffer.action_space.shape, buffer.n_envs)
         if found != (self.env.observation_space, self.env.action_space.shape, self.seat.num_envs):
             raise RunError(f"{path}: holds what another learner saw: {buffer.observation_space}, {buffer.n_envs} rows")
+        if isinstance(buffer, NStepReplayBuffer) and buffer.size():
+            # episodes are fresh after loading, so that no return of n steps may go on from the last one kept
+            buffer.timeouts[buffer.pos - 1] = np.logical_not(buffer.dones[buffer.pos - 1])
 
     def budget(self, steps: int) -> int:
         """Joint steps after which it is stopped; only ARS, which may be in mid-update then, does not stop by itself."""
         if isinstance(self.model, ARS):
-            return math.ceil(steps * self.spec.share_of_steps / self.seat.copies)
+            return math.ceil(self.spec.steps_of(steps) / self.seat.copies)
         return 2**62
 
     @property
@@ -157,12 +172,16 @@ class Trainee:
             demonstrate(self.model, self.demonstrations, lambda: view.join(leader.act()))
         done = self.model.num_timesteps
         rows = self.seat.num_envs // self.seat.copies
-        total = math.ceil(steps * self.spec.share_of_steps) * rows - done
+        total = self.spec.steps_of(steps) * rows - done
         if isinstance(self.model, ARS):
             # It counts each step of its copies once for every copy, and schedules by this number, done before or not.
             total = self.budget(steps) * self.seat.num_envs**2
         if total > 0:
-            self.model.learn(total, callback=callback, reset_num_timesteps=done == 0)
+            try:
+                self.model.learn(total, callback=callback, reset_num_timesteps=done == 0)
+            except BudgetSpent:
+                if callback is not None:
+                    callback.on_training_end()
 
     def act(self) -> None:
         """Act for ever by the learnt policy, learning nothing."""
@@ -214,7 +233,9 @@ def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = Non
         RunError: if the file cannot be read.
     """
     path = folder / f"{name}.zip"
-    with global_streams_kept():
+    with global_streams_kept(), warnings.catch_warnings():
+        # of learners with returns of n steps: the library saved the buffer's class, and takes it for one of the user's
+        warnings.filterwarnings("ignore", message=r"`n_steps=\d+` is ignored because a custom")
         try:
             return algorithm_class(algorithm).load(path, env=env, device="cpu")
         except (*UNREADABLE, KeyError, RuntimeError) as error:

@@ -225,7 +225,7 @@ class _Hook:
             self._report(
                 Progress(
                     (training.joint_steps - training.done) * copies,
-                    training.config.steps - training.done * copies,
+                    max(training.config.steps, training.joint_steps * copies) - training.done * copies,
                     seconds,
                     float(circularity.mean()),
                     float(service.mean()),

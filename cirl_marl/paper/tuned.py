@@ -143,6 +143,7 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, repor
     parameters = learner.parameters | ({"replay_buffer_class": HerReplayBuffer} if goal else {})
     policy = learner.policy.replace("Mlp", "MultiInput") if goal else learner.policy
     model = build(learner.algorithm, policy, env, parameters, seed=row.seed, device="cpu")
+    env.seed(row.seed * copies)  # one seed for each copy from there on, so that no two rows share a start
     elapsed = stopwatch()
     if learner.demonstrations is not None:
         assert isinstance(model, OffPolicyAlgorithm)

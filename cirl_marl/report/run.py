@@ -59,7 +59,7 @@ def evaluate_run(
         figures["no_bound"] = comparison.yardstick.reason
     config = run.config
     figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": comparison.first_seed}
-    figures["checkpoint"] = run.checkpoint.name
+    figures["checkpoint"] = entries["trained"].checkpoint
     if bounds or not _is_evaluated(run, figures):
         write_json(run.path / "evaluation.json", figures)
     return figures, rollouts, env
