@@ -12,7 +12,7 @@ from cirl_marl.controllers.basic import Controller
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.staged import CIRO_FACTOR
-from cirl_marl.statistics import over_episodes
+from cirl_marl.statistics import SHARE, over_episodes
 from cirl_marl.vector_env import VectorEnv
 
 EVALUATION_SEEDS = 2**31
@@ -163,7 +163,7 @@ def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
         figures[name] = {
             "circularity": over_episodes(run.episode_circularity).as_dict(),
             "circularity_gain": over_episodes(gain(run, neutral)).as_dict(),
-            "service_level": over_episodes(run.episode_service).as_dict(),
+            "service_level": over_episodes(run.episode_service, SHARE).as_dict(),
             "service_level_over_neutral": over_episodes(run.episode_service - neutral.episode_service).as_dict(),
             "return": _by_agent(env, run.returns),
             "local_return": _by_agent(env, run.local_returns),

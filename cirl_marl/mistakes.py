@@ -20,10 +20,23 @@ BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ON
 
 def toml_mistake(error: tomllib.TOMLDecodeError, text: str) -> str:
     """Say where ``text`` is not valid TOML, and what to write if it is for a bare word."""
+    comma = _decimal_comma(str(error), text)
+    if comma:
+        return f"not valid TOML: {error}: {comma}; write {comma.replace(',', '.')}"
     word = _bare_word(str(error), text)
     if word.lower() in ("true", "false"):
         return f"not valid TOML: {error}: {word}; write {word.lower()}"
     return f"not valid TOML: {error}" + (f': {word}; text needs quotes, "{word}"' if word else "")
+
+
+def _decimal_comma(error: str, text: str) -> str:
+    """Return the number with a comma in it that stands last before where reading failed; empty if there is none."""
+    place = re.search(r"line (\d+), column (\d+)", error)
+    if place is None:
+        return ""
+    before = text.split("\n")[int(place[1]) - 1][: int(place[2])]
+    found = re.search(r"=\s*(-?\d+,\d+)\W*$", before)
+    return found[1] if found else ""
 
 
 def _bare_word(error: str, text: str) -> str:

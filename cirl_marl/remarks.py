@@ -25,10 +25,11 @@ SHORT = 20
 
 
 def remarks(network: Network) -> Iterator[str]:
-    """Yield what whoever wrote ``network`` may not have meant: idle agents and debtors, batches, steps too long."""
+    """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse."""
     yield from _apart(network)
     yield from _without_effect(network)
     yield from _departures(network)
+    yield from _starved(network)
     yield from _aimless(network)
     yield from _unpaid(network)
     yield from _coarse(network)
@@ -55,15 +56,19 @@ def _without_effect(network: Network) -> Iterator[str]:
 
 
 def _departures(network: Network) -> Iterator[str]:
-    """Yield batches that leave after the episode, or that a station cannot finish."""
+    """Yield series and batches that begin after the episode, and batches that a station cannot finish."""
     interval, horizon = network.episode.control_interval, network.episode.horizon
+    end = f"an episode ends at {horizon * interval:g} {network.time_unit}"
     for arc in network.arcs:
+        late = [time for time in arc.times if time >= horizon * interval]
+        if late:
+            yield f"arc '{arc.id}': series: {end}, so that what begins at {late[0]:g} {network.time_unit} never comes"
         recipient = network.nodes[network.node_index[arc.recipient]]
         batch_kg = getattr(recipient.model, "batch_kg", None)
         for time, mass in arc.batches:
             at = f"arc '{arc.id}': batch at {time:g} {network.time_unit}"
             if round(time / interval) >= horizon:
-                yield f"{at}: an episode ends at {horizon * interval:g} {network.time_unit}, so that it never leaves"
+                yield f"{at}: {end}, so that it never leaves"
             if batch_kg is not None and not is_whole(mass * factor(network.mass_unit, "kg") / batch_kg):
                 yield (
                     f"{at}: {mass:g} {network.mass_unit} are no whole number of batches of {batch_kg:g} kg, as "
@@ -112,8 +117,35 @@ def _states(network: Network, action: float | None, intervals: int) -> Floats:
     return np.array(rows)
 
 
+def _starved(network: Network) -> Iterator[str]:
+    """Yield exogenous flows that their donors cannot feed under neutral control."""
+    ordered = {k: arc for k, arc in enumerate(network.arcs) if arc.law is Law.EXOGENOUS and any(arc.flow)}
+    if not ordered:
+        return
+    env, interval = VectorEnv(network, num_envs=1), network.episode.control_interval
+    env.reset(seed=0)
+    neutral = {agent: action[None] for agent, action in env.neutral_action.items()}
+    short: dict[int, float] = {}
+    for step in range(min(network.episode.horizon, INTERVALS)):
+        env.advance(env.stack(neutral))
+        for k, arc in ordered.items():
+            first = max(0, int(np.searchsorted(arc.times, step * interval, side="right")) - 1)
+            last = max(first, int(np.searchsorted(arc.times, (step + 1) * interval)) - 1)
+            if env.physical.flow[k, 0] < (1 - COARSE) * min(arc.flow[first : last + 1]):
+                short.setdefault(k, step * interval)
+    for k, time in short.items():
+        arc = ordered[k]
+        yield (
+            f"arc '{arc.id}': under neutral control '{arc.donor}' holds too little for its flow from "
+            f"{time:g} {network.time_unit} on; give it a larger initial stock if it stands for the world outside"
+        )
+
+
 def _aimless(network: Network) -> Iterator[str]:
-    """Yield the lack of a service where agents are paid for λ, which is best when nothing flows."""
+    """Yield the lack of a service where agents are paid for λ, which is best when nothing flows, and a λ that is 0."""
+    if _paid_for_circularity(network) and network.arcs and not network.sustainability.any():
+        roles = ", ".join(sorted({node.role.value for node in network.nodes}))
+        yield f"λ is always 0, as no arc leaves a reservoir or enters a sink: the roles are {roles}"
     if _paid_for_circularity(network) and not network.services:
         reward = network.objective.reward
         yield f"there is no service, so that agents with reward '{reward}' do best to stop whatever flows"

@@ -10,7 +10,7 @@ import numpy as np
 
 from cirl_marl.actuators import Actuators
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.elements import Compartment, ControlKind
+from cirl_marl.elements import Compartment, ControlKind, Law
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluate import EVALUATION_SEEDS, Rollout, first_seed, interval_ends, rollout
 from cirl_marl.learners.run import write_atomically
@@ -128,10 +128,11 @@ def _inputs(compartment: Compartment) -> tuple[str, ...]:
 
 
 def _throughputs(network: Network, agents: tuple[str, ...], flow: Floats) -> Iterator[tuple[str, Floats]]:
-    """Yield what the agents let through, shape (steps,) each: an arc its flow, a node all that leaves it."""
+    """Yield what the agents let through, shape (steps,) each: an arc its flow, a node what leaves it but in batches."""
     unit = f"{network.mass_unit}/{network.time_unit}"
+    steady = np.array([arc.law is not Law.BATCH for arc in network.arcs], dtype=bool)
     for agent in agents:
         if agent in network.arc_index:
             yield f"{agent}: flow ({unit})", flow[network.arc_index[agent]]
-        elif (leaving := network.donors == network.node_index[agent]).any():
+        elif (leaving := steady & (network.donors == network.node_index[agent])).any():
             yield f"{agent}: total outflow ({unit})", flow[leaving].sum(axis=0)

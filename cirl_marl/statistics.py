@@ -46,8 +46,14 @@ class Aggregate:
         return {name: defined(getattr(self, name)) for name in ("value", "low", "high")}
 
 
-def over_episodes(samples: Floats) -> Aggregate:
+SHARE = (0.0, 1.0)
+"""Within which a service level lies."""
+
+
+def over_episodes(samples: Floats, within: tuple[float, float] = (-np.inf, np.inf)) -> Aggregate:
     """Return the mean of independent episodes with its interval (Student's t); a single one has no interval.
+
+    The interval ends where what is measured does, ``within`` (lowest, highest).
 
     >>> found = over_episodes(np.array([1.0, 2.0, 3.0]))
     >>> f"{found.value:.1f} [{found.low:.1f}, {found.high:.1f}]"
@@ -59,7 +65,8 @@ def over_episodes(samples: Floats) -> Aggregate:
         return Aggregate(mean, float("nan"), float("nan"))
     error = float(samples.std(ddof=1)) / np.sqrt(len(samples))
     half_width = float(stats.t.ppf(0.975, len(samples) - 1) * error)
-    return Aggregate(mean, mean - half_width, mean + half_width)
+    low, high = within
+    return Aggregate(mean, max(mean - half_width, min(low, mean)), min(mean + half_width, max(high, mean)))
 
 
 def interquartile_mean(scores: ArrayLike) -> float:

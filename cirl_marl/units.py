@@ -35,6 +35,17 @@ def _ambiguity(symbol: str) -> str | None:
     return None
 
 
+MISSPELT = {
+    "y": "year",
+    "T": "t (tonne)",
+    "kT": "kt (kilotonne)",
+    "Kt": "kt (kilotonne)",
+    "KT": "kt (kilotonne)",
+    "MT": "Mt (megatonne)",
+}
+"""Symbols that are written for a unit, and are none or another."""
+
+
 @cache
 def factor(unit: str, target: str) -> float:
     """Return the number by which values in ``unit`` are multiplied to be in ``target``.
@@ -51,10 +62,18 @@ def factor(unit: str, target: str) -> float:
         instead = _ambiguity(symbol)
         if instead is not None:
             raise CirlError(f"unit '{unit}': '{symbol}' is read in several ways; write {instead}")
+        if symbol in MISSPELT:
+            raise CirlError(f"unit '{unit}': for '{symbol}' write {MISSPELT[symbol]}")
+    if unit.strip() == "-":
+        raise CirlError("unit '-': write '1' for a number without unit")
     registry = _registry()
     try:
-        return float(registry.Quantity(1.0, unit).to(target).magnitude)
+        zero, one = (float(registry.Quantity(value, unit).to(target).magnitude) for value in (0.0, 1.0))
     except pint.errors.DimensionalityError as error:
         raise CirlError(f"unit '{unit}' is inconsistent: a quantity in '{target}' is needed ({error})") from error
-    except (pint.errors.PintError, AttributeError, TypeError, ValueError) as error:
-        raise CirlError(f"unit '{unit}' cannot be read: {error}") from error
+    except (pint.errors.PintError, ArithmeticError, AssertionError, AttributeError, TypeError, ValueError) as error:
+        form = "write units as in kg, t/day, 1/day or m**3"
+        raise CirlError(f"unit '{unit}' cannot be read: {str(error) or 'it breaks off'}; {form}") from error
+    if zero != 0.0:
+        raise CirlError(f"unit '{unit}': its zero is another than that of '{target}'; give numbers in '{target}'")
+    return one

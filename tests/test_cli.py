@@ -214,6 +214,42 @@ def test_check_remarks_on_what_has_no_effect(
     assert "node 'shop'" not in printed
 
 
+def test_check_remarks_on_what_is_always_zero_too_small_or_too_late(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Roles without which λ is 0, a source that cannot feed its flow, a series whose times are in another unit."""
+    text = re.sub('role = "(nonrenewable_reservoir|landfill)"', 'role = "technosphere"', guide())
+    text += """
+[nodes.imports]
+role = "technosphere"
+initial = { low = 0, high = 0, unit = "t", source = "forgotten" }
+[arcs.imported]
+from = "imports"
+to = "households"
+law = "exogenous"
+series = { times = [0, 1], time_unit = "year", values = [5, 6], unit = "t/day", source = "trade" }
+"""
+    Path("bottles.toml").write_text(text)
+    assert run(monkeypatch, "check", "bottles.toml") == 0
+    printed = capsys.readouterr().out
+    assert "remark on scenario 'default': λ is always 0" in printed
+    assert "'imported': under neutral control 'imports' holds too little for its flow from 0 day on" in printed
+    assert "'imported': series: an episode ends at 60 day, so that what begins at 365.25 day never comes" in printed
+    Path("bottles.toml").write_text(text.replace("low = 0, high = 0", "low = 1e6, high = 1e6"))
+    assert run(monkeypatch, "check", "bottles.toml") == 0
+    assert "holds too little" not in capsys.readouterr().out
+
+
+def test_check_names_the_scenario_that_cannot_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A rate that no solver can follow is told with its file and scenario."""
+    wrong = '\n[scenarios.crisis.arcs.disposal]\nrate = { value = 0.05, unit = "1/us", source = "slip" }\n'
+    Path("bottles.toml").write_text(guide() + wrong)
+    assert run(monkeypatch, "check", "bottles.toml") == 2
+    assert "bottles.toml, scenario 'crisis': network 'bottles': node 'households'" in capsys.readouterr().err
+
+
 def test_check_remarks_on_batches_that_never_leave_or_never_end(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -269,6 +269,7 @@ def test_a_mistake_is_named(tmp_path: Path, old: str, new: str, said: list[str])
         (RATE, RATE.replace('"1/day"', "1/day"), ': 1/day; text needs quotes, "1/day"'),
         (RATE, RATE.replace('"1/day"', "one per day"), ': one per day; text needs quotes, "one per day"'),
         (ALONE, ALONE.replace('"', ""), ': use_to_collection; text needs quotes, "use_to_collection"'),
+        (RATE, RATE.replace("0.82", "0,82"), ": 0,82; write 0.82"),
         (RATE, "pollutant = True\n" + RATE, ": True; write true"),
         ('mass = "kt"', 'mass = "kt', ""),
         ('mass = "kt"', "mass = ", ""),

@@ -18,6 +18,7 @@ from cirl_marl import (
     Law,
     Network,
     Node,
+    Objective,
     Role,
     Service,
     VectorEnv,
@@ -79,6 +80,31 @@ def test_a_service_out_of_reach_is_approached() -> None:
     rising = 2.0 * np.exp(-0.15 * np.arange(1, 3)) + 30.0 * (1 - np.exp(-0.15 * np.arange(1, 3)))
     np.testing.assert_allclose(run.service[0, :2], rising / 10, rtol=1e-6)
     np.testing.assert_allclose(run.service[0, 4:], 1.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0])
+def test_a_short_window_sees_what_comes_after_where_the_service_is_out_of_reach(scale: float) -> None:
+    """A long chain has to be filled early, which a window of four decisions learns from prices alone, in their unit."""
+    valve = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=1.0)
+    steps = [f"step_{i}" for i in range(6)]
+    links = zip(steps, [*steps[1:], "use"], strict=True)
+    chain = Network(
+        name="chain",
+        nodes=(replace(RESERVE, initial=(1e3, 1e3), control=valve), *(Node(id=name) for name in (*steps, "use")), TIP),
+        arcs=(
+            Arc(id="mining", donor="reserve", recipient=steps[0], rate=0.01),
+            *(Arc(id=f"from_{i}", donor=donor, recipient=to, rate=0.7) for i, (donor, to) in enumerate(links)),
+            Arc(id="loss", donor="use", recipient="tip", rate=0.1),
+        ),
+        services=(replace(SERVED, low=20.0),),
+        episode=Episode(control_interval=1.0, horizon=50),
+        objective=Objective(circularity_scale=scale),
+    )
+    whole, short = (
+        rollout(VectorEnv(chain, num_envs=1), MPC(horizon=horizon, min_service=1.0, replan=2)).episode_service[0]
+        for horizon in (None, 4)
+    )
+    assert short == pytest.approx(whole, rel=0.005)
 
 
 def test_weight_decides_whether_service_is_worth_its_price() -> None:

@@ -7,10 +7,12 @@ import sys
 from collections.abc import Callable, Iterator
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from numpy.typing import NDArray
@@ -305,6 +307,28 @@ def test_trajectory(tmp_path: Path, network: Callable[[], Network], steps: int) 
     flow = random.normal(10, 1, (len(shown.arcs), steps))
     time = np.arange(steps) / 4
     read(save_trajectory(tmp_path / "path.png", shown, time, stock, flow, shown.circularity(flow)))
+
+
+def test_stocks_are_drawn_from_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large reserve is drawn by its change since the start of the episode, not since the end of the first step."""
+    lines: dict[str, tuple[Floats, Floats]] = {}
+    plot = Axes.plot
+
+    def recorded(self: Axes, x: Floats, y: Floats, *args: Any, **options: Any) -> Any:
+        lines[str(options.get("label"))] = np.asarray(x), np.asarray(y)
+        return plot(self, x, y, *args, **options)
+
+    monkeypatch.setattr(Axes, "plot", recorded)
+    network = cirl_marl.load_network("copper_net")
+    stock = np.random.default_rng(0).normal(100, 5, (8, 3))
+    stock[0] = [1e6 - 5, 1e6 - 10, 1e6 - 15]
+    start = np.full(8, 100.0)
+    start[0] = 1e6
+    time, flow = np.array([1.0, 2.0, 3.0]), np.ones((9, 3))
+    read(save_trajectory(tmp_path / "path.png", network, time, stock, flow, time, start=start))
+    (label,) = (label for label in lines if label.endswith("(change)"))
+    np.testing.assert_allclose(lines[label][0], [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_allclose(lines[label][1], [0.0, -5.0, -10.0, -15.0])
 
 
 def test_smoothing_heeds_what_there_is() -> None:

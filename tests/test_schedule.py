@@ -49,6 +49,13 @@ def test_inputs_of_models_are_named() -> None:
     assert np.isfinite(found.columns).all()
 
 
+def test_batches_are_no_outflow() -> None:
+    """What leaves a node in batches is not counted as its outflow, of which their arrivals would be no measure."""
+    found = schedule(VectorEnv("solids_net", num_envs=1, scenario="reacher", horizon=3), Neutral())
+    assert any(name.startswith("sorter: ") for name in found.header)
+    assert not any("total outflow" in name for name in found.header)
+
+
 def test_seeded_plan_is_an_episode_of_the_evaluation() -> None:
     """With a seed the plan is the first episode that an evaluation with this seed sees; else it starts mid-range."""
     env = VectorEnv("copper_net", num_envs=1, horizon=3)

@@ -11,6 +11,17 @@ from cirl_marl.errors import CirlError
 from cirl_marl.statistics import interquartile_mean, over_episodes, over_seeds
 
 
+def test_intervals_end_where_the_figure_does() -> None:
+    """A share has no interval beyond 0 and 1, and rounding does not move a mean out of its own interval."""
+    found = over_episodes(np.array([0.9, 1.0]), (0.0, 1.0))
+    assert found.value == pytest.approx(0.95)
+    assert found.high == 1.0
+    assert 0.0 < found.low < 0.95
+    assert over_episodes(np.array([0.1, 0.9]), (0.0, 1.0)).low == 0.0
+    beyond = over_episodes(np.array([1.0, 1.0 + 4e-16]), (0.0, 1.0))
+    assert beyond.low <= beyond.value <= beyond.high
+
+
 @pytest.mark.parametrize(
     ("scores", "expected"),
     [

@@ -55,3 +55,29 @@ def test_tons_are_refused_with_any_prefix(unit: str, instead: str) -> None:
 def test_masses_that_say_which_ton(unit: str, kg: float) -> None:
     """Spelt out, each of them is understood."""
     assert factor(unit, "kg") == pytest.approx(kg, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "target", "said"),
+    [
+        ("degC", "K", "its zero is another than that of 'K'; give numbers in 'K'"),
+        ("K", "degC", "its zero is another than that of 'degC'"),
+        ("-", "1", "unit '-': write '1' for a number without unit"),
+        ("1/day/0", "1/day", "cannot be read: .*zero.*; write units as in kg, t/day, 1/day"),
+        ("1/", "1/day", "cannot be read: .*; write units as in kg, t/day, 1/day"),
+        ("d-1", "1/day", "cannot be read: .*; write units as in kg, t/day, 1/day"),
+        ("1/y", "1/day", "for 'y' write year"),
+        ("kT", "kt", re.escape("for 'kT' write kt (kilotonne)")),
+        ("T/day", "t/day", re.escape("for 'T' write t (tonne)")),
+    ],
+)
+def test_units_that_cannot_be_used_say_what_to_write(unit: str, target: str, said: str) -> None:
+    """Also those that pint would convert to something else, or fail at in its own way."""
+    with pytest.raises(CirlError, match=said):
+        factor(unit, target)
+
+
+def test_temperatures_keep_their_scale() -> None:
+    """Degrees are degrees, whatever their zero."""
+    assert factor("degC", "degC") == 1.0
+    assert factor("1/K", "1/K") == 1.0

@@ -132,7 +132,10 @@ def _check_network(source: str) -> None:
 
     network = load_network(source)
     for each in (network, *network.scenarios.values()):
-        VectorEnv(each, num_envs=1)  # finds what only a network that is run says, such as rates no solver can follow
+        try:
+            VectorEnv(each, num_envs=1)  # finds what only a network that is run says, as rates no solver can follow
+        except CirlError as error:
+            raise CirlError(f"{source}, scenario '{each.scenario_name}': {error}") from error
     say(
         f"{source}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
         f"scenarios {', '.join([network.scenario_name, *network.scenarios])}: no mistakes"
@@ -171,6 +174,7 @@ def simulate(
     name = f"{found.name}_{control}"
     time = interval_ends(found)
     env.reset(seed=seed)  # to where the episode began
+    began = env.physical
     _write_csv(folder / f"{name}.csv", env, time, run)
     save_trajectory(
         folder / f"{name}.png",
@@ -179,6 +183,7 @@ def simulate(
         run.stock.T,
         run.flow.T,
         run.circularity[0],
+        start=np.concatenate([began.stock[: len(found.nodes), 0], env.dynamics.batches.loads(began.stock)[:, 0]]),
         load=run.load.T,
         service=run.service[0] if found.services else None,
         title=f"{found.title or found.name}, {control} control",

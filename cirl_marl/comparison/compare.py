@@ -17,10 +17,13 @@ from cirl_marl.evaluate import Rollout, first_seed, gain, relative, rollout
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import NoCertificate
-from cirl_marl.statistics import ENOUGH_SEEDS, Aggregate, over_episodes, over_seeds
+from cirl_marl.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds
 from cirl_marl.vector_env import VectorEnv
 
 FIGURES = ("circularity", "gain", "service", "bound", "gap")
+EVERYWHERE = (-np.inf, np.inf)
+LIMITS = {"service": SHARE, "gap": (0.0, np.inf)}
+"""Within which figures lie: the bound is proved, so that no gap is below 0."""
 SOLVING = 0.7
 """Share of solving programs in the work on bounds; the rest is to evaluate their multipliers for every episode."""
 Progress = Callable[[str, float], None]
@@ -93,7 +96,7 @@ class Row:
         if any(each is None for each in samples):
             return None
         if not self.seeds:
-            return over_episodes(samples[0])
+            return over_episodes(samples[0], LIMITS.get(which, EVERYWHERE))
         return over_seeds([[each.mean() for each in samples]])
 
 

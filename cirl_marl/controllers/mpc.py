@@ -43,6 +43,7 @@ class _Plan:
         problem: the program.
         solution: its optimum.
         actions: of the first intervals, shape (decisions, entries).
+        unit: what 1 of its objective is in the objective of plans that meet the demand.
     """
 
     episode: int
@@ -50,6 +51,7 @@ class _Plan:
     problem: Program
     solution: Solution
     actions: Floats
+    unit: float
 
     def basis(self, intervals: range) -> Basis | None:
         """Return the basis from which to plan ``intervals``; None if they are neither as many nor the last of these."""
@@ -69,7 +71,8 @@ class _Plan:
     def prices(self) -> Floats:
         """Return what the rows of the next interval charge for the stocks at the end of each, shape (intervals, nodes).
 
-        They are the terms of c − Aᵀy − Gᵀμ, for those stocks, of rows that belong to the interval after.
+        They are the terms of c − Aᵀy − Gᵀμ, for those stocks, of rows that belong to the interval after, in the
+        objective of plans that meet the demand.
         """
         problem, certificate = self.problem, self.solution.certificate
         layout = problem.layout
@@ -82,7 +85,7 @@ class _Plan:
             later &= (ends >= layout.end(-1)) & (ends < layout.level)
             np.subtract.at(charged, entries.col[later], (entries.data * multipliers[entries.row])[later])
         priced: Floats = charged.reshape(-1, layout.size)[:, layout.end(-1) : layout.level]
-        return priced
+        return priced * self.unit
 
 
 class MPC:
@@ -198,10 +201,11 @@ class MPC:
             intervals: to be planned.
             missing: least sum of the service levels of all intervals; None if nothing is demanded.
             basis: from which the solver starts.
-            prices: of the stocks at the end, shape (nodes,), in the objective of the episode per mass.
+            prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
         """
         stock = self._env.physical.stock[: len(self._env.network.nodes), copy]
         demanded = None if missing is None else max(0.0, missing / len(intervals))
+        unit = 1.0
         what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
             problem = self._priced(self._programs, stock, intervals, demanded, prices)
@@ -209,14 +213,14 @@ class MPC:
         except Infeasible:
             if demanded is None:
                 raise
-            scale = self._env.network.objective.circularity_scale
-            prices = None if prices is None else prices / scale
+            unit = self._env.network.objective.circularity_scale
+            prices = None if prices is None else prices / unit
             problem = self._priced(self._urgent, stock, intervals, 0.0, prices)
             solution = solve(problem, basis, what=what)
         planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
         base = self._admissible.base[intervals.start : intervals.stop][: self._replan]
         actions = normalised_actions(replace(self._admissible, base=base), problem.layout, planned)
-        return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions)
+        return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)
 
     def _priced(
         self, programs: Programs, stock: Floats, intervals: range, demanded: float | None, prices: Floats | None

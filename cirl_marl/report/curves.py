@@ -114,6 +114,7 @@ def save_trajectory(
     flow: Floats,
     circularity: Floats,
     *,
+    start: Floats | None = None,
     load: Floats | None = None,
     service: Floats | None = None,
     title: str = "",
@@ -129,6 +130,7 @@ def save_trajectory(
         stock: stocks, shape (nodes, steps), mass.
         flow: flows, shape (arcs, steps), mass/time.
         circularity: λ, shape (steps,), mass.
+        start: stocks before the first step, then masses on batch arcs if ``load`` is given, mass; None leaves them out.
         load: masses on batch arcs, shape (batch arcs, steps), mass; None leaves them out.
         service: service level, shape (steps,); None leaves it out.
         title: heading.
@@ -148,11 +150,15 @@ def save_trajectory(
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {arc}" for arc in on_the_way]
         stock = np.concatenate([stock, _shaped("load", load, (len(on_the_way), *steps))])
+    held_at = time
+    if start is not None:
+        stock = np.column_stack([_shaped("start", start, (len(stock),)), stock])
+        held_at = np.concatenate([[0.0], time])
     heights = (1.25, 1.25, 0.8) if service is None else (1.25, 1.25, 0.8, 0.5)
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
     figure.suptitle(title, fontsize=11, fontweight="bold")
     above, middle, below, *rest = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-    _draw_largest(above, time, stock, held, "Stocks", mass)
+    _draw_largest(above, held_at, stock, held, "Stocks", mass)
     _draw_largest(middle, time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}")
     below.plot(time, circularity, color=SERIES[0], linewidth=1.8, marker=_dots(time))
     dressed(below, title="Circularity", ylabel=f"λ / {mass}")
@@ -161,7 +167,7 @@ def save_trajectory(
         last.plot(time, level, color=SERIES[0], linewidth=1.8, marker=_dots(time))
         dressed(last, title="Service level", ylabel="service level")
         last.set_ylim(-0.03, 1.06)
-    _set_time([above, middle, below, *rest][-1], time, network)
+    _set_time([above, middle, below, *rest][-1], held_at, network)
     return save(figure, path)
 
 

@@ -76,7 +76,8 @@ def save_fronts(path: str | Path, network: Network, series: Sequence[Series], bo
 def _draw_bound(axes: Axes, bound: Floats) -> None:
     """Draw the front of the bounds and shade what it rules out.
 
-    The bound for a service holds for every higher one, so steps are what is proved.
+    The bound for a service holds for every higher one, so steps are what is proved, for the start that it is of. Where
+    points are means over other starts, as that of their middle, one of them may lie above.
     """
     low, high = axes.get_ylim()
     high = max(high, float(bound[:, 1].max()) + 0.05 * (high - low))
@@ -84,7 +85,7 @@ def _draw_bound(axes: Axes, bound: Floats) -> None:
     axes.step(service, most, where="post", color=INK, linewidth=1.6, label="bound")
     axes.fill_between(service, most, high, step="post", color=GRID, linewidth=0, zorder=0)
     axes.annotate(
-        "proved out of reach",
+        "proved out of reach from a middle start",
         (1.0, high),
         xytext=(-4, -12),
         textcoords="offset points",

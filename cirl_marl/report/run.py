@@ -53,7 +53,7 @@ def evaluate_run(
         if entry.bound is not None and entry.gap is not None:
             figures["controllers"][name] |= {
                 "bound": over_episodes(entry.bound).as_dict(),
-                "gap": over_episodes(entry.gap).as_dict(),
+                "gap": over_episodes(entry.gap, (0.0, np.inf)).as_dict(),
             }
     if comparison.yardstick.reason:
         figures["no_bound"] = comparison.yardstick.reason
