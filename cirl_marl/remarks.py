@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cirl_marl.elements import ControlKind, Law, Role
+from cirl_marl.elements import Compartment, ControlKind, Law, Role
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.units import factor
@@ -125,13 +125,18 @@ def _starved(network: Network) -> Iterator[str]:
     env, interval = VectorEnv(network, num_envs=1), network.episode.control_interval
     env.reset(seed=0)
     neutral = {agent: action[None] for agent, action in env.neutral_action.items()}
+    valves = {k: _valve(arc) * _valve(network.nodes[network.node_index[arc.donor]]) for k, arc in ordered.items()}
     short: dict[int, float] = {}
     for step in range(min(network.episode.horizon, INTERVALS)):
-        env.advance(env.stack(neutral))
+        try:
+            env.advance(env.stack(neutral))
+        except CirlError as error:
+            yield str(error)
+            return
         for k, arc in ordered.items():
             first = max(0, int(np.searchsorted(arc.times, step * interval, side="right")) - 1)
             last = max(first, int(np.searchsorted(arc.times, (step + 1) * interval)) - 1)
-            if env.physical.flow[k, 0] < (1 - COARSE) * min(arc.flow[first : last + 1]):
+            if env.physical.flow[k, 0] < (1 - COARSE) * valves[k] * min(arc.flow[first : last + 1]):
                 short.setdefault(k, step * interval)
     for k, time in short.items():
         arc = ordered[k]
@@ -139,6 +144,12 @@ def _starved(network: Network) -> Iterator[str]:
             f"arc '{arc.id}': under neutral control '{arc.donor}' holds too little for its flow from "
             f"{time:g} {network.time_unit} on; give it a larger initial stock if it stands for the world outside"
         )
+
+
+def _valve(compartment: Compartment) -> float:
+    """Return by what neutral control multiplies the flows that a compartment scales."""
+    control = compartment.control
+    return control.neutral if control is not None and control.kind is ControlKind.RATE else 1.0
 
 
 def _aimless(network: Network) -> Iterator[str]:

@@ -235,9 +235,14 @@ series = { times = [0, 1], time_unit = "year", values = [5, 6], unit = "t/day", 
     assert "remark on scenario 'default': λ is always 0" in printed
     assert "arc 'imported': under neutral control 'imports' holds too little for its flow from 0 day on" in printed
     assert "arc 'imported': series: an episode ends at 7 day, so that what begins at 365.25 day never comes" in printed
-    Path("bottles.toml").write_text(text.replace("low = 0, high = 0", "low = 1e6, high = 1e6"))
-    assert run(monkeypatch, "check", "bottles.toml") == 0
-    assert "holds too little" not in capsys.readouterr().out
+    half = (
+        '[nodes.imports]\ncontrol = { kind = "rate", low = 0, neutral = 0.5, high = 1, unit = "1", source = "valve" }'
+    )
+    full = text.replace("low = 0, high = 0", "low = 1e6, high = 1e6")
+    for enough in (full, full.replace("[nodes.imports]", half)):
+        Path("bottles.toml").write_text(enough)
+        assert run(monkeypatch, "check", "bottles.toml") == 0
+        assert "holds too little" not in capsys.readouterr().out
 
 
 def test_check_names_the_scenario_that_cannot_run(

@@ -461,6 +461,7 @@ class TestBalances:
         for feed in (0.0, 100.0):
             soon = solve(model, start, np.array([3.56e5]), [0.1, 28 / 60], feed_kg_min=feed)
             np.testing.assert_allclose(soon[5], 1000.0, atol=2.0)
+            assert solve(model, start, np.array([6.4e5]), [28 / 60], feed_kg_min=feed)[5, 0] < 860.0
         np.testing.assert_allclose(model.derivative(start[:, None], inputs)[[3, 4]], 0.0, atol=1e-12)
         end = solve(model, start, inputs[:, 0], [1000.0], "LSODA")
         assert end[5, 0] == pytest.approx(1000.0, abs=10.0)

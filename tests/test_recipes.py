@@ -278,6 +278,16 @@ def test_recipes_of_python_are_checked_like_files(changes: dict[str, Any], messa
         train("copper_net", ppo_recipe.model_copy(update=changes))
 
 
+def test_whole_episodes_need_a_single_environment(tmp_path: Path) -> None:
+    """The library learns after whole episodes in one environment only; it is said before anything is written."""
+    text = GOOD.replace('"PPO"', '"SAC"').replace("n_steps = 8", 'train_freq = [1, "episode"]')
+    path = write(tmp_path, text)
+    with pytest.raises(RecipeError, match=r"train_freq: SAC learns after whole episodes in a single .*not in 2"):
+        train("copper_net", path, envs=2, directory=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    train("copper_net", path, envs=1, steps=3, agents=["mine"], horizon=2)
+
+
 def test_lists_stand_for_tuples() -> None:
     """TOML has no tuples; the library takes some parameters as such."""
     assert list(parameter_mistakes("SAC", "MlpPolicy", {"train_freq": [1, "episode"]})) == []
