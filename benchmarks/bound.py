@@ -20,11 +20,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from benchmarks.document import made_with, write_sections
 from cirl_marl import VectorEnv
-from cirl_marl.comparison.compare import starting_stocks
-from cirl_marl.controllers.mpc import MPC
+from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.evaluate import EVALUATION_SEEDS, rollout
+from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.optimum import Bound, Envelope, Incumbent, Plan, achieved, bound, envelope, improved, search
+from cirl_marl.optimum.mpc import MPC
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "bound.md"
 NETWORKS = ("copper_net", "carbo_net")

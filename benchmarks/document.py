@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cirl_marl
 from cirl_marl.errors import CirlError
-from cirl_marl.learners.run import write_atomically
-from cirl_marl.machine import versions
+from cirl_marl.records.files import write_atomically
+from cirl_marl.records.machine import versions
 
 
 def write_sections(document: Path, sections: Mapping[str, str]) -> None:

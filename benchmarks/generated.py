@@ -16,14 +16,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from cirl_marl.elements import Arc, Control, ControlKind, Episode, Node
+from cirl_marl.environments.vector import Infos, VectorEnv
+from cirl_marl.learners.learner import Trainee
 from cirl_marl.learners.lockstep import Lockstep
 from cirl_marl.learners.recipe import Recipe
 from cirl_marl.learners.seat import Seat
-from cirl_marl.learners.trainee import Trainee
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network import Network
-from cirl_marl.vector_env import Infos, VectorEnv
+from cirl_marl.network.elements import Arc, Control, ControlKind, Episode, Node
 
 TURNOVER = 0.2
 """Share of its stock that a node with outflows sends on in one control interval, as the faster nodes of copper_net."""

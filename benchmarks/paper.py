@@ -27,9 +27,9 @@ from cirl_marl.errors import CirlError
 from cirl_marl.paper.document import markdown
 from cirl_marl.paper.plan import minutes, overview, planned, study
 from cirl_marl.paper.results import Results, Row
+from cirl_marl.paper.running import outdated
 from cirl_marl.paper.session import live_bar
 from cirl_marl.paper.table import result_line
-from cirl_marl.paper.training import outdated
 
 console = Console(width=None if sys.stdout.isatty() else 140)
 processes = get_context("spawn")
@@ -198,7 +198,7 @@ def work(row: Row, folder: str, episodes: int | None, state: Any) -> None:
                 raise KeyboardInterrupt("the study that started this row is gone")
 
     try:
-        from cirl_marl.paper.training import run_row
+        from cirl_marl.paper.running import run_row
 
         results.write(run_row(row, report=report, episodes=episodes))
         log.write("done\n")

@@ -28,10 +28,10 @@ from rich.table import Table
 
 from benchmarks.generated import FreeEnv, Weights, learn_alone, learn_together, random_network, simple_spread
 from cirl_marl import parallel_env
+from cirl_marl.environments.parallel import NetworkParallelEnv
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.learners import load_recipe, train
-from cirl_marl.machine import processor
-from cirl_marl.parallel_env import NetworkParallelEnv
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.records.machine import processor
 
 console = Console(width=150)
 

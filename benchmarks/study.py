@@ -24,20 +24,20 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.document import made_with, write_sections
-from cirl_marl.catalogue import load_network
-from cirl_marl.comparison import Comparison, Row, compare, yardstick
-from cirl_marl.comparison.compare import starting_stocks
-from cirl_marl.comparison.files import write_comparison
 from cirl_marl.controllers import LQR, Controller, Neutral
-from cirl_marl.controllers.mpc import MPC, SERVICE_FIRST
+from cirl_marl.controllers.rollout import first_seed, rollout
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.drawing.style import SERIES, dressed, save
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown
-from cirl_marl.evaluate import first_seed, rollout
+from cirl_marl.evaluation import Comparison, Row, compare, yardstick
+from cirl_marl.evaluation.comparison import starting_stocks
+from cirl_marl.evaluation.statistics import Aggregate, interquartile_mean, over_episodes, over_seeds
 from cirl_marl.learners import RunDirectory, load_recipe, train
-from cirl_marl.learners.run import write_json
 from cirl_marl.network import Floats
-from cirl_marl.report.style import SERIES, dressed, save
-from cirl_marl.statistics import Aggregate, interquartile_mean, over_episodes, over_seeds
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
+from cirl_marl.records.files import write_json
+from cirl_marl.report.comparison import write_comparison
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
 SEEDS, EPISODES = 5, 16

@@ -8,8 +8,15 @@ reward is the circularity λ(N;t) of the network.
 ['carbo_net', 'copper_net', 'net_zero', 'solids_net']
 """
 
-from cirl_marl.catalogue import load_network, networks, recipes
-from cirl_marl.elements import (
+from cirl_marl.definitions.catalogue import load_network, networks, recipes
+from cirl_marl.environments.parallel import NetworkParallelEnv, aec_env, parallel_env, vector_env
+from cirl_marl.environments.registration import register
+from cirl_marl.environments.single import SingleAgentEnv, single_agent_env
+from cirl_marl.environments.state import Snapshot
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError, ControlError, DefinitionError, LearnerError, NetworkError, RecipeError, RunError
+from cirl_marl.network import Network
+from cirl_marl.network.elements import (
     Arc,
     Control,
     ControlKind,
@@ -21,21 +28,6 @@ from cirl_marl.elements import (
     Role,
     Service,
 )
-from cirl_marl.errors import (
-    CirlError,
-    ControlError,
-    DefinitionError,
-    LearnerError,
-    NetworkError,
-    RecipeError,
-    RunError,
-)
-from cirl_marl.network import Network
-from cirl_marl.parallel_env import NetworkParallelEnv, aec_env, parallel_env, vector_env
-from cirl_marl.registration import register
-from cirl_marl.single_env import SingleAgentEnv, single_agent_env
-from cirl_marl.state import Snapshot
-from cirl_marl.vector_env import VectorEnv
 
 __version__ = "0.1.0"
 

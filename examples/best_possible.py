@@ -6,9 +6,9 @@ Ten days of the copper network; whole episodes take a minute.
 from rich import print
 
 from cirl_marl import vector_env
-from cirl_marl.controllers.mpc import MPC
-from cirl_marl.evaluate import rollout
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.optimum import achieved, bound, envelope, improved
+from cirl_marl.optimum.mpc import MPC
 
 service, horizon = 0.98, 40
 

@@ -13,20 +13,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from cirl_marl import (
-    Arc,
-    Control,
-    ControlKind,
-    Episode,
-    Law,
-    Network,
-    Node,
-    Objective,
-    Role,
-    Service,
-)
-from cirl_marl.definition import read_network
-from cirl_marl.simulate import Dynamics
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service
+from cirl_marl.definitions.reading import read_network
+from cirl_marl.dynamics.motion import Dynamics
 
 if TYPE_CHECKING:
     from cirl_marl.learners import Progress

@@ -98,7 +98,8 @@ def stepped() -> Iterator[tuple[str, str]]:
 def bounded() -> Iterator[tuple[str, str]]:
     """Yield bounds with their multipliers and plans, and the plans of searches."""
     for name in ("copper_net", "carbo_net"):
-        for options in ({}, {"min_service": 0.97}, {"service_weight": 3.0}):
+        asked: tuple[dict[str, Any], ...] = ({}, {"min_service": 0.97}, {"service_weight": 3.0})
+        for options in asked:
             found = optimum.bound(name, horizon=6, **options)
             better = optimum.improved(found, rounds=2)
             proof = [found.certificate.equal, found.certificate.under, found.verify().bound]

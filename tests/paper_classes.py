@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.rowsum import Floats
 
 REFERENCE = Path(__file__).parent / "reference"
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl import Arc, Episode, Network, Node
-from cirl_marl.simulate import Dynamics
+from cirl_marl.dynamics.motion import Dynamics
 
 Floats = NDArray[np.float64]
 

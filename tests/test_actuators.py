@@ -12,9 +12,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from cirl_marl import Arc, CirlError, Control, ControlError, ControlKind, Network, Node, VectorEnv
-from cirl_marl.comparison import compare
 from cirl_marl.controllers import Neutral, Random
-from cirl_marl.evaluate import rollout
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.evaluation import compare
 
 hundredths = st.integers(0, 300).map(lambda n: n / 100)
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv
 from cirl_marl.compartments import RewardState, model_class
-from cirl_marl.elements import Episode, Law, Objective, Service
 from cirl_marl.network import Floats
+from cirl_marl.network.elements import Episode, Law, Objective, Service
 
 INTERVAL = 0.04
 ITEM = 100.0

@@ -19,8 +19,8 @@ from scipy import optimize
 
 import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, cli, learners
-from cirl_marl.catalogue import folder, networks
-from cirl_marl.definition import write_network
+from cirl_marl.definitions.catalogue import folder, networks
+from cirl_marl.definitions.reading import write_network
 from cirl_marl.learners import RunDirectory, train
 from cirl_marl.optimum import search_each
 

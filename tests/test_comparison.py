@@ -15,19 +15,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cirl_marl.catalogue import load_network
-from cirl_marl.comparison import compare
-from cirl_marl.comparison.contenders import differences
-from cirl_marl.comparison.files import FILES, write_comparison
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError
+from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.contenders import differences
+from cirl_marl.evaluation.provenance import provenance
+from cirl_marl.evaluation.statistics import interquartile_mean
+from cirl_marl.evaluation.sweep import pareto
 from cirl_marl.learners import Progress, Recipe, RunDirectory, Training, load_recipe, resume, train
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
-from cirl_marl.pareto import pareto
+from cirl_marl.records.files import published
+from cirl_marl.report.comparison import FILES, write_comparison
 from cirl_marl.report.run import evaluate_run
-from cirl_marl.results import provenance, published
-from cirl_marl.statistics import interquartile_mean
-from cirl_marl.vector_env import VectorEnv
 
 
 @pytest.fixture(scope="module")

@@ -22,10 +22,10 @@ from cirl_marl.compartments.incinerator import PUBLISHED_FLOWS, Incinerator
 from cirl_marl.compartments.light import light_response
 from cirl_marl.compartments.microalgae_droop import MicroalgaeDroop
 from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
-from cirl_marl.compartments.model import ContinuousModel
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import ContinuousModel
+from cirl_marl.network.rowsum import Floats
 
 
 def solve(

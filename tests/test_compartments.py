@@ -22,12 +22,12 @@ from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.compartments.microalgae_droop import MicroalgaeDroop
 from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
-from cirl_marl.compartments.model import ContinuousModel
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
 from cirl_marl.errors import CirlError
-from cirl_marl.rowsum import Floats
-from cirl_marl.units import factor
+from cirl_marl.network.model import ContinuousModel
+from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.units import factor
 
 HELPERS = {"model", "light", "nutrient"}
 """Modules of the package that hold no model."""

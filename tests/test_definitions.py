@@ -26,10 +26,10 @@ from cirl_marl import (
     networks,
     parallel_env,
 )
-from cirl_marl.catalogue import folder
-from cirl_marl.definition import write_network
-from cirl_marl.elements import ControlKind
-from cirl_marl.schema import json_schema
+from cirl_marl.definitions.catalogue import folder
+from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.schema import json_schema
+from cirl_marl.network.elements import ControlKind
 
 FILES = sorted(folder("envs").glob("*.toml"))
 COPPER = (Path(__file__).parent / "reference" / "definition.toml").read_text(encoding="utf-8")

@@ -17,13 +17,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from cirl_marl import ControlError, DefinitionError, RecipeError, VectorEnv
 from cirl_marl.controllers import Controller, Scripted
-from cirl_marl.controllers.named import CONTROLLERS, named_controller
-from cirl_marl.goal_env import GoalEnv
+from cirl_marl.environments.goal import GoalEnv
 from cirl_marl.learners import Recipe, Training, load_recipe, resume, train
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
+from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import Demonstrations
-from cirl_marl.learners.trainee import derived_seed
 from cirl_marl.learners.views import View
+from cirl_marl.optimum.named import CONTROLLERS, named_controller
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Row
 from cirl_marl.paper.tuned import train_tuned

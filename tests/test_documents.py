@@ -11,7 +11,7 @@ import typer.main
 
 import cirl_marl
 from cirl_marl.cli import app
-from cirl_marl.definition import read_network
+from cirl_marl.definitions.reading import read_network
 from cirl_marl.learners import load_recipe, train
 
 ROOT = Path(__file__).parent.parent

@@ -22,7 +22,6 @@ from cirl_marl import (
     Node,
     VectorEnv,
     aec_env,
-    credit,
     load_network,
     networks,
     parallel_env,
@@ -30,11 +29,12 @@ from cirl_marl import (
     vector_env,
 )
 from cirl_marl.controllers import Constant, Random, Scripted
-from cirl_marl.elements import Episode
-from cirl_marl.evaluate import rollout
-from cirl_marl.nested import same_or_raise
-from cirl_marl.simulate import Dynamics
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.environments import rewards as credit
+from cirl_marl.network.elements import Episode
 from cirl_marl.testing import check_parallel_env, check_vector_env
+from cirl_marl.testing.nested import same_or_raise
 
 CATALOGUE = [
     pytest.param(name, scenario, id=f"{name}-{scenario}")

@@ -16,7 +16,7 @@ from small_networks import NO_STATES, advanced, small, start
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, VectorEnv
 from cirl_marl.compartments import RewardState
-from cirl_marl.simulate import Dynamics
+from cirl_marl.dynamics.motion import Dynamics
 
 Floats = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from cirl_marl import CirlError, Network, Node, Service, load_network
 from cirl_marl.compartments.robots.fetch import BIN
 from cirl_marl.controllers.scripted import fetch
-from cirl_marl.goal_env import PARTS, GoalEnv
-from cirl_marl.nested import same_or_raise
+from cirl_marl.environments.goal import PARTS, GoalEnv
+from cirl_marl.testing.nested import same_or_raise
 
 FETCH, REACHER = "cirl_marl/FetchWasteSorting-v0", "cirl_marl/Reacher-v0"
 robots = pytest.mark.parametrize("id_", [FETCH, REACHER])

@@ -1,80 +1,106 @@
-"""What importing the library costs, and which way imports go."""
+"""What importing the library costs, and which way imports go: all of them, wherever in a file they stand."""
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
 from pathlib import Path
 
-import cirl_marl
+import pytest
+from imports import PACKAGE, arrows, circles, drawing, floors, imported, modules, room_of, rooms
 
-PACKAGE = Path(cirl_marl.__file__).parent
+CHECKOUT = Path(__file__).parent.parent
 LAYERS = (
-    {
-        "errors",
-        "machine",
-        "units",
-        "fields",
-        "elements",
-        "rowsum",
-        "validate",
-        "validate_services",
-        "validate_settings",
-        "network",
-        "staged",
-        "statistics",
-    },
-    {"compartments"},
-    {"schema", "mistakes", "conversion", "definition", "writing", "catalogue"},
-    {"batches", "flows", "inner", "simulate", "actuators", "starts", "state", "observe", "reward", "credit"},
-    {"vector_env"},
-    {"parallel_env", "single_env", "goal_env", "registration"},
-    {
-        "controllers",
-        "optimum",
-        "learners",
-        "evaluate",
-        "remarks",
-        "results",
-        "schedule",
-        "pareto",
-        "comparison",
-        "report",
-        "nested",
-        "testing",
-    },
-    {"paper"},
-    {"cli"},
+    ("errors", "records"),
+    ("network",),
+    ("compartments", "drawing", "dynamics"),
+    ("definitions",),
+    ("environments",),
+    ("__init__", "controllers", "testing"),
+    ("optimum",),
+    ("learners",),
+    ("evaluation", "paper"),
+    ("report",),
+    ("cli",),
 )
-"""From the network to the command line; a module imports from its own layer or earlier ones."""
+"""From the ground up; a room imports from layers below its own, and from itself."""
+
+MOST_FLOORS = 12
+TRAINING = ("learners", "paper")
+"""Rooms whose modules may load torch."""
 
 
-def test_import_is_light() -> None:
-    """``import cirl_marl`` loads neither torch nor mujoco."""
-    heavy = ("torch", "mujoco", "stable_baselines3")
-    code = f"import sys, cirl_marl; print([module for module in {heavy} if module in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+def wrong_way(graph: object) -> list[str]:
+    """Return the imports that do not lead to a lower layer."""
+    layer = {room: i for i, rooms_ in enumerate(LAYERS) for room in rooms_}
+    pairs = [(a, b, room_of(a), room_of(b)) for a, b in graph.edges]  # type: ignore[attr-defined]
+    return [f"{a} imports {b}" for a, b, above, below in pairs if above != below and layer[below] >= layer[above]]
 
 
-def imported(path: Path) -> set[str]:
-    """Return the modules of this library that a file imports when it is loaded."""
-    names: list[str] = []
-    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(statement, ast.ImportFrom):
-            names += [f"{statement.module}.{alias.name}" for alias in statement.names]
-        elif isinstance(statement, ast.Import):
-            names += [alias.name for alias in statement.names]
-    return {name.split(".")[1] for name in names if name.startswith("cirl_marl.")}
+def test_every_room_has_a_layer() -> None:
+    """The layers name the sub-packages and top modules that there are; little stands at the top."""
+    found = {room_of(module) for module in modules(CHECKOUT)}
+    assert found == {room for layer in LAYERS for room in layer}
+    assert {path.stem for path in (CHECKOUT / PACKAGE).glob("*.py")} == {"__init__", "errors"}
 
 
 def test_imports_go_one_way() -> None:
-    """No module imports, when it is loaded, from a later layer."""
-    layer = {module: i for i, modules in enumerate(LAYERS) for module in modules}
-    files = [path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py" or path.parent != PACKAGE]
-    for path in files:
-        own = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        assert own in layer, f"{own} belongs to no layer"
-        for other in imported(path):
-            assert layer[other] <= layer[own], f"{path.name} imports {other}"
+    """No import leads up or round, within a room neither; there are few floors."""
+    graph = arrows(modules(CHECKOUT))
+    assert not wrong_way(graph)
+    assert not circles(graph)
+    assert not circles(rooms(graph))
+    assert max(floors(rooms(graph)).values()) <= MOST_FLOORS
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("errors", "from cirl_marl.network import Network"),
+        ("network/units", "if TYPE_CHECKING:\n    from cirl_marl.dynamics.motion import Dynamics"),
+        ("optimum/layout", "def late():\n    from cirl_marl.optimum import bound"),
+    ],
+)
+def test_a_planted_circle_is_found(tmp_path: Path, module: str, line: str) -> None:
+    """One line is enough, at the top, for types only, inside a function, and between modules of one room."""
+    for path in modules(CHECKOUT).values():
+        copy = tmp_path / path.relative_to(CHECKOUT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
+    planted = tmp_path / PACKAGE / f"{module}.py"
+    planted.write_text(f"{planted.read_text(encoding='utf-8')}\n{line}\n", encoding="utf-8")
+    graph = arrows(modules(tmp_path))
+    assert circles(graph)
+    assert "none" not in "\n".join(drawing(tmp_path)).split("circles of modules")[1].splitlines()[0]
+    if module != "optimum/layout":
+        assert wrong_way(graph)
+
+
+def test_every_kind_of_import_is_read() -> None:
+    """Names, modules and packages, plain and from, nested; what is not of the library is nothing."""
+    known = [PACKAGE, f"{PACKAGE}.errors", f"{PACKAGE}.network", f"{PACKAGE}.network.units"]
+    text = "import numpy\ndef f():\n    import cirl_marl.network.units as u\nfrom cirl_marl.network import Network\n"
+    assert imported(text, known) == {f"{PACKAGE}.network", f"{PACKAGE}.network.units"}
+    assert imported("from cirl_marl import errors, load_network", known) == {PACKAGE, f"{PACKAGE}.errors"}
+
+
+def test_packages_say_their_subject() -> None:
+    """The first line of every sub-package is one sentence."""
+    for path in (CHECKOUT / PACKAGE).rglob("__init__.py"):
+        first = path.read_text(encoding="utf-8").splitlines()[0]
+        assert first.startswith('"""') and first.rstrip('"').endswith("."), path
+
+
+def test_import_is_light() -> None:
+    """What trains nothing loads neither torch nor mujoco; ``learners`` itself only when a training is asked for."""
+    light = [name for name in modules(CHECKOUT) if room_of(name) not in TRAINING and ".robots." not in name]
+    light += [f"{PACKAGE}.learners", f"{PACKAGE}.learners.run", f"{PACKAGE}.learners.recipe", f"{PACKAGE}.paper.plan"]
+    code = (
+        "import sys, importlib\n"
+        f"for name in {light!r}:\n"
+        "    importlib.import_module(name)\n"
+        "    heavy = {'torch', 'mujoco', 'stable_baselines3'} & set(sys.modules)\n"
+        "    assert not heavy, (name, heavy)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert not done.returncode, done.stderr

@@ -15,12 +15,12 @@ from scipy.integrate import solve_ivp
 from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv, parallel_env
 from cirl_marl.compartments import model_class
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.definition import read_network, write_network
-from cirl_marl.elements import Episode, Law, Objective, Observation
-from cirl_marl.nested import same_or_raise
+from cirl_marl.definitions.reading import read_network, write_network
+from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.network import Floats
-from cirl_marl.single_env import SingleAgentEnv
+from cirl_marl.network.elements import Episode, Law, Objective, Observation
 from cirl_marl.testing import check_parallel_env, check_vector_env
+from cirl_marl.testing.nested import same_or_raise
 
 LITRES = 1000.0
 KG_PER_MMOL = 44.01e-6

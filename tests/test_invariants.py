@@ -12,9 +12,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from cirl_marl import Law, Network, SingleAgentEnv, VectorEnv, load_network, networks, parallel_env
-from cirl_marl.elements import REWARDS
-from cirl_marl.nested import same_or_raise
+from cirl_marl.network.elements import REWARDS
 from cirl_marl.testing import check_parallel_env, check_vector_env
+from cirl_marl.testing.nested import same_or_raise
 
 EPS = float(np.finfo(float).eps)
 CATALOGUE = [

@@ -17,13 +17,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import cirl_marl
 from cirl_marl import DefinitionError, Network, VectorEnv, vector_env
-from cirl_marl.controllers.trained import Trained
-from cirl_marl.evaluate import rollout
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import load_recipe, train
 from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.lockstep import Lockstep
 from cirl_marl.learners.recipe import Learner, Match, Normalisation, Recipe, Run
 from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.trained import Trained
 from cirl_marl.learners.training import Training
 from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, WithState, unseen_state
 

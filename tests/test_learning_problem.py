@@ -9,7 +9,7 @@ import pytest
 
 from cirl_marl import VectorEnv
 from cirl_marl.controllers import Constant, Controller, Neutral
-from cirl_marl.evaluate import Rollout, rollout
+from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.learners import RunDirectory, train
 
 BETTER = {

@@ -12,7 +12,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Network, Node, VectorEnv, load_network
 from cirl_marl.controllers import LQR, LinearSystem
-from cirl_marl.evaluate import rollout
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network import Floats
 
 MEASURED = ("urban_air",)

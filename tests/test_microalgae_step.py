@@ -17,7 +17,7 @@ from cirl_marl.compartments import nutrient
 from cirl_marl.compartments.microalgae_droop import MicroalgaeDroop
 from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
 from cirl_marl.compartments.nutrient import draw_down
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.rowsum import Floats
 
 Model = MicroalgaeMonod | MicroalgaeDroop
 

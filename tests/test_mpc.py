@@ -23,9 +23,9 @@ from cirl_marl import (
     Service,
     VectorEnv,
 )
-from cirl_marl.controllers.mpc import MPC
-from cirl_marl.evaluate import rollout
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.optimum import NoCertificate, Plan, bound, envelope
+from cirl_marl.optimum.mpc import MPC
 
 RESERVE = Node(id="reserve", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0))
 USE = Node(id="use", initial=(10.0, 10.0))

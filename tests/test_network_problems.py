@@ -24,12 +24,12 @@ from cirl_marl import (
     Service,
     load_network,
 )
-from cirl_marl.catalogue import folder
 from cirl_marl.compartments.delivery_truck import DeliveryTruck
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
-from cirl_marl.definition import write_network
+from cirl_marl.definitions.catalogue import folder
+from cirl_marl.definitions.reading import write_network
 
 A, B = Node(id="a", initial=(10.0, 10.0)), Node(id="b")
 LINK = Arc(id="k", donor="a", recipient="b", rate=0.1)

@@ -29,8 +29,8 @@ from cirl_marl import (
     load_network,
 )
 from cirl_marl.controllers import Neutral
-from cirl_marl.evaluate import rollout
-from cirl_marl.flows import FlowLaws
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, improved
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verified

@@ -24,10 +24,10 @@ from cirl_marl import (
     VectorEnv,
     load_network,
 )
-from cirl_marl.comparison import compare
 from cirl_marl.compartments import kind_of, model_class
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.definition import write_network
+from cirl_marl.definitions.reading import write_network
+from cirl_marl.evaluation import compare
 from cirl_marl.learners import Recipe, train
 
 

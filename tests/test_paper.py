@@ -27,8 +27,9 @@ from cirl_marl.paper.evaluation import evaluate
 from cirl_marl.paper.plan import planned, study
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
 from cirl_marl.paper.results import Evaluation, Result, Results, Row, thinned
+from cirl_marl.paper.running import outdated, run_row
 from cirl_marl.paper.table import table_rows
-from cirl_marl.paper.training import Trained, described, outdated, run_row
+from cirl_marl.paper.training import Trained, described
 from cirl_marl.paper.tuned import train_tuned
 
 COPPER = ENVIRONMENTS["CopperNet"]

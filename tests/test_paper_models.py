@@ -11,7 +11,7 @@ from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.compartments.microalgae_droop import MicroalgaeDroop
 from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
 from cirl_marl.compartments.transport_truck import TransportTruck
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.rowsum import Floats
 
 CLASSES: dict[str, tuple[ContinuousModel, PaperClass, tuple[int, ...]]] = {
     "TransportTruck": (TransportTruck(form="published"), PAPER["transport_truck"], (0,)),

@@ -16,7 +16,7 @@ from scipy.optimize import lsq_linear
 import cirl_marl
 from cirl_marl import VectorEnv
 from cirl_marl.controllers import Constant
-from cirl_marl.evaluate import EVALUATION_SEEDS, SEED_SPACING, rollout
+from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING, rollout
 from cirl_marl.network import Floats
 from cirl_marl.paper.evaluation import EVALUATION_COPIES, EVALUATION_EPISODES, evaluate
 from cirl_marl.paper.published import ENVIRONMENTS

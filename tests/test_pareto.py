@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cirl_marl.catalogue import folder
+from cirl_marl.definitions.catalogue import folder
 from cirl_marl.errors import CirlError, RunError
+from cirl_marl.evaluation.sweep import Sweep, pareto
 from cirl_marl.learners import load_recipe
 from cirl_marl.network import Network
 from cirl_marl.optimum import NoCertificate
-from cirl_marl.pareto import FILES, Sweep, pareto
+from cirl_marl.report.sweep import FILES, write_sweep
 
 
 def swept(network: Network, directory: Path, **options: object) -> Sweep:
@@ -45,7 +46,7 @@ def test_trainings_are_kept(bottles: Network, tmp_path: Path) -> None:
     again = swept(bottles, tmp_path)
     assert again.points == found.points
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("status.json")} == stamps
-    assert [path.name for path in found.write(tmp_path / "out", points=3)] == list(FILES)
+    assert [path.name for path in write_sweep(found, tmp_path / "out", points=3)] == list(FILES)
     with (tmp_path / "out" / "pareto.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["kind"] for row in rows].count("trained") == 3

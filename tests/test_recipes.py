@@ -13,7 +13,7 @@ import pytest
 
 import cirl_marl
 from cirl_marl import CirlError, DefinitionError, RecipeError, VectorEnv
-from cirl_marl.catalogue import folder
+from cirl_marl.definitions.catalogue import folder
 from cirl_marl.learners import Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import algorithms, parameter_mistakes, parameters_of, policy_parameters_of
 from cirl_marl.learners.recipe import Learner, Match, Normalisation, Options, recipe_schema

@@ -15,8 +15,8 @@ from paper_classes import trajectory
 from scipy.integrate import solve_ivp
 
 from cirl_marl import CirlError, Law, VectorEnv, load_network, parallel_env, single_agent_env
-from cirl_marl.registration import PAPER_ENVIRONMENTS
-from cirl_marl.simulate import Dynamics
+from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.environments.registration import PAPER_ENVIRONMENTS
 
 PAPER = {"CopperNet": ("copper_net", "use_to_collection"), "CarboNet": ("carbo_net", "urban_to_capture")}
 

@@ -19,19 +19,12 @@ from numpy.typing import NDArray
 
 import cirl_marl
 from cirl_marl import Arc, CirlError, Network, Node, Role
+from cirl_marl.drawing import picture as drawing
+from cirl_marl.drawing.arrangement import layout_of
+from cirl_marl.drawing.digraph import Canvas, draw_network, save_before_after, save_network
 from cirl_marl.network import Floats
-from cirl_marl.report import (
-    Canvas,
-    curves,
-    draw_network,
-    drawing,
-    save_before_after,
-    save_circularity,
-    save_learning_curves,
-    save_network,
-    save_trajectory,
-)
-from cirl_marl.report.plan import layout_of
+from cirl_marl.report import curves
+from cirl_marl.report.curves import save_circularity, save_learning_curves, save_trajectory
 
 Picture = NDArray[np.float32]
 

@@ -14,8 +14,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from cirl_marl import CirlError, LearnerError, RecipeError, RunError
 from cirl_marl.learners import Progress, Recipe, RunDirectory, resume, train
+from cirl_marl.learners.learner import load_model
 from cirl_marl.learners.recipe import Demonstrations, Learner, Run
-from cirl_marl.learners.trainee import load_model
 
 
 class FailsAt(BaseCallback):

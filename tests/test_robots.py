@@ -23,7 +23,7 @@ from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.compartments.robots.sorting_station import BOOKS, SortingStation
 from cirl_marl.controllers.scripted import Seen, fetch, reacher
 from cirl_marl.errors import CirlError
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.rowsum import Floats
 
 Robot = Fetch | Reacher
 ROBOTS: tuple[Robot, ...] = (Fetch(), Reacher())

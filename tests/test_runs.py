@@ -14,12 +14,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import cirl_marl
 from cirl_marl import RunError, VectorEnv
-from cirl_marl.controllers.trained import Trained
-from cirl_marl.evaluate import rollout
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners import run as learners_run
 from cirl_marl.learners.recipe import Learner, Normalisation, Run
-from cirl_marl.learners.run import write_atomically
+from cirl_marl.learners.trained import Trained
+from cirl_marl.records import files as files_module
+from cirl_marl.records.files import write_atomically
 
 
 def test_run_directory_holds_what_is_needed(tmp_path: Path, ppo_recipe: Recipe) -> None:
@@ -216,13 +217,13 @@ def test_checkpoints_are_on_the_disk_before_they_count(
 ) -> None:
     """Every file of a checkpoint, then its folder, then the status that names it."""
     synced: list[Path] = []
-    sync = learners_run._sync
+    sync = files_module.sync
 
     def recorded(path: Path) -> None:
         sync(path)
         synced.append(path)
 
-    monkeypatch.setattr(learners_run, "_sync", recorded)
+    monkeypatch.setattr(learners_run, "sync", recorded)
     train("copper_net", ppo_recipe, directory=tmp_path, agents=["mine"])
     names = [path.name for path in synced]
     end = names.index("000000040-complete.partial")

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from cirl_marl import DefinitionError
-from cirl_marl.catalogue import folder
-from cirl_marl.definition import read_network
+from cirl_marl.definitions.catalogue import folder
+from cirl_marl.definitions.reading import read_network
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from cirl_marl.controllers import Constant, Neutral, Random
+from cirl_marl.controllers.rollout import first_seed, rollout
+from cirl_marl.controllers.schedule import schedule
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluate import first_seed, rollout
-from cirl_marl.schedule import schedule
-from cirl_marl.vector_env import VectorEnv
 
 
 def test_neutral_plan_holds_the_neutral_controls() -> None:

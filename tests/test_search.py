@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from cirl_marl import Arc, CirlError, ControlError, Network, Node, Role, VectorEnv, load_network, networks
 from cirl_marl.controllers import Neutral, Random
-from cirl_marl.controllers.optimum import Optimum
-from cirl_marl.evaluate import EVALUATION_SEEDS, rollout
+from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.optimum import Incumbent, Plan, bound, search, search_each, standard_candidates
+from cirl_marl.optimum.controller import Optimum
+from cirl_marl.optimum.cross_entropy import SHORTFALL_PRICE
 from cirl_marl.optimum.gaussians import Gaussians, stages
 from cirl_marl.optimum.population import Population, starting_states
-from cirl_marl.optimum.search import SHORTFALL_PRICE
 
 EVERYWHERE = [(name, scenario) for name in networks() for scenario in (None, *load_network(name).scenarios)]
 

@@ -16,8 +16,8 @@ from small_networks import advanced, neutral_rate, small, start
 
 from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Network, Node, VectorEnv, parallel_env
 from cirl_marl.controllers import Neutral
-from cirl_marl.evaluate import rollout
-from cirl_marl.simulate import Dynamics
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.dynamics.motion import Dynamics
 
 Floats = NDArray[np.float64]
 

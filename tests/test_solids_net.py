@@ -19,11 +19,12 @@ from cirl_marl import Network, SingleAgentEnv, VectorEnv, load_network, parallel
 from cirl_marl.compartments.delivery_truck import DeliveryTruck
 from cirl_marl.controllers import Constant, Neutral, Random, Scripted
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.elements import REWARDS, Law
-from cirl_marl.evaluate import rollout, summary
-from cirl_marl.nested import same_or_raise
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.evaluation.figures import summary
 from cirl_marl.network import Floats
-from cirl_marl.staged import staged_circularity, time_window_circularity
+from cirl_marl.network.elements import REWARDS, Law
+from cirl_marl.network.staged import staged_circularity, time_window_circularity
+from cirl_marl.testing.nested import same_or_raise
 
 BATCH_KG, ITEMS = 300.0, 3
 both = pytest.mark.parametrize("scenario", ["default", "reacher"])
@@ -73,7 +74,7 @@ def column(env: VectorEnv, state: str) -> Floats:
 
 def mass(env: VectorEnv, row: str) -> Floats:
     """Return the mass in a row of a batch arc, shape (B,)."""
-    values: Floats = env.physical.stock[len(env.network.nodes) + env.dynamics.batches.names.index(row)]
+    values: Floats = env.physical.stock[env.rows.batches][env.rows.batch_names.index(row)]
     return values
 
 
@@ -117,7 +118,7 @@ def record(env: VectorEnv, controller: Controller, seed: int) -> Recorded:
     carried = {line for line, load in zip(lines, loads.max(axis=(0, 2)), strict=True) if load > 0.0}
     assert "first_use" in carried
     assert carried & {"truck", "recycling"}
-    names, rows = env.dynamics.inner.names, env.dynamics.batches.names
+    names, rows = env.dynamics.inner.names, env.rows.batch_names
     seen = {name: nodes[:, i] for i, name in enumerate(STOCKS)}
     seen |= {name: np.stack([state.inner[names.index(name)] for state in states]) for name in BOOKS}
     seen |= {name: np.stack([state.stock[len(STOCKS) + rows.index(name)] for state in states]) for name in WAITING}

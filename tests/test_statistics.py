@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cirl_marl.errors import CirlError
-from cirl_marl.statistics import interquartile_mean, over_episodes, over_seeds
+from cirl_marl.evaluation.statistics import interquartile_mean, over_episodes, over_seeds
 
 
 def test_intervals_end_where_the_figure_does() -> None:

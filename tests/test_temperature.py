@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from cirl_marl import VectorEnv, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.evaluate import rollout
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network import Floats
 
 STEPS = 40

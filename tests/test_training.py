@@ -17,15 +17,15 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, LearnerError, Network, Node, RunError, VectorEnv
-from cirl_marl.controllers.trained import Trained
-from cirl_marl.elements import Episode, Law
 from cirl_marl.learners import Recipe, RunDirectory, Training, resume, train
+from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import Learner, Match, Run
 from cirl_marl.learners.seat import Seat
-from cirl_marl.learners.trainee import derived_seed
+from cirl_marl.learners.trained import Trained
 from cirl_marl.learners.views import OneAgent
+from cirl_marl.network.elements import Episode, Law
 from cirl_marl.paper.results import Row
-from cirl_marl.paper.training import run_row
+from cirl_marl.paper.running import run_row
 
 OFF_POLICY = {
     "buffer_size": 1000,

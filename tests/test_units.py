@@ -7,7 +7,7 @@ import re
 import pytest
 
 from cirl_marl import CirlError
-from cirl_marl.units import factor
+from cirl_marl.network.units import factor
 
 
 def test_kt_is_the_kilotonne() -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 
-from cirl_marl.cli import comparing, networks, training
+from cirl_marl.cli import comparing, networks
+from cirl_marl.cli import learning as training
 from cirl_marl.cli.common import app, errors, plain
 from cirl_marl.errors import CirlError, LearnerError
 

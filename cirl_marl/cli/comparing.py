@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from cirl_marl.catalogue import load_network
 from cirl_marl.cli.common import (
     Episodes,
     MinService,
@@ -20,7 +19,8 @@ from cirl_marl.cli.common import (
     say,
     shares,
 )
-from cirl_marl.controllers.named import CONTROLLERS
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.optimum.named import CONTROLLERS
 
 
 @app.command()
@@ -49,9 +49,8 @@ def compare(
     mpc and optimum solve linear programs for every episode: minutes for each on the larger networks.
     Where nothing bounds a network, optimum is the best plan that a search by simulation finds, without certificate.
     """
-    from cirl_marl.comparison import compare as compared
-    from cirl_marl.comparison.files import write_comparison
-    from cirl_marl.report.comparison import comparison_notes, comparison_table
+    from cirl_marl.evaluation import compare as compared
+    from cirl_marl.report.comparison import comparison_notes, comparison_table, write_comparison
 
     names = [name.strip() for name in controllers.split(",") if name.strip()]
     folder = None if out is None else folder_for(out, "--out")
@@ -97,7 +96,8 @@ def pareto(
     The bound is swept over the service demanded, the learners over the weight of circularity in their reward, 0 to 1.
     Finished trainings are kept: the same command goes on where it was stopped.
     """
-    from cirl_marl.pareto import pareto as swept
+    from cirl_marl.evaluation.sweep import pareto as swept
+    from cirl_marl.report.sweep import write_sweep
 
     folder = folder_for(out or Path("runs") / f"pareto-{load_network(network).name}", "--out")
     try:
@@ -123,5 +123,5 @@ def pareto(
     if found.reason:
         say(f"no bound: {found.reason}")
     asked = {"agents": agents, "points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
-    for path in found.write(folder, **asked):
+    for path in write_sweep(found, folder, **asked):
         say(f"wrote {path}")

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from cirl_marl.catalogue import load_network, networks, recipes
 from cirl_marl.cli.common import MinService, NetworkName, Scenario, Seed, app, bar, console, errors, plain, say
 from cirl_marl.controllers import Controller
-from cirl_marl.controllers.named import CONTROLLERS, SETTABLE, named_controller
-from cirl_marl.controllers.planner import Watched
+from cirl_marl.controllers.rollout import Rollout, interval_ends, rollout
+from cirl_marl.controllers.watched import Watched
+from cirl_marl.definitions.catalogue import load_network, networks, recipes
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluate import Rollout, interval_ends, rollout, time_window
+from cirl_marl.evaluation.figures import time_window
 from cirl_marl.network import Network
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
 
 if TYPE_CHECKING:
     from cirl_marl.learners import Recipe
@@ -39,14 +40,14 @@ def show(
     picture: Annotated[Path | None, typer.Option(help="Where to draw it; default: NETWORK.png here.")] = None,
 ) -> None:
     """Show the compartments, flows and circularity of a network at its start state, and draw it."""
-    from cirl_marl.report.digraph import save_network
+    from cirl_marl.drawing.digraph import save_network
     from cirl_marl.report.tables import arcs_table, nodes_table
 
     found = load_network(network, scenario=scenario)
     env = VectorEnv(found, num_envs=1)
     middle = {node.id: sum(node.initial) / 2 for node in found.nodes}
     env.reset(seed=0, options={"initial_state": middle})
-    stock, flow = env.physical.stock[: len(found.nodes), 0], env.physical.flow[:, 0]
+    stock, flow = env.physical.stock[env.rows.nodes, 0], env.physical.flow[:, 0]
     console.print(nodes_table(found, stock))
     console.print(arcs_table(found, flow))
     for service in found.services:
@@ -96,7 +97,7 @@ def check(
 
 def _is_recipe(source: str) -> bool:
     """Whether a file says how to learn, or a name is that of a recipe."""
-    from cirl_marl.definition import read_toml
+    from cirl_marl.definitions.reading import read_toml
 
     if not source.endswith(".toml"):
         return source in recipes()
@@ -128,7 +129,7 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
 
 
 def _check_network(source: str) -> None:
-    from cirl_marl.remarks import remarks
+    from cirl_marl.controllers.remarks import remarks
 
     network = load_network(source)
     for each in (network, *network.scenarios.values()):
@@ -183,7 +184,7 @@ def simulate(
         run.stock.T,
         run.flow.T,
         run.circularity[0],
-        start=np.concatenate([began.stock[: len(found.nodes), 0], env.dynamics.batches.loads(began.stock)[:, 0]]),
+        start=np.concatenate([began.stock[env.rows.nodes, 0], env.dynamics.batches.loads(began.stock)[:, 0]]),
         load=run.load.T,
         service=run.service[0] if found.services else None,
         title=f"{found.title or found.name}, {control} control",
@@ -214,8 +215,8 @@ def plan(
     A row is a control interval: when it begins and ends, the value of every control (a flow ordered, a factor on what a
     valve lets through, or an input of a model) with its unit, the resulting flows, circularity and service level.
     """
-    from cirl_marl.controllers.optimum import Optimum
-    from cirl_marl.schedule import schedule
+    from cirl_marl.controllers.schedule import schedule
+    from cirl_marl.optimum.controller import Optimum
 
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
@@ -244,8 +245,8 @@ def _actor(
         raise CirlError(f"plan {source}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
     if scenario is not None or min_service is not None:
         raise CirlError("--scenario and --min-service go with --control; a run has its own scenario and policies")
-    from cirl_marl.controllers.trained import Trained
     from cirl_marl.learners.run import RunDirectory
+    from cirl_marl.learners.trained import Trained
 
     run = RunDirectory(source)
     return run.make_env(1), Trained(run)
@@ -277,7 +278,7 @@ def _held(control: str, settings: list[str]) -> dict[str, float]:
 
 def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> None:
     """Write the state in which ``env`` is, from which ``run`` began, and a row for the end of each interval."""
-    from cirl_marl.learners.run import write_atomically
+    from cirl_marl.records.files import write_atomically
 
     network, physics = env.network, env.dynamics.inner
     header = [f"time ({network.time_unit})", f"circularity ({network.mass_unit})", "service level"]
@@ -286,7 +287,7 @@ def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> No
     header += [f"mass on {line.id} ({network.mass_unit})" for line in env.dynamics.batches.lines]
     header += [physics.names[row] for row in physics.visible]
     start = env.physical
-    held = [*start.stock[: len(network.nodes), 0].tolist(), *[""] * len(network.arcs)]
+    held = [*start.stock[env.rows.nodes, 0].tolist(), *[""] * len(network.arcs)]
     held += [*env.dynamics.batches.loads(start.stock)[:, 0].tolist(), *start.inner[physics.visible, 0].tolist()]
 
     def write(target: Path) -> None:

@@ -8,14 +8,8 @@ import pkgutil
 from functools import cache
 from typing import Any
 
-from cirl_marl.compartments.model import (
-    CompartmentModel,
-    ContinuousModel,
-    DiscreteTimeModel,
-    OwnStepModel,
-    RewardState,
-)
 from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network.model import CompartmentModel, ContinuousModel, DiscreteTimeModel, OwnStepModel, RewardState
 
 __all__ = [
     "CompartmentModel",

@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.model import RewardState, check_positive
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.errors import CirlError
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_positive
+from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

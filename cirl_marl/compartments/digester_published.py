@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.compartments.model import RewardState, check_positive
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_positive
+from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

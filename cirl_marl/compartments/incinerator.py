@@ -9,14 +9,8 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from cirl_marl.compartments.model import (
-    RewardState,
-    check_form,
-    check_not_negative,
-    check_positive,
-    check_share,
-)
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_form, check_not_negative, check_positive, check_share
+from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ min. Horizon 100 and T_g(0) ~ U[900, 1100] °C are inferred: from the
 # released 20 °C a step costs 9.6·10⁵, while the paper's whole episodes cost 3.2·10⁵ to 3.8·10⁵.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.rowsum import Floats
 
 
 def light_response(light: Floats, *, half_saturation: float, inhibition: float) -> Floats:

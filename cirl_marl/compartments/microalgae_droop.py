@@ -10,9 +10,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from cirl_marl.compartments.light import light_response
-from cirl_marl.compartments.model import RewardState, check_form, check_not_negative, check_positive
 from cirl_marl.compartments.nutrient import draw_down, substeps
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred (mean return 454; the paper's end
 # at 446 to 473). The light changes the return by no more than 0.1 %.

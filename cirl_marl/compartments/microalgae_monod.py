@@ -10,9 +10,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from cirl_marl.compartments.light import light_response
-from cirl_marl.compartments.model import RewardState, check_form, check_not_negative, check_positive
 from cirl_marl.compartments.nutrient import draw_down, substeps
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[1, 5] µmol/L is inferred: from S = 0 constant darkness
 # returns 103.4, while the paper reports up to 143.1. At S = 1 darkness returns 143.8, I = 75 114.7 and I = 150 95.3,

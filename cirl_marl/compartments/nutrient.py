@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import wrightomega
 
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.rowsum import Floats
 
 NEWTON_STEPS = 6
 """Measured over S 0…10⁴, q 0…10⁶ and t 10⁻⁶…1 d: with the published parameters the fifth step changes S by less than

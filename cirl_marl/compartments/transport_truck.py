@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from cirl_marl.compartments.model import RewardState, check_form, check_not_negative, check_positive
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ s, an episode 0.01 s. x(0) ~ U[0, 500] m is inferred: from 0 the
 # published returns of −1.2·10⁸ are out of reach (the best is −1.99992·10⁸).

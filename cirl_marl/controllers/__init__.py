@@ -1,8 +1,4 @@
-"""Controllers: what maps observations to actions, learnt or not.
-
-``controllers.mpc`` and ``controllers.trained`` are imported by name: the one stands on ``optimum``, which evaluates
-controllers itself, the other loads torch.
-"""
+"""Who acts by rule (neutral, constant, random, scripted, linear-quadratic), and the episodes that come of it."""
 
 from cirl_marl.controllers.basic import Constant, Controller, Neutral, Random
 from cirl_marl.controllers.lqr import LQR, LinearSystem

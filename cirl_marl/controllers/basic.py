@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import ControlError, unknown
-from cirl_marl.vector_env import VectorEnv
 
 Arrays = Mapping[str, NDArray[np.floating]]
 

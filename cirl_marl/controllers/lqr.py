@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from cirl_marl.actuators import Actuators
 from cirl_marl.controllers.basic import Arrays
-from cirl_marl.elements import ControlKind, Law, Role
+from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.environments.actuators import Actuators
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown
-from cirl_marl.flows import FlowLaws
 from cirl_marl.network import Floats, Network
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.network.elements import ControlKind, Law, Role
 
 RANK, DECAY = 1e-9, 1e-7
 """Relative singular value, and rate of decay relative to ‖A‖, below which they count as zero."""
@@ -81,7 +81,7 @@ class LinearSystem:
             raise CirlError(f"'{network.name}' ({network.scenario_name}) {problem}")
         controls = np.repeat(laws.neutral[:, None], 1 + len(acting), axis=1)
         controls[acting] = np.eye(1 + len(acting))[1:]
-        rate, units = laws.rate(controls), np.eye(laws.unit + 1)  # no input, then one unit of each
+        rate, units = laws.rate(controls), np.eye(laws.rows.masses)  # no input, then one unit of each
         A, c = np.split(laws.incidence(laws.flow(units, np.repeat(rate[:, :1], len(units), axis=1)))[:-1], [-1], axis=1)
         B = laws.incidence(laws.flow(units[:, [-1] * len(acting)], rate[:, 1:] - rate[:, :1]))[:-1]
         targets = _targets(network, set_points)

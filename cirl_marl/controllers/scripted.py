@@ -9,10 +9,10 @@ import numpy as np
 
 from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.controllers.basic import Arrays, Constant
-from cirl_marl.elements import Control, ControlKind
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.network.elements import Control, ControlKind
 
 Seen = dict[str, Floats]
 """Observed states of an agent's own model by name, shape (B,) each, in physical units."""

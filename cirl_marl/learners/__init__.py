@@ -1,8 +1,24 @@
-"""Stable-Baselines3 learners, one per agent, learning together in one coupled environment."""
+"""Stable-Baselines3 learners, one per agent, learning together in one coupled environment.
 
-from cirl_marl.learners.launch import resume, train
+What trains loads torch, and does so when it is first asked for: reading a run or a recipe does not.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.run import RunDirectory
-from cirl_marl.learners.training import Progress, Training
+
+if TYPE_CHECKING:
+    from cirl_marl.learners.launch import resume, train
+    from cirl_marl.learners.training import Progress, Training
 
 __all__ = ["Progress", "Recipe", "RunDirectory", "Training", "load_recipe", "resume", "train"]
+
+_HOME = {"Progress": "training", "Training": "training", "resume": "launch", "train": "launch"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

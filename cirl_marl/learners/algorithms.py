@@ -21,9 +21,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from cirl_marl.errors import RecipeError, unknown
 from cirl_marl.learners.central_critic import CentralCriticPolicy
+from cirl_marl.learners.views import CENTRAL_CRITIC
 
 MODULES = ("stable_baselines3", "sb3_contrib")
-CENTRAL_CRITIC = "CentralCriticPolicy"
 POLICIES: Mapping[str, type[BasePolicy]] = {CENTRAL_CRITIC: CentralCriticPolicy}
 """Policies that Stable-Baselines3 has no name for."""
 

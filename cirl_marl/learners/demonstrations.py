@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from cirl_marl.controllers.basic import Arrays
-from cirl_marl.controllers.named import named_controller
 from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.environments.goal import GoalEnv
+from cirl_marl.environments.single import SingleAgentEnv
+from cirl_marl.environments.state import State
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RecipeError
-from cirl_marl.goal_env import GoalEnv
-from cirl_marl.single_env import SingleAgentEnv
-from cirl_marl.state import State
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.optimum.named import named_controller
 
 Act = Callable[[], NDArray[np.float32]]
 """Returns what the controller does now, a row for each row of the learner's environment."""

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from cirl_marl.catalogue import load_network
-from cirl_marl.definition import write_network
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.definitions.reading import write_network
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.recipe import OPTIONS, Recipe, load_recipe
@@ -22,7 +23,6 @@ from cirl_marl.learners.run import RunConfig, RunDirectory
 from cirl_marl.learners.streams import global_streams_claimed
 from cirl_marl.learners.training import Progress, Training
 from cirl_marl.network import Network
-from cirl_marl.vector_env import VectorEnv
 
 
 def train(

@@ -20,16 +20,15 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from cirl_marl.catalogue import recipe_path
-from cirl_marl.definition import read_toml
-from cirl_marl.elements import Moment, Node, Observe, Reward, Role
+from cirl_marl.definitions.catalogue import recipe_path
+from cirl_marl.definitions.mistakes import mistakes_of
+from cirl_marl.definitions.reading import read_toml
+from cirl_marl.definitions.schema import Number
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
-from cirl_marl.learners.algorithms import CENTRAL_CRITIC, algorithm_mistakes, algorithms, has_replay_buffer
-from cirl_marl.learners.views import Scheme, View, view_of
-from cirl_marl.mistakes import mistakes_of
+from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of
 from cirl_marl.network import Network
-from cirl_marl.schema import Number
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
 
 Count = Annotated[int, Field(strict=True, gt=0)]
 Limit = Annotated[Number, Field(gt=0)]
@@ -108,13 +107,19 @@ class Learner(_Table):
 
     def mistakes(self) -> Iterator[str]:
         """Yield what is wrong whatever the network and the number of steps: key, value and what would do."""
+        from cirl_marl.learners.algorithms import algorithm_mistakes
+
         yield from algorithm_mistakes(self.algorithm, self.policy, self.parameters)
         if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
             yield f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true"
 
     def demonstration_mistakes(self, steps: int) -> Iterator[str]:
         """Yield why the algorithm cannot keep its demonstrations, or why a run of ``steps`` has no room for them."""
-        if self.demonstrations is None or self.algorithm not in algorithms():
+        if self.demonstrations is None:
+            return
+        from cirl_marl.learners.algorithms import algorithms, has_replay_buffer
+
+        if self.algorithm not in algorithms():
             return
         if not has_replay_buffer(self.algorithm):
             fit = ", ".join(filter(has_replay_buffer, algorithms()))
@@ -272,6 +277,8 @@ class Recipe(_Table):
 
 def recipe_schema() -> dict[str, Any]:
     """Return the JSON schema of recipe files, with which editors complete and check them."""
+    from cirl_marl.learners.algorithms import algorithms
+
     schema = Recipe.model_json_schema()
     for table in ("Learner", "Match"):
         schema["$defs"][table]["properties"]["algorithm"]["enum"] = list(algorithms())

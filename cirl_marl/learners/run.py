@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -30,41 +29,15 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from cirl_marl.catalogue import load_network
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError, unknown
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe
-from cirl_marl.machine import versions
 from cirl_marl.network import Network
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.records.files import sync, write_atomically, write_json
+from cirl_marl.records.machine import versions
 
 STATES = ("running", "complete", "interrupted", "failed")
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a temporary file, then put it in the place of ``path`` in one step."""
-    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
-    try:
-        write(temporary)
-        _sync(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _sync(path: Path) -> None:
-    """Have a file, or the names in a folder, on the disk before anything else is done."""
-    if os.name == "nt" and path.is_dir():
-        return  # Windows does not open folders
-    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def write_json(path: Path, value: object) -> None:
-    """Write JSON atomically."""
-    write_atomically(path, lambda temporary: temporary.write_text(json.dumps(value, indent=2) + "\n"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -254,10 +227,10 @@ class RunDirectory:
         partial.mkdir(parents=True)
         write(partial)
         for path in (*partial.iterdir(), partial):
-            _sync(path)
+            sync(path)
         shutil.rmtree(folder, ignore_errors=True)
         partial.replace(folder)
-        _sync(folder.parent)
+        sync(folder.parent)
         before = self.status["checkpoint"] if state == "failed" else None
         counts = before or folder.name
         self.set_status(state, int(counts.partition("-")[0]), counts, reason)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn
 
-from cirl_marl.elements import Compartment
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.views import Observation, View
 from cirl_marl.network import Floats
-from cirl_marl.vector_env import VectorEnv
+from cirl_marl.network.elements import Compartment
 
 
 class CopyView:

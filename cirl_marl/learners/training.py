@@ -16,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
+from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
+from cirl_marl.learners.learner import Trainee, derived_seed
 from cirl_marl.learners.lockstep import Interrupted, Lockstep
 from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
-from cirl_marl.learners.trainee import Trainee, derived_seed
-from cirl_marl.vector_env import Infos, VectorEnv
 
 CHECKPOINTS = 10
 """Checkpoints of a run, evenly spaced; a crash loses at most what came after the last."""

@@ -15,12 +15,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.network import Floats
-from cirl_marl.vector_env import VectorEnv
 
 Arrays = Mapping[str, NDArray[np.floating]]
 Observation = NDArray[np.floating] | dict[str, NDArray[np.floating]]
 Scheme = Literal["independent", "shared", "joint"]
+CENTRAL_CRITIC = "CentralCriticPolicy"
+"""Name of the policy whose critic sees the whole state."""
 
 
 class View(ABC):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from cirl_marl.actuators import Actuators
-from cirl_marl.elements import ControlKind, Law
-from cirl_marl.flows import FlowLaws
+from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats
+from cirl_marl.network.elements import ControlKind, Law
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.actuators import Actuators
-from cirl_marl.elements import Arc, Compartment, ControlKind, Law, Node
+from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
-from cirl_marl.flows import FlowLaws
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
 
 MOST_NODES = 1000
 """Nodes of the largest network that is bounded; memory grows with their square, time faster."""

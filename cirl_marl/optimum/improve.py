@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from scipy import optimize, sparse
 
-from cirl_marl.actuators import Actuators
+from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluate import Rollout
 from cirl_marl.network import Floats
-from cirl_marl.optimum.bound import Bound
+from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.plan import achieved
-from cirl_marl.simulate import Dynamics
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
@@ -97,7 +97,7 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     when = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
     done = dynamics.advance(dynamics.extend(flat[:nodes]), inner, actuators.controls(flat[nodes:]), when)
-    outputs = np.concatenate([done.stock[:nodes], done.moved / network.episode.control_interval])
+    outputs = np.concatenate([done.stock[dynamics.rows.nodes], done.moved / network.episode.control_interval])
     shaped = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (shaped[:, :, :-1] - shaped[:, :, -1:]) / shift[:, None]
     return slopes[:, :, :nodes], slopes[:, :, nodes:]

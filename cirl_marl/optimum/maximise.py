@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.catalogue import load_network
+from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.actions import normalised_actions
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bound import Bound, Envelope, check_service, check_stocks
+from cirl_marl.optimum.bounds import Bound, Envelope, check_service, check_stocks
 from cirl_marl.optimum.certificate import verified
 from cirl_marl.optimum.objective import circularity_weights
 from cirl_marl.optimum.program import Program, Programs

@@ -9,12 +9,12 @@ from typing import Protocol
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays
+from cirl_marl.controllers.rollout import Rollout, rollout
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import ControlError
-from cirl_marl.evaluate import Rollout, rollout
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum.bound import Bound
+from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.population import starting_states
-from cirl_marl.vector_env import VectorEnv
 
 SAME = 1e-9
 """Relative difference of starts that count as the same."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from cirl_marl.controllers.basic import Controller
+from cirl_marl.controllers.rollout import EVALUATION_SEEDS
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluate import EVALUATION_SEEDS
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.vector_env import VectorEnv
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ class Population:
 def starting_states(env: VectorEnv) -> Floats:
     """Return the stocks and inner states in which the copies of ``env`` are, shape (copies, rows)."""
     state = env.physical
-    return np.concatenate([state.stock[: len(env.network.nodes)], state.inner]).T
+    return env.rows.start_of(state.stock, state.inner).T
 
 
 def named(env: VectorEnv, starts: Floats) -> dict[str, Floats]:
@@ -117,7 +117,7 @@ def named(env: VectorEnv, starts: Floats) -> dict[str, Floats]:
     Raises:
         CirlError: for another shape.
     """
-    names = env.state_names[: len(env.network.nodes) + len(env.dynamics.inner.names)]
+    names = env.rows.start_names
     if starts.ndim != 2 or starts.shape[1] != len(names):
         raise CirlError(f"initial has shape {starts.shape}, expected (starts, {len(names)})")
     return dict(zip(names, starts.T, strict=True))

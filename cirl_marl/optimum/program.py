@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from cirl_marl.flows import FlowLaws
+from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout, Link, Row, matrix_of, start_of

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
-from cirl_marl.simulate import Dynamics
 
 ROUNDING = 1e-9
 """Relative widening of every bound; rounding errors are far smaller."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cirl_marl.catalogue import recipes
+from cirl_marl.definitions.catalogue import recipes
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.paper.published import ALGORITHMS, BOX_ALGORITHMS, ENVIRONMENTS, GOAL_ALGORITHMS, chosen, environment_of
 from cirl_marl.paper.results import Row

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.errors import RunError
-from cirl_marl.learners.run import write_atomically
+from cirl_marl.records.files import write_atomically
 
 CURVE_POINTS = 500
 WINDOW = 100

@@ -14,8 +14,9 @@ from cirl_marl.paper.evaluation import Report
 from cirl_marl.paper.plan import overview
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Results, Row
+from cirl_marl.paper.running import outdated, run_row
 from cirl_marl.paper.table import environment_table, result_line
-from cirl_marl.paper.training import check_registered, outdated, run_row
+from cirl_marl.paper.training import check_registered
 
 REFRESH_S = 0.2
 

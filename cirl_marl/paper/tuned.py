@@ -18,20 +18,13 @@ from cirl_marl.errors import CirlError, RecipeError
 from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
+from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import Learner
-from cirl_marl.learners.trainee import derived_seed
 from cirl_marl.paper.evaluation import Report, predictor
 from cirl_marl.paper.plan import tuned_recipe
 from cirl_marl.paper.published import PaperEnvironment
 from cirl_marl.paper.results import Row
-from cirl_marl.paper.training import (
-    Trained,
-    Watch,
-    check_registered,
-    described,
-    episodes_of,
-    stopwatch,
-)
+from cirl_marl.paper.training import Trained, Watch, check_registered, described, episodes_of, stopwatch
 
 
 def train_tuned(environment: PaperEnvironment, row: Row, report: Report, recipe: Recipe | None = None) -> Trained:

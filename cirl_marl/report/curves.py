@@ -11,10 +11,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
-from cirl_marl.elements import Law
+from cirl_marl.drawing.style import DASHES, MUTED, SERIES, dressed, save, spoken
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.report.style import DASHES, MUTED, SERIES, dressed, save, spoken
+from cirl_marl.network.elements import Law
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dressed, save, spoken
 from cirl_marl.network import Floats, Network
 from cirl_marl.report.curves import WIDTH
-from cirl_marl.report.style import DASHES, GRID, INK, MUTED, SERIES, dressed, save, spoken
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

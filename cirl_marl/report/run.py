@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from cirl_marl.comparison import compare
+from cirl_marl.controllers.rollout import Rollout, interval_ends
+from cirl_marl.drawing.digraph import save_before_after
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
-from cirl_marl.evaluate import Rollout, interval_ends, summary
-from cirl_marl.learners.run import RunDirectory, write_json
+from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.figures import summary
+from cirl_marl.evaluation.statistics import over_episodes
+from cirl_marl.learners.run import RunDirectory
+from cirl_marl.records.files import write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
-from cirl_marl.report.digraph import save_before_after
-from cirl_marl.statistics import over_episodes
-from cirl_marl.vector_env import VectorEnv
 
 
 def evaluate_run(

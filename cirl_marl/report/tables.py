@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from cirl_marl.elements import Arc, Compartment, ControlKind, Law
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law
 
 
 def networks_table(networks: Mapping[str, Network]) -> Table:

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import mujoco
 import numpy as np
 
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.rowsum import Floats
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 

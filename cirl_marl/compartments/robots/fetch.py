@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.model import RewardState, check_step
 from cirl_marl.compartments.robots.engine import Engine, one_per_thread
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_step
+from cirl_marl.network.rowsum import Floats
 
 with redirect_stderr(StringIO()):  # the package prints a notice about its robot hands, which are not used here
     from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv

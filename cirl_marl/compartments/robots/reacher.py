@@ -9,9 +9,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.model import RewardState, check_step
 from cirl_marl.compartments.robots.engine import Engine, one_per_thread
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_step
+from cirl_marl.network.rowsum import Floats
 
 OBSERVED = (
     "cos_0",

@@ -8,11 +8,11 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.model import RewardState, check_form, check_positive, check_step
 from cirl_marl.compartments.robots.fetch import Fetch
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.errors import CirlError
-from cirl_marl.rowsum import Floats
+from cirl_marl.network.model import RewardState, check_form, check_positive, check_step
+from cirl_marl.network.rowsum import Floats
 
 ROBOTS: dict[str, Fetch | Reacher] = {"fetch": Fetch(), "reacher": Reacher()}
 BOOKS = ("busy", "attempt_step", "done_in_batch", "sorted_now", "missed_now", "complete_now", "key", "attempt")

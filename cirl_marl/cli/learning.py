@@ -1,0 +1,164 @@
+"""``cirl train | evaluate | report | paper``: learning and what came of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cirl_marl.cli.common import Episodes, RunPath, Scenario, Seed, app, console, say, shares, training_bar
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.errors import CirlError
+from cirl_marl.network.elements import OBSERVE, REWARDS
+
+
+@app.command()
+def train(
+    context: typer.Context,
+    network: Annotated[str | None, typer.Argument(metavar="NETWORK", help="Catalogue name or .toml file.")] = None,
+    agents: Annotated[str, typer.Option(help="Learner recipe: catalogue name or .toml file.")] = "independent_ppo",
+    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps, summed over the copies.")] = None,
+    envs: Annotated[int | None, typer.Option(min=1, help="Copies of the environment.")] = None,
+    seed: Seed = 0,
+    scenario: Scenario = None,
+    reward: Annotated[str | None, typer.Option(help=f"{', '.join(REWARDS)}; default: the recipe's.")] = None,
+    observe: Annotated[
+        str | None, typer.Option(help=f"{', '.join(OBSERVE)}; default: the recipe's, else the definition's.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Run directory; default: runs/NETWORK-RECIPE-seedN.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run; with --steps, to so many.")
+    ] = None,
+    episodes: Episodes = 64,
+) -> None:
+    """Train one learner per compartment, all at once, then evaluate them and draw what changed."""
+    from cirl_marl import learners
+
+    if network is None and resume is None:
+        raise CirlError("train needs NETWORK, or --resume RUN")
+    if network is not None and resume is not None:
+        raise CirlError(f"--resume goes on with the network of its run; leave out {network}")
+    if resume is not None:
+        _only_resume(context)
+    directory = resume or out
+    if directory is None:
+        directory = Path("runs") / f"{load_network(str(network)).name}-{Path(agents).stem}-seed{seed}"
+    with training_bar() as report:
+        try:
+            if resume is not None:
+                training = learners.resume(resume, steps=steps, report=report)
+            else:
+                training = learners.train(
+                    str(network),
+                    agents,
+                    directory=directory,
+                    steps=steps,
+                    envs=envs,
+                    seed=seed,
+                    scenario=scenario,
+                    reward=reward,
+                    observe=observe,
+                    report=report,
+                )
+        except KeyboardInterrupt:
+            console.print(f"\nstopped; {_kept(directory)}", soft_wrap=True, highlight=False)
+            raise typer.Exit(130) from None
+    assert training.run is not None
+    _evaluate_and_draw(training.run.path, episodes, 0)
+
+
+@app.command()
+def evaluate(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
+    """Compare the trained policies with neutral and random control on fresh seeds, and with the best possible.
+
+    The gap to the bound is to the highest circularity of any episode from the same start that serves at least as well.
+    """
+    from cirl_marl.learners.run import RunDirectory
+    from cirl_marl.report.run import evaluate_run
+    from cirl_marl.report.tables import evaluation_table, local_returns_table
+
+    with shares() as progress:
+        figures, _, _ = evaluate_run(RunDirectory(run), episodes=episodes, seed=seed, progress=progress)
+    console.print(evaluation_table(figures))
+    console.print(local_returns_table(figures))
+    if "no_bound" in figures:
+        say(f"gap to bound: {figures['no_bound']}")
+
+
+@app.command()
+def report(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
+    """Evaluate a run and draw its pictures anew."""
+    _evaluate_and_draw(run, episodes, seed)
+
+
+@app.command()
+def paper(
+    environment: Annotated[str | None, typer.Argument(metavar="ENV", help="Such as CopperNet; default: all.")] = None,
+    algorithm: Annotated[str | None, typer.Argument(metavar="ALGORITHM", help="Such as A2C; default: all.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; default: the paper's.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many seeds: 0, 1, …")] = 1,
+    recipe: Annotated[str, typer.Option(help="published: the paper's settings; tuned: ours.")] = "published",
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Evaluation episodes; default: 100, where successes count the paper's.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Results, one file a row; a row that is done is not run again.")] = Path(
+        "runs/paper"
+    ),
+) -> None:
+    """Repeat the CiRL paper's training runs, half a day in all, and show their figures beside the published ones."""
+    from cirl_marl.paper.plan import planned
+    from cirl_marl.paper.results import Results
+    from cirl_marl.paper.session import run_session
+
+    rows = planned(environment, algorithm, steps=steps, seeds=seeds, recipe=recipe)
+    try:
+        failed = run_session(rows, Results(out), console, episodes=episodes)
+    except KeyboardInterrupt:
+        message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
+        console.print(message, soft_wrap=True, highlight=False)
+        raise typer.Exit(130) from None
+    if failed:
+        raise typer.Exit(1)
+
+
+def _only_resume(context: typer.Context) -> None:
+    """Refuse options beside --resume: a resumed run keeps its own."""
+    given = [
+        f"--{name}"
+        for name in context.params
+        if name not in ("resume", "network", "episodes", "steps")
+        and getattr(context.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT"
+    ]
+    if given:
+        raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(given)}")
+
+
+def _kept(directory: Path) -> str:
+    """Say what a training that was stopped has left."""
+    from cirl_marl.learners.run import RunDirectory
+
+    run = RunDirectory(directory)
+    if not (directory / "status.json").is_file() or run.status["checkpoint"] is None:
+        return "nothing was learnt yet that could be saved"
+    status, go_on = run.status, f"Go on with: cirl train --resume {directory}"
+    if status["state"] == "interrupted":
+        return f"everything learnt is saved. {go_on}"
+    return f"what was learnt in the first {status['joint_steps'] * run.config.envs:,} steps is saved. {go_on}"
+
+
+def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:
+    from cirl_marl.learners.run import RunDirectory
+    from cirl_marl.report.run import draw_run, evaluate_run
+    from cirl_marl.report.tables import evaluation_table
+
+    run = RunDirectory(directory)
+    with shares() as progress:
+        figures, rollouts, env = evaluate_run(run, episodes=episodes, seed=seed, bounds=False, progress=progress)
+    console.print(evaluation_table(figures))
+    for path in draw_run(run, rollouts, env):
+        say(f"picture: {path}")
+    if not run.metrics()["env_steps"]:
+        needed = run.config.envs * env.network.episode.horizon
+        say(f"no learning curves, as no episode ended: {run.config.envs} copies need {needed:,} steps")
+    say(f"run: {directory}  (figures in evaluation.json; gap to the bound and more: cirl evaluate {directory})")

@@ -1,0 +1,187 @@
+"""What is no mistake in a network but seldom meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Compartment, ControlKind, Law, Role
+from cirl_marl.network.units import factor
+from cirl_marl.network.validate_settings import is_whole
+
+COARSE = 0.01
+"""Share of its largest value by which a state may depend on the step of the solver."""
+
+INTERVALS = 200
+"""Control intervals over which this is looked at."""
+
+SHORT = 20
+"""Control intervals over which the ends of the controls are tried."""
+
+
+def remarks(network: Network) -> Iterator[str]:
+    """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse."""
+    yield from _apart(network)
+    yield from _without_effect(network)
+    yield from _departures(network)
+    yield from _starved(network)
+    yield from _aimless(network)
+    yield from _unpaid(network)
+    yield from _coarse(network)
+
+
+def _apart(network: Network) -> Iterator[str]:
+    """Yield nodes that no arc touches and that have nothing else to do."""
+    touched = {end for arc in network.arcs for end in (arc.donor, arc.recipient)}
+    for node in network.nodes:
+        if node.model is None and node.id not in touched:
+            yield f"node '{node.id}': no arc begins or ends here, so that no mass enters or leaves it"
+
+
+def _without_effect(network: Network) -> Iterator[str]:
+    """Yield valves and pollutants that change nothing."""
+    scaled = {arc.donor for arc in network.arcs if arc.law is not Law.BATCH}
+    for node in network.nodes:
+        if node.control is not None and node.control.kind is ControlKind.RATE and node.id not in scaled:
+            yield f"node '{node.id}': its valve scales no flow, as nothing but batches leaves it"
+    for arc in network.arcs:
+        recipient = network.nodes[network.node_index[arc.recipient]]
+        if not arc.pollutant and recipient.role is not Role.ENVIRONMENT:
+            yield f"arc '{arc.id}': pollutant = false says nothing here, as '{arc.recipient}' is no environment"
+
+
+def _departures(network: Network) -> Iterator[str]:
+    """Yield series and batches that begin after the episode, and batches that a station cannot finish."""
+    interval, horizon = network.episode.control_interval, network.episode.horizon
+    end = f"an episode ends at {horizon * interval:g} {network.time_unit}"
+    for arc in network.arcs:
+        late = [time for time in arc.times if time >= horizon * interval]
+        if late:
+            yield f"arc '{arc.id}': series: {end}, so that what begins at {late[0]:g} {network.time_unit} never comes"
+        recipient = network.nodes[network.node_index[arc.recipient]]
+        batch_kg = getattr(recipient.model, "batch_kg", None)
+        for time, mass in arc.batches:
+            at = f"arc '{arc.id}': batch at {time:g} {network.time_unit}"
+            if round(time / interval) >= horizon:
+                yield f"{at}: {end}, so that it never leaves"
+            if batch_kg is not None and not is_whole(mass * factor(network.mass_unit, "kg") / batch_kg):
+                yield (
+                    f"{at}: {mass:g} {network.mass_unit} are no whole number of batches of {batch_kg:g} kg, as "
+                    f"'{recipient.id}' makes them, so that a part of it waits there"
+                )
+
+
+def _coarse(network: Network) -> Iterator[str]:
+    """Yield what neutral control brings about otherwise with half the solver's step, and controls it cannot follow."""
+    step = network.episode.solver_step
+    if step is None:
+        return
+    try:
+        for action in (-1.0, 1.0):
+            _states(network, action, SHORT)
+        finer = network.with_options(episode={"solver_step": step / 2})
+        shown = [_states(each, None, INTERVALS) for each in (network, finer)]
+    except CirlError as error:
+        yield str(error)
+        return
+    size = np.maximum(np.abs(shown[1]).max(axis=0), 1e-9)
+    apart = np.abs(shown[0] - shown[1]).max(axis=0) / size
+    if (apart > COARSE).any():
+        worst = int(apart.argmax())
+        name = VectorEnv(network, num_envs=1).state_names[worst]
+        yield (
+            f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, neutral control gives another "
+            f"{name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
+        )
+
+
+def _states(network: Network, action: float | None, intervals: int) -> Floats:
+    """Return the states that come of one action of all agents, None being neutral, shape (intervals, states)."""
+    env = VectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    controls = env.dynamics.neutral.copy()
+    if action is not None:
+        acting = [row for agent in env.agents for row in range(*network.control_rows[agent].indices(len(controls)))]
+        controls[acting] = (env.dynamics.control_low if action < 0 else env.dynamics.control_high)[acting]
+    state, rows = env.physical, []
+    with np.errstate(all="ignore"):
+        for step in range(min(network.episode.horizon, intervals)):
+            after = env.dynamics.advance(state.stock, state.inner, controls[:, None], np.array([step]))
+            state = replace(state, stock=after.stock, inner=after.inner)
+            whole = env.rows.start_of(after.stock, after.inner)
+            rows.append(np.concatenate([whole[:, 0], after.stock[env.rows.batches, 0]]))
+    return np.array(rows)
+
+
+def _starved(network: Network) -> Iterator[str]:
+    """Yield exogenous flows that their donors cannot feed under neutral control."""
+    ordered = {k: arc for k, arc in enumerate(network.arcs) if arc.law is Law.EXOGENOUS and any(arc.flow)}
+    if not ordered:
+        return
+    env, interval = VectorEnv(network, num_envs=1), network.episode.control_interval
+    env.reset(seed=0)
+    neutral = {agent: action[None] for agent, action in env.neutral_action.items()}
+    valves = {k: _valve(arc) * _valve(network.nodes[network.node_index[arc.donor]]) for k, arc in ordered.items()}
+    short: dict[int, float] = {}
+    for step in range(min(network.episode.horizon, INTERVALS)):
+        try:
+            env.advance(env.stack(neutral))
+        except CirlError as error:
+            yield str(error)
+            return
+        for k, arc in ordered.items():
+            first = max(0, int(np.searchsorted(arc.times, step * interval, side="right")) - 1)
+            last = max(first, int(np.searchsorted(arc.times, (step + 1) * interval)) - 1)
+            if env.physical.flow[k, 0] < (1 - COARSE) * valves[k] * min(arc.flow[first : last + 1]):
+                short.setdefault(k, step * interval)
+    for k, time in short.items():
+        arc = ordered[k]
+        yield (
+            f"arc '{arc.id}': under neutral control '{arc.donor}' holds too little for its flow from "
+            f"{time:g} {network.time_unit} on; give it a larger initial stock if it stands for the world outside"
+        )
+
+
+def _valve(compartment: Compartment) -> float:
+    """Return by what neutral control multiplies the flows that a compartment scales."""
+    control = compartment.control
+    return control.neutral if control is not None and control.kind is ControlKind.RATE else 1.0
+
+
+def _aimless(network: Network) -> Iterator[str]:
+    """Yield the lack of a service where agents are paid for λ, which is best when nothing flows, and a λ that is 0."""
+    if _paid_for_circularity(network) and network.arcs and not network.sustainability.any():
+        roles = ", ".join(sorted({node.role.value for node in network.nodes}))
+        yield f"λ is always 0, as no arc leaves a reservoir or enters a sink: the roles are {roles}"
+    if _paid_for_circularity(network) and not network.services:
+        reward = network.objective.reward
+        yield f"there is no service, so that agents with reward '{reward}' do best to stop whatever flows"
+
+
+def _unpaid(network: Network) -> Iterator[str]:
+    """Yield services whose shortfall nobody who acts feels.
+
+    A shortfall lowers the local reward of those who owe the service. If none of them acts, or some do not, agents that
+    are paid for λ too are paid for stopping what the service is there to keep up.
+    """
+    if not _paid_for_circularity(network):
+        return
+    for service in network.services:
+        idle = [debtor for debtor in service.debtors if debtor not in network.agents]
+        owed = "owed_by" if service.owed_by else "owed_by is left out, so the provider owes it;"
+        if len(idle) == len(service.debtors):
+            yield (
+                f"service '{service.id}': {owed} {', '.join(idle)}: does not act, so that no agent is paid less when "
+                f"the service fails; agents are {', '.join(network.agents)}"
+            )
+        elif idle:
+            yield f"service '{service.id}': owed_by: {', '.join(idle)} does not act and cannot be paid less"
+
+
+def _paid_for_circularity(network: Network) -> bool:
+    return bool(network.agents) and not network.objective.reward.startswith("local")

@@ -1,0 +1,127 @@
+"""Rollouts of controllers and the figures that compare them: λ̄, circularity gain, service level, local returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cirl_marl.controllers.basic import Controller
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats, Network
+
+EVALUATION_SEEDS = 2**31
+"""First seed of evaluations; training draws its seeds below it, so no evaluated episode was trained on."""
+
+SEED_SPACING = 1_000_000
+"""Distance between the first seeds of two evaluations with different ``seed``, so that they share no episode."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rollout:
+    """One episode of each of B copies under one controller.
+
+    Attributes:
+        circularity: λ at the end of each interval, shape (B, steps), mass.
+        circularity_mean: mean of λ over each interval, shape (B, steps), mass.
+        service: service level, shape (B, steps).
+        local_returns: sum of the local rewards of each agent, shape (agents, B).
+        returns: sum of the rewards of each agent, shape (agents, B).
+        stock: stocks after each interval in the first copy, shape (steps, nodes), mass.
+        flow: mean flows of each interval in the first copy, shape (steps, arcs), mass/time.
+        load: masses that batch arcs hold after each interval in the first copy, shape (steps, batch arcs), mass.
+        inner: inner states after each interval in the first copy, those that an agent may see, shape (steps, states).
+        final_stock: mean over copies of the last stocks, shape (nodes,), mass.
+        mean_flow: mean over copies and time of the flows, shape (arcs,), mass/time.
+    """
+
+    circularity: Floats
+    circularity_mean: Floats
+    service: Floats
+    local_returns: Floats
+    returns: Floats
+    stock: Floats
+    flow: Floats
+    load: Floats
+    inner: Floats
+    final_stock: Floats
+    mean_flow: Floats
+
+    @property
+    def episode_circularity(self) -> Floats:
+        """λ̄ of each episode, shape (B,), mass."""
+        mean: Floats = self.circularity_mean.mean(axis=1)
+        return mean
+
+    @property
+    def episode_service(self) -> Floats:
+        """Mean service level of each episode, shape (B,)."""
+        mean: Floats = self.service.mean(axis=1)
+        return mean
+
+
+def rollout(
+    env: VectorEnv,
+    controller: Controller,
+    *,
+    seed: int = EVALUATION_SEEDS,
+    start: Mapping[str, float] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Rollout:
+    """Run one whole episode in every copy of ``env``.
+
+    Args:
+        env: copy i is reset with ``seed + i``.
+        controller: who acts.
+        seed: first seed; the same seed gives every controller the same start states.
+        start: initial stocks and inner states that are given instead of drawn; see ``VectorEnv.reset``.
+        progress: called with the number of intervals done.
+    """
+    observations = env.reset(seed=seed, options={"initial_state": start or {}})
+    controller.start(env, seed)
+    steps = env.network.episode.horizon
+    shape = (env.num_envs, steps)
+    circularity, mean, service = np.empty(shape), np.empty(shape), np.empty(shape)
+    local = np.zeros((len(env.agents), env.num_envs))
+    returns = np.zeros_like(local)
+    rows = env.rows
+    stock = np.empty((steps, len(env.network.nodes)))
+    flow = np.empty((steps, len(env.network.arcs)))
+    batches, physics = env.dynamics.batches, env.dynamics.inner
+    load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
+    total_flow = np.zeros(len(env.network.arcs))
+    for t in range(steps):
+        outcome = env.advance(env.stack(controller.act(observations)))
+        circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
+        service[:, t] = outcome.service_level
+        local += outcome.local
+        returns += outcome.reward
+        stock[t], flow[t] = env.physical.stock[rows.nodes, 0], outcome.flow[:, 0]
+        load[t], inner[t] = batches.loads(env.physical.stock)[:, 0], env.physical.inner[physics.visible, 0]
+        total_flow += outcome.flow.mean(axis=1)
+        observations = env.by_agent(outcome.observation)
+        if progress is not None:
+            progress(t + 1)
+    final = env.physical.stock[rows.nodes].mean(axis=1)
+    return Rollout(circularity, mean, service, local, returns, stock, flow, load, inner, final, total_flow / steps)
+
+
+def interval_ends(network: Network) -> Floats:
+    """Return the time at which each control interval of an episode ends, shape (steps,)."""
+    ends: Floats = np.multiply(
+        np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64
+    )
+    return ends
+
+
+def first_seed(seed: int) -> int:
+    """Return the seed of the first episode of the evaluation ``seed``.
+
+    Raises:
+        CirlError: if ``seed`` is negative.
+    """
+    if seed < 0:
+        raise CirlError(f"seed must not be negative, got {seed}")
+    return EVALUATION_SEEDS + SEED_SPACING * seed

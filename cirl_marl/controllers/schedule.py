@@ -1,0 +1,137 @@
+"""What a policy or controller does in one episode, as a table of its actions in physical units over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from cirl_marl.controllers.basic import Arrays, Controller
+from cirl_marl.controllers.rollout import EVALUATION_SEEDS, Rollout, first_seed, interval_ends, rollout
+from cirl_marl.environments.actuators import Actuators
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Compartment, ControlKind, Law
+from cirl_marl.records.files import write_atomically, write_table
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """One episode of a policy or controller.
+
+    Attributes:
+        network: under its scenario.
+        header: of the columns, with units.
+        columns: shape (columns, steps).
+        rollout: the episode.
+    """
+
+    network: Network
+    header: tuple[str, ...]
+    columns: Floats
+    rollout: Rollout
+
+    def write(self, path: Path) -> None:
+        """Write a CSV file, whole or not at all; its folder must be there.
+
+        Raises:
+            CirlError: if there is no such folder.
+        """
+        if not path.parent.is_dir():
+            raise CirlError(f"{path}: the folder {path.parent} does not exist")
+        rows = [[f"{value:.10g}" for value in row] for row in self.columns.T]
+        write_atomically(path, lambda partial: write_table(partial, self.header, rows))
+
+
+@dataclass(slots=True)
+class _Recorded:
+    """A controller whose actions are kept."""
+
+    controller: Controller
+    env: VectorEnv
+    actions: list[Floats] = field(default_factory=list)
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        self.controller.start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        actions = self.controller.act(observations)
+        self.actions.append(self.env.stack(actions)[:, 0])
+        return actions
+
+
+def schedule(
+    env: VectorEnv, controller: Controller, *, seed: int | None = None, progress: Callable[[int], None] | None = None
+) -> Schedule:
+    """Run one episode and tabulate it, a row for each control interval.
+
+    Columns are when the interval begins and ends, the value of every control in it, the mass that an agent with a valve
+    lets through, λ at its end and its mean over it, and the service level.
+
+    Args:
+        env: a single copy.
+        controller: who acts.
+        seed: of the evaluation whose first start is taken; None starts from the middle of all initial ranges, with
+            inner states that models draw themselves as the first evaluation draws them.
+        progress: called with the number of intervals done.
+
+    Raises:
+        CirlError: if the controller does not fit the network, nobody acts, or there are several copies.
+    """
+    network = env.network
+    if env.num_envs != 1 or not env.agents:
+        raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
+    middle = {node.id: sum(node.initial) / 2 for node in network.nodes}
+    inner = env.dynamics.inner
+    rows = zip(inner.ranged.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
+    middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}
+    recorded = _Recorded(controller, env)
+    first = EVALUATION_SEEDS if seed is None else first_seed(seed)
+    run = rollout(env, recorded, seed=first, start=middle if seed is None else None, progress=progress)
+    actuators = Actuators(env.dynamics, env.agents, len(recorded.actions))
+    values = actuators.controls(np.array(recorded.actions).T)[actuators.acting]
+    ends = interval_ends(network)
+    columns = [
+        (f"from ({network.time_unit})", ends - network.episode.control_interval),
+        (f"to ({network.time_unit})", ends),
+        *zip(_controls(network, env.agents), values, strict=True),
+        *_throughputs(network, env.agents, run.flow.T),
+        (f"circularity at the end ({network.mass_unit})", run.circularity[0]),
+        (f"mean circularity ({network.mass_unit})", run.circularity_mean[0]),
+        ("service level (1)", run.service[0]),
+    ]
+    header, found = zip(*columns, strict=True)
+    return Schedule(network, header, np.array(found), run)
+
+
+def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
+    """Yield what each entry of the actions sets, with its unit."""
+    for agent in agents:
+        compartment = network.compartments[agent]
+        control = compartment.control
+        assert control is not None
+        if control.kind is ControlKind.FLOW:
+            yield f"{agent}: flow ordered ({network.mass_unit}/{network.time_unit})"
+        elif control.kind is ControlKind.RATE:
+            yield f"{agent}: valve factor (1)"
+        else:
+            yield from (f"{agent}: {name}" for name in _inputs(compartment))
+
+
+def _inputs(compartment: Compartment) -> tuple[str, ...]:
+    assert compartment.model is not None
+    return tuple(compartment.model.input_names)  # they end in their unit
+
+
+def _throughputs(network: Network, agents: tuple[str, ...], flow: Floats) -> Iterator[tuple[str, Floats]]:
+    """Yield what the agents let through, shape (steps,) each: an arc its flow, a node what leaves it but in batches."""
+    unit = f"{network.mass_unit}/{network.time_unit}"
+    steady = np.array([arc.law is not Law.BATCH for arc in network.arcs], dtype=bool)
+    for agent in agents:
+        if agent in network.arc_index:
+            yield f"{agent}: flow ({unit})", flow[network.arc_index[agent]]
+        elif (leaving := steady & (network.donors == network.node_index[agent])).any():
+            yield f"{agent}: total outflow ({unit})", flow[leaving].sum(axis=0)

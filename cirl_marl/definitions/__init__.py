@@ -1,0 +1,1 @@
+"""Networks as TOML files: reading, writing, the catalogue, and mistakes in the words of the file."""

@@ -1,0 +1,184 @@
+"""From a TOML definition to a ``Network``, naming every mistake by file and key."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import hashlib
+import tomllib
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from cirl_marl.definitions.conversion import Converter
+from cirl_marl.definitions.mistakes import choices, mistakes_of, toml_mistake
+from cirl_marl.definitions.schema import NetworkTable
+from cirl_marl.errors import DefinitionError, NetworkError, unknown
+from cirl_marl.network import Network
+
+
+def read_network(path: Path) -> Network:
+    """Read a definition file; the other scenarios hang on the returned default network.
+
+    Raises:
+        DefinitionError: with every mistake in the file; nothing is returned half-read.
+    """
+    document = read_toml(path)
+    source_sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    overrides = document.get("scenarios", {})
+    if not isinstance(overrides, dict) or not all(isinstance(o, dict) for o in overrides.values()):
+        raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
+    mistakes: list[str] = []
+    networks: dict[str, Network] = {}
+    if "default" in overrides:
+        mistakes.append("scenarios.default: the default scenario is what stands outside [scenarios]")
+    for name, override in {"default": {}, **{k: v for k, v in overrides.items() if k != "default"}}.items():
+        where = "" if name == "default" else f"scenarios.{name}."
+        strangers = list(_strangers(document, override, where))
+        mistakes += strangers
+        if strangers:
+            continue
+        try:
+            told = {key: value for key, value in override.items() if key != "without"}
+            networks[name] = _build(_merge(_without(document, override), told), name)
+        except NetworkError as error:
+            mistakes += [where + problem for problem in error.problems]
+            if name == "default":
+                break  # the scenarios would only repeat these
+    if mistakes:
+        raise DefinitionError(str(path), mistakes)
+    for network in networks.values():
+        others = {name: other for name, other in networks.items() if other is not network}
+        object.__setattr__(network, "scenarios", others)
+        object.__setattr__(network, "source", path)
+        object.__setattr__(network, "source_sha256", source_sha256)
+    return networks["default"]
+
+
+def write_network(network: Network, path: Path) -> None:
+    """Write a network built in Python as a definition file; its other scenarios are not written."""
+    from cirl_marl.definitions.writing import definition_of
+
+    path.write_text(definition_of(network), encoding="utf-8")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        DefinitionError: if it is missing, unreadable or not TOML (with line and column).
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise DefinitionError(str(path), ["no such file"]) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise DefinitionError(str(path), [f"cannot be read: {error}"]) from error
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise DefinitionError(str(path), [toml_mistake(error, text)]) from error
+
+
+def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with the tables of ``override`` laid over it, key by key, where they do not take its place."""
+    merged = {key: value for key, value in base.items() if key != "scenarios"}
+    for key, value in override.items():
+        old = merged.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping) and not _takes_its_place(value, old):
+            merged[key] = _merge(old, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
+    """Whether a scenario's table replaces the old one whole: a quantity, or a model or control of another kind."""
+    kind = old.get("kind")
+    if isinstance(kind, str):
+        return bool(new.get("kind", kind) != kind)
+    return isinstance(old.get("source"), str)
+
+
+def _without(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy of ``document`` less the tables at the dotted paths in ``override["without"]``, which exist."""
+    kept = copy.deepcopy(dict(document))
+    for path in override.get("without", []):
+        *parents, last = path.split(".")
+        table = kept
+        for key in parents:
+            table = table[key]
+        del table[last]
+    return kept
+
+
+def _lost(document: Mapping[str, Any], paths: Any, where: str) -> typing.Iterator[str]:
+    """Yield what is wrong with the dotted paths of a scenario's ``without``."""
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        yield f"{where}without: must be a list of dotted paths, such as ['nodes.digester.model']"
+        return
+    if len(set(paths)) != len(paths):
+        yield f"{where}without: names a path twice"
+    for path in paths:
+        for other in paths:
+            if path.startswith(f"{other}."):
+                yield f"{where}without: '{path}' lies in '{other}', which goes as a whole"
+        table: Any = document
+        for key in path.split("."):
+            if not isinstance(table, Mapping) or key not in table:
+                known = list(table) if isinstance(table, Mapping) else []
+                yield f"{where}without: '{path}': {unknown('key', key, known)}"
+                break
+            table = table[key]
+
+
+def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> typing.Iterator[str]:
+    """Yield the compartments and services that a scenario names but the network does not have."""
+    yield from _lost(document, override.get("without", []), where)
+    for table in ("nodes", "arcs", "services"):
+        known = document.get(table, {})
+        given = override.get(table, {})
+        if not isinstance(given, Mapping) or not isinstance(known, Mapping):
+            yield f"{where}{table}: must be a table"
+            continue
+        for name in given:
+            if name not in known:
+                yield f"{where}{table}: {unknown(table[:-1], name, known)}"
+    for key in ("name", "scenarios"):
+        if key in override:
+            yield f"{where}{key}: a scenario cannot set it"
+
+
+def _build(document: Mapping[str, Any], scenario: str) -> Network:
+    name = str(document.get("name", "?"))
+    try:
+        table = NetworkTable.model_validate(document)
+    except ValidationError as error:
+        mistakes = mistakes_of(error, NetworkTable)
+        raise NetworkError(name, [*mistakes, *_further_mistakes(document, error, scenario)]) from None
+    return Converter(table).network(scenario)
+
+
+def _further_mistakes(document: Mapping[str, Any], error: ValidationError, scenario: str) -> list[str]:
+    """Look for mistakes behind the given ones, with misspelt values mended and unknown keys left out."""
+    mended = copy.deepcopy(dict(document))
+    for item in error.errors():
+        *path, last = [part for part in item["loc"] if part != "[key]"]
+        table: Any = mended
+        for part in path:
+            table = table[part]
+        if item["type"] == "extra_forbidden":
+            del table[last]
+        elif item["type"] in ("enum", "literal_error"):
+            valid = choices(str(item["ctx"]["expected"]))
+            table[last] = next(iter(difflib.get_close_matches(str(item["input"]), valid, n=1)), valid[0])
+        else:
+            return []
+    try:
+        _build(mended, scenario)
+    except NetworkError as further:
+        return list(further.problems)
+    return []

@@ -1,0 +1,98 @@
+"""The plan of a network's picture: places, courses and names, computed once for each structure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from cirl_marl.drawing.places import Pitch, place
+from cirl_marl.drawing.routing import LABEL, Routes, route
+from cirl_marl.drawing.style import spoken
+from cirl_marl.network import Floats, Network
+
+LABELLED_NODES = 60
+"""Largest network drawn with boxes and labels."""
+LABELLED_ARCS = 200
+LINE_LETTERS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where everything of one network goes, in em.
+
+    Attributes:
+        positions: centres of the nodes, shape (nodes, 2).
+        routes: courses of the arcs; None for networks too large to label.
+        box: width and height of a node.
+        names: label of each node, in lines.
+    """
+
+    positions: Floats
+    routes: Routes | None
+    box: Floats
+    names: tuple[tuple[str, ...], ...]
+
+    def extent(self) -> tuple[Floats, Floats]:
+        """Return the lower left and upper right corner of all that is drawn."""
+        places, half, label = self.positions, self.box / 2 + 0.3, LABEL / 2
+        if self.routes is None:
+            margin = 0.04 * np.ptp(places, axis=0) + 1
+            return places.min(axis=0) - margin, places.max(axis=0) + margin
+        labels = self.routes.labels
+        corners = [
+            places - half,
+            places + half,
+            self.routes.curves.reshape(-1, 2),
+            labels - label,
+            labels + label,
+        ]
+        points = np.concatenate(corners)
+        return points.min(axis=0), points.max(axis=0)
+
+
+def layout_of(network: Network, aspect: float) -> Layout:
+    """Return the layout of ``network`` for pictures of about this width over height."""
+    return _layout(_Structure(network), round(2 * aspect) / 2 or 0.5)
+
+
+class _Structure:
+    """A network that equals every other with the same nodes, arcs and roles, whatever its numbers."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self._key = (
+            tuple((node.id, node.role) for node in network.nodes),
+            tuple((arc.donor, arc.recipient) for arc in network.arcs),
+        )
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Structure) and self._key == other._key
+
+
+@lru_cache(maxsize=16)
+def _layout(structure: _Structure, aspect: float) -> Layout:
+    network = structure.network
+    names = tuple(_lines(node.id) for node in network.nodes)
+    letters = max(len(line) for name in names for line in name)
+    box = np.array([max(5.5, 0.62 * letters + 1.0), 1.2 * (max(map(len, names)) + 1) + 0.6])
+    positions = place(network, Pitch(box[0] + 4.8, box[1] + 3.7), aspect)
+    labelled = len(network.nodes) <= LABELLED_NODES and len(network.arcs) <= LABELLED_ARCS
+    routes = route(positions, network.donors, network.recipients, box) if labelled else None
+    return Layout(positions, routes, box, names)
+
+
+def _lines(identifier: str) -> tuple[str, ...]:
+    """Break an id into lines at its spaces."""
+    lines = [""]
+    for word in spoken(identifier).split():
+        joined = f"{lines[-1]} {word}".strip()
+        if len(joined) <= LINE_LETTERS or not lines[-1]:
+            lines[-1] = joined
+        else:
+            lines.append(word)
+    return tuple(lines)

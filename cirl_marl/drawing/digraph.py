@@ -1,0 +1,133 @@
+"""Pictures of a material network: as a file, two side by side, or frame by frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cirl_marl.drawing.picture import draw_network, largest_flow, legend_of
+from cirl_marl.drawing.style import number, save, spoken
+from cirl_marl.drawing.window import Window
+from cirl_marl.network import Floats, Network
+
+__all__ = ["Canvas", "draw_network", "save_before_after", "save_network"]
+
+FRAME_INCHES = (9.0, 6.2)
+FRAME_DPI = 100
+
+
+class Canvas:
+    """Draws one network again and again, for ``render()``; the picture depends on what is drawn alone.
+
+    Arrows are as wide as their flow relative to the largest reference flow of the network, or to the largest
+    flow of the frame if that is larger still.
+    """
+
+    def __init__(self, network: Network, *, window: bool) -> None:
+        """Prepare the picture.
+
+        Args:
+            network: what to draw.
+            window: whether to show each picture in a window too.
+
+        Raises:
+            CirlError: if a window is wanted and pygame is not installed.
+        """
+        self._network = network
+        self._window = Window(spoken(network.name)) if window else None
+        self._reference = max((arc.scale for arc in network.arcs), default=0.0)
+        self._figure = Figure(figsize=FRAME_INCHES, dpi=FRAME_DPI, facecolor="white")
+        self._agg = FigureCanvasAgg(self._figure)
+        self._axes = self._figure.add_axes((0.01, 0.01, 0.98, 0.87))
+
+    def draw(self, stock: Floats, flow: Floats, time: float, circularity: float | None = None) -> NDArray[np.uint8]:
+        """Return the picture, shape (height, width, 3), and show it if there is a window.
+
+        Args:
+            stock: stocks, shape (nodes,), mass.
+            flow: flows, shape (arcs,), mass/time.
+            time: time of the stocks, for the heading.
+            circularity: λ, mass; see ``draw_network``.
+        """
+        network = self._network
+        reference = max(self._reference, largest_flow(flow))
+        title = f"{spoken(network.name)}, {network.time_unit} {number(time)}"
+        draw_network(self._axes, network, stock, flow, title=title, circularity=circularity, reference_flow=reference)
+        self._agg.draw()  # type: ignore[no-untyped-call]
+        pixels = np.asarray(self._agg.buffer_rgba())  # type: ignore[no-untyped-call]
+        image: NDArray[np.uint8] = pixels[..., :3].copy()
+        if self._window is not None:
+            self._window.show(image)
+        return image
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+
+
+def save_network(
+    path: str | Path,
+    network: Network,
+    stock: Floats,
+    flow: Floats,
+    title: str = "",
+    circularity: float | None = None,
+) -> Path:
+    """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide.
+
+    Args:
+        path: file to write; its folder is made.
+        network: the network.
+        stock: stocks, shape (nodes,), mass.
+        flow: flows, shape (arcs,), mass/time.
+        title: heading; empty takes that of the network.
+        circularity: λ, mass; see ``draw_network``.
+
+    Returns:
+        The path.
+
+    Raises:
+        CirlError: if an array has the wrong shape.
+    """
+    figure = Figure(figsize=FRAME_INCHES)
+    axes = figure.add_axes((0.01, 0.01, 0.98, 0.87))
+    draw_network(axes, network, stock, flow, title=title, circularity=circularity)
+    return save(figure, path)
+
+
+def save_before_after(
+    path: str | Path,
+    network: Network,
+    before: tuple[Floats, Floats],
+    after: tuple[Floats, Floats],
+    labels: tuple[str, str] = ("before", "after"),
+    circularity: tuple[float | None, float | None] = (None, None),
+) -> Path:
+    """Save two states of one network side by side, with arrows at the same scale.
+
+    Args:
+        path: file to write; its folder is made.
+        network: the network.
+        before: stocks, shape (nodes,), and flows, shape (arcs,).
+        after: the same, later or under other control.
+        labels: headings of the two.
+        circularity: λ of the two, mass; see ``draw_network``.
+
+    Returns:
+        The path.
+
+    Raises:
+        CirlError: if an array has the wrong shape.
+    """
+    figure = Figure(figsize=(9.0, 5.6))
+    reference = max(largest_flow(np.asarray(flow)) for _, flow in (before, after))
+    for column, ((stock, flow), label, value) in enumerate(zip((before, after), labels, circularity, strict=True)):
+        axes = figure.add_axes((0.005 + 0.5 * column, 0.1, 0.49, 0.78))
+        draw_network(axes, network, stock, flow, title=label, circularity=value, reference_flow=reference, legend=False)
+    figure.legend(**legend_of(network), loc="lower center", ncols=3)
+    return save(figure, path)

@@ -1,0 +1,230 @@
+"""Drawing the digraph of a material network, with its stocks and flows, on axes."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
+from matplotlib.patheffects import withStroke
+
+from cirl_marl.drawing.arrangement import Layout, layout_of
+from cirl_marl.drawing.routing import Routes, bezier
+from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, ROLE_NAMES, WARNING, number, spoken
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Law, Role
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LARGEST_EM = 14.0
+"""Largest font of a digraph, points."""
+WIDEST = 1.0
+"""Width of the arrow that carries the reference flow, em."""
+BROADEST = 1.25
+"""Largest width of an arrow, relative to that."""
+
+
+def draw_network(
+    axes: Axes,
+    network: Network,
+    stock: Floats,
+    flow: Floats,
+    *,
+    title: str = "",
+    circularity: float | None = None,
+    reference_flow: float | None = None,
+    legend: bool = True,
+) -> None:
+    """Draw the digraph with its stocks and flows.
+
+    A box is filled to stock / (stock + scale), half at the node's reference stock. The width of an arrow is
+    proportional to its flow. Arrows that lower the circularity are vermilion, those that raise it green; those of
+    parallel arcs bear their names.
+    Networks of more than 60 nodes or 200 arcs are drawn without labels.
+
+    Args:
+        axes: where to draw; what they show is cleared.
+        network: the network.
+        stock: stocks, shape (nodes,), mass.
+        flow: flows, shape (arcs,), mass/time.
+        title: heading.
+        circularity: λ, mass, which is written below it; None takes that of ``flow``, and writes none where batches
+            move, of which the flows know nothing.
+        reference_flow: flow of the widest arrow, mass/time; None: the largest of ``flow``. Pictures with
+            the same reference compare.
+        legend: whether to explain the colours below the digraph.
+
+    Raises:
+        CirlError: if an array has the wrong shape.
+    """
+    stock, flow = _checked("stock", stock, len(network.nodes)), _checked("flow", flow, len(network.arcs))
+    reference = largest_flow(flow) if reference_flow is None else reference_flow
+    share = np.clip(np.nan_to_num(np.abs(flow)) / max(reference, 1e-12), 0, BROADEST)
+    width, height = _inches(axes)
+    layout = layout_of(network, width / height)
+    axes.clear()
+    axes.set_axis_off()
+    em = _frame(axes, layout, legend)
+    if layout.routes is None:
+        _draw_dots(axes, network, layout, stock, share, em)
+    else:
+        _draw_arrows(axes, network, layout.routes, flow, share, em)
+        _draw_boxes(axes, network, layout, stock, em)
+    if circularity is None and all(arc.law is not Law.BATCH for arc in network.arcs):
+        with np.errstate(invalid="ignore"):  # flows that overflowed are shown as they are
+            circularity = float(network.circularity(flow))
+    _write_title(axes, network, circularity, title)
+    if legend:
+        axes.legend(**legend_of(network), loc="lower center", ncols=3)
+
+
+def largest_flow(flow: Floats) -> float:
+    """Return the largest finite |f|, mass/time; 0 if there is none."""
+    return float(np.abs(flow, where=np.isfinite(flow), out=np.zeros(flow.shape)).max(initial=0.0))
+
+
+def legend_of(network: Network) -> dict[str, Any]:
+    """Return handles and look of the legend that explains the colours that ``network`` uses."""
+    roles = dict.fromkeys(node.role for node in sorted(network.nodes, key=lambda n: list(Role).index(n.role)))
+    patches: dict[str, str] = {}
+    for role in roles:
+        colour = ROLE_COLOURS[role]
+        patches[colour] = f"{patches[colour]}, {ROLE_NAMES[role]}" if colour in patches else ROLE_NAMES[role]
+    sign = network.sustainability
+    arrows = {WARNING: "flow that lowers λ", GOOD: "flow that raises λ", NEUTRAL: "other flow"}
+    used = {WARNING: (sign > 0).any(), GOOD: (sign < 0).any(), NEUTRAL: (sign == 0).any()}
+    patches |= {colour: label for colour, label in arrows.items() if used[colour]}
+    handles = [Patch(facecolor=colour, label=label) for colour, label in patches.items()]
+    return {"handles": handles, "frameon": False, "fontsize": 8, "labelcolor": MUTED, "handlelength": 1.2}
+
+
+def _checked(name: str, values: Floats, count: int) -> Floats:
+    found = np.asarray(values, dtype=float)
+    if found.shape != (count,):
+        raise CirlError(f"{name} has shape {found.shape}, expected {(count,)}")
+    return found
+
+
+def _inches(axes: Axes) -> tuple[float, float]:
+    """Width and height of the axes."""
+    return axes.bbox.width / axes.figure.dpi, axes.bbox.height / axes.figure.dpi
+
+
+def _frame(axes: Axes, layout: Layout, legend: bool) -> float:
+    """Set limits in em around the digraph and return the size of one em in points."""
+    low, high = layout.extent()
+    width, height = (72 * inches for inches in _inches(axes))
+    strip = 30.0 if legend else 4.0
+    em = min(width / (high[0] - low[0] + 1), (height - strip) / (high[1] - low[1] + 1))
+    em = float(min(em, LARGEST_EM) if layout.routes is not None else em)
+    middle = (low + high) / 2
+    axes.set_xlim(middle[0] - width / em / 2, middle[0] + width / em / 2)
+    bottom = middle[1] - (height + strip) / em / 2
+    axes.set_ylim(bottom, bottom + height / em)
+    return em
+
+
+def _colours(network: Network) -> list[str]:
+    return [WARNING if sign > 0 else GOOD if sign < 0 else NEUTRAL for sign in network.sustainability]
+
+
+def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, share: Floats, em: float) -> None:
+    colours = _colours(network)
+    shapes = [
+        _arrow(curve if value >= 0 else curve[::-1], WIDEST * size)
+        for curve, value, size in zip(routes.curves, flow, share, strict=True)
+    ]
+    axes.add_collection(
+        PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.4, zorder=2),
+        autolim=False,
+    )
+    halo = [withStroke(linewidth=0.25 * em, foreground="white")]
+    ends = Counter((arc.donor, arc.recipient) for arc in network.arcs)
+    for arc, (x, y), value, colour in zip(network.arcs, routes.labels, flow, colours, strict=True):
+        ink = MUTED if colour is NEUTRAL else colour
+        parallel = ends[arc.donor, arc.recipient] > 1
+        label = f"{spoken(arc.id)}\n{number(value)}" if parallel else number(value)
+        axes.text(x, y, label, color=ink, fontsize=(0.8 if parallel else 0.95) * em, ha="center", va="center",
+                  zorder=5, path_effects=halo)  # fmt: skip
+
+
+def _arrow(curve: Floats, width: float) -> Floats:
+    """Return the outline of an arrow along ``curve``, shape (points, 2); it never gets too thin to see."""
+    width = max(width, 0.09)
+    head, flare = 0.55 + 0.55 * width, 0.3 + 0.75 * width
+    length = np.hypot(*np.diff(curve, axis=0).T)
+    left = np.concatenate([np.cumsum(length[::-1])[::-1], [0.0]])
+    shaft = curve[left >= min(head, 0.6 * left[0])]
+    along = np.gradient(shaft, axis=0) if len(shaft) > 1 else curve[-1:] - curve[:1]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+    tip, neck, across = curve[-1], shaft[-1], normal[-1]
+    sides = shaft + normal * width / 2, shaft - normal * width / 2
+    return np.concatenate([sides[0], [neck + across * flare, tip, neck - across * flare], sides[1][::-1]])
+
+
+def _draw_boxes(axes: Axes, network: Network, layout: Layout, stock: Floats, em: float) -> None:
+    width, height = layout.box
+    for node, (x, y), amount, name in zip(network.nodes, layout.positions, stock, layout.names, strict=True):
+        corner, colour = (x - width / 2, y - height / 2), ROLE_COLOURS[node.role]
+        look = f"round,pad=0,rounding_size={0.5}"
+        axes.add_patch(FancyBboxPatch(corner, width, height, look, fc=_tint(colour, 0.25), ec="none", zorder=3))
+        level = Rectangle(corner, width, height * _fill(amount, node.scale), fc=colour, ec="none", zorder=3.1)
+        axes.add_patch(level)
+        edge = FancyBboxPatch(corner, width, height, look, fc="none", ec=_darker(colour), lw=0.1 * em, zorder=3.2)
+        axes.add_patch(edge)
+        level.set_clip_path(edge)
+        top = y + 0.6 * len(name)
+        for line, text in enumerate((*name, f"{number(amount)} {network.mass_unit}")):
+            bold = "bold" if line < len(name) else "normal"
+            axes.text(x, top - 1.2 * line, text, color=INK, fontsize=0.95 * em, fontweight=bold, ha="center",
+                      va="center", zorder=4)  # fmt: skip
+
+
+def _fill(amount: float, scale: float) -> float:
+    """Share of a box that a stock fills: 0 without stock or for one that is no number, half at ``scale``."""
+    held = max(amount, 0.0) if math.isfinite(amount) else 0.0
+    return held / (held + scale)
+
+
+def _tint(colour: str, share: float) -> str:
+    """Mix a colour with white."""
+    return "#" + "".join(f"{round(255 - share * (255 - int(colour[i : i + 2], 16))):02x}" for i in (1, 3, 5))
+
+
+def _darker(colour: str) -> str:
+    return "#" + "".join(f"{int(colour[i : i + 2], 16) * 6 // 10:02x}" for i in (1, 3, 5))
+
+
+def _draw_dots(axes: Axes, network: Network, layout: Layout, stock: Floats, share: Floats, em: float) -> None:
+    """Draw a large network: dots whose area shows the stock, bent lines whose width shows the flow."""
+    ends = layout.positions[network.donors], layout.positions[network.recipients]
+    # Arcs that count towards λ come last, on top of the others.
+    colours, order = _colours(network), np.argsort(np.abs(network.sustainability), kind="stable")
+    lines = bezier(*ends, np.full(len(network.arcs), 0.12), 12)
+    thickest = min(2.5, 40 / math.sqrt(len(network.arcs)))
+    collection = LineCollection(
+        list(lines[order]),
+        colors=[colours[k] for k in order],
+        linewidths=np.clip(thickest * share[order], 0.15, None),
+        alpha=0.6,
+    )
+    axes.add_collection(collection, autolim=False)
+    fill = np.array([_fill(amount, node.scale) for amount, node in zip(stock, network.nodes, strict=True)])
+    area = (0.6 * em * layout.box[1]) ** 2 * (0.15 + 0.85 * fill)
+    faces = [ROLE_COLOURS[node.role] for node in network.nodes]
+    edges = [_darker(face) for face in faces]
+    x, y = layout.positions.T
+    axes.scatter(x, y, s=np.maximum(area, 4.0), c=faces, edgecolors=edges, linewidths=0.4, zorder=3)
+
+
+def _write_title(axes: Axes, network: Network, circularity: float | None, title: str) -> None:
+    heading = title or network.title or spoken(network.name)
+    below = "" if circularity is None else f"λ = {number(circularity)} {network.mass_unit}    "
+    below += f"flows in {network.mass_unit}/{network.time_unit}"
+    axes.text(0.5, 1.075, heading, transform=axes.transAxes, fontsize=11, fontweight="bold", color=INK, ha="center")
+    axes.text(0.5, 1.02, below, transform=axes.transAxes, fontsize=9.5, color=MUTED, ha="center")

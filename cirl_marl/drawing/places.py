@@ -1,0 +1,264 @@
+"""Where the compartments of a digraph go: small networks by search on a grid, large ones in layers.
+
+Everything here is deterministic: the same network gives the same places.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import SINKS, Role
+
+SEARCHED_NODES = 24
+"""Largest network whose places are searched for."""
+SEARCHED_EDGES = 72
+"""Largest number of connected pairs for which they are."""
+RESTARTS = 6
+STRETCH = 1.6
+
+
+@dataclass(frozen=True, slots=True)
+class Pitch:
+    """Distance between the centres of neighbouring places, in em."""
+
+    across: float
+    down: float
+
+
+def place(network: Network, pitch: Pitch, aspect: float) -> Floats:
+    """Return the centre of each node, in em.
+
+    Args:
+        network: whose nodes are placed.
+        pitch: distance between neighbouring places.
+        aspect: width over height that the picture should have.
+
+    Returns:
+        Positions (x to the right, y upwards), shape (nodes, 2).
+    """
+    layers = layered(network, pitch, aspect)
+    edges = np.unique(np.sort(np.stack([network.donors, network.recipients], axis=1), axis=1), axis=0)
+    small = 2 < len(network.nodes) <= SEARCHED_NODES and len(edges) <= SEARCHED_EDGES
+    cells = _Search(network, edges, pitch, aspect).best(layers) if small else layers
+    cells = _without_gaps(cells)
+    positions: Floats = cells * _stretched(cells, pitch, aspect) * np.array([1.0, -1.0])
+    return positions
+
+
+def _stretched(cells: Floats, pitch: Pitch, aspect: float) -> Floats:
+    """Return the pitch widened, at most by ``STRETCH``, so that the cells fill a picture of this aspect."""
+    columns, rows = np.ptp(cells, axis=0) + 1
+    wide, high = columns * pitch.across, rows * pitch.down
+    down = pitch.down * min(max(wide / aspect / high, 1.0), STRETCH)
+    across = pitch.across * min(max(high * aspect / wide, 1.0), STRETCH)
+    return np.array([across, down])
+
+
+def depths(network: Network) -> Integers:
+    """Return the number of arcs from the nearest reservoir or source to each node, shape (nodes,)."""
+    outgoing: list[list[int]] = [[] for _ in network.nodes]
+    entered = set(network.recipients.tolist())
+    for donor, recipient in zip(network.donors.tolist(), network.recipients.tolist(), strict=True):
+        outgoing[donor].append(recipient)
+    reservoirs = [i for i, node in enumerate(network.nodes) if node.role is Role.NONRENEWABLE_RESERVOIR]
+    sources = [i for i in range(len(network.nodes)) if i not in entered]
+    depth = np.full(len(network.nodes), -1, dtype=np.intp)
+    _flood(dict.fromkeys(reservoirs + sources), outgoing, depth)
+    for start in range(len(network.nodes)):
+        # What no source reaches hangs on a cycle: its first node counts as a source.
+        if depth[start] < 0:
+            _flood([start], outgoing, depth)
+    for i, node in enumerate(network.nodes):
+        if node.role in SINKS and node.role is not Role.ENVIRONMENT and not outgoing[i]:
+            depth[i] = depth.max()
+    return depth
+
+
+def _flood(starts: Iterable[int], outgoing: list[list[int]], depth: Integers) -> None:
+    """Write the depth of all that ``starts`` reach, where it is not known yet."""
+    queue = deque(starts)
+    depth[list(queue)] = 0
+    while queue:
+        node = queue.popleft()
+        for after in outgoing[node]:
+            if depth[after] < 0:
+                depth[after] = depth[node] + 1
+                queue.append(after)
+
+
+def layered(network: Network, pitch: Pitch, aspect: float) -> Floats:
+    """Return cells (column, row) with the nodes ordered by depth and, within a depth, by their neighbours."""
+    depth = depths(network)
+    count = len(depth)
+    height = np.zeros(count)
+    levels = np.split(np.argsort(depth, kind="stable"), np.cumsum(np.bincount(depth))[:-1])
+    for level in levels:
+        _spread(height, level)
+    neighbours = np.bincount(network.donors, minlength=count) + np.bincount(network.recipients, minlength=count)
+    for _ in range(4):
+        total = np.bincount(network.donors, height[network.recipients], count)
+        total += np.bincount(network.recipients, height[network.donors], count)
+        height = total / np.maximum(neighbours, 1)
+        for level in levels:
+            _spread(height, level)
+    rows = max(1, math.ceil(math.sqrt(count * pitch.across / (aspect * pitch.down))))
+    return _in_columns(depth, height, rows)
+
+
+def _spread(height: Floats, members: Integers) -> None:
+    """Put the members of a layer at equal distances in (-1, 1), in the order of their height."""
+    order = members[np.argsort(height[members], kind="stable")]
+    height[order] = (2 * np.arange(len(order)) + 1) / len(order) - 1 if len(order) else 0.0
+
+
+def _in_columns(depth: Integers, height: Floats, rows: int) -> Floats:
+    """Fill columns of at most ``rows`` cells; thin layers share columns, up and down in turn."""
+    order = np.lexsort((height, depth))
+    folded = int(depth.max()) + 1 > 2 * math.ceil(len(depth) / rows)
+    groups = [order] if folded else [order[depth[order] == level] for level in range(int(depth.max()) + 1)]
+    cells = np.zeros((len(depth), 2))
+    column = 0
+    for group in groups:
+        for part in np.array_split(group, math.ceil(len(group) / rows)) if len(group) else []:
+            row = np.arange(len(part)) + (0.0 if folded else (rows - len(part)) / 2)
+            if folded and column % 2:
+                row = len(part) - 1 - row
+            cells[part, 0], cells[part, 1] = column, row
+            column += 1
+    return cells
+
+
+def _without_gaps(cells: Floats) -> Floats:
+    """Close empty rows and columns."""
+    return np.stack([np.unique(cells[:, axis], return_inverse=True)[1] for axis in (0, 1)], axis=1).astype(float)
+
+
+class _Search:
+    """Coordinate descent over the cells of a grid: short, uncrossed arcs, reservoirs left and sinks right."""
+
+    def __init__(self, network: Network, edges: Integers, pitch: Pitch, aspect: float) -> None:
+        count = len(network.nodes)
+        self._edges, self._count = edges, count
+        places = 1.5 * count
+        self._columns = max(3, round(math.sqrt(places * aspect * pitch.down / pitch.across)))
+        self._rows = max(2, math.ceil(places / self._columns))
+        self._unit = np.array([1.0, pitch.down / pitch.across])
+        grid = np.indices((self._columns, self._rows)).reshape(2, -1).T
+        self._grid = grid.astype(float)
+        roles = [node.role for node in network.nodes]
+        self._pull = np.array([_pull(role) for role in roles])
+        self._upward = np.array([0.1 * (role is Role.NONRENEWABLE_RESERVOIR) for role in roles])
+        self._donors, self._recipients = network.donors, network.recipients
+        first, second = np.triu_indices(len(edges), 1)
+        apart = ~(edges[first][:, :, None] == edges[second][:, None, :]).any(axis=(1, 2))
+        self._first, self._second = first[apart], second[apart]
+        self._shared = (first[~apart], second[~apart])
+
+    def best(self, seed: Floats) -> Floats:
+        """Return the cheapest cells found from ``seed`` and some shuffled starts."""
+        random = np.random.default_rng(0)
+        order = np.lexsort((seed[:, 1], seed[:, 0]))
+        starts = [np.argsort(order)]
+        starts += [
+            random.permutation(len(self._grid))[: self._count] for _ in range(RESTARTS // max(1, self._count // 8))
+        ]
+        found = [self._descend(start) for start in starts]
+        cells = min(found, key=lambda pair: pair[0])[1]
+        return self._grid[cells]
+
+    def _descend(self, cells: Integers) -> tuple[float, Integers]:
+        cells = cells.copy()
+        cost = float(self._cost(self._grid[cells][None])[0])
+        improved = True
+        while improved:
+            improved = False
+            for node in range(self._count):
+                trials = self._trials(cells, node)
+                costs = self._cost(self._grid[trials])
+                chosen = int(np.argmin(costs))
+                if costs[chosen] < cost - 1e-9:
+                    cells, cost, improved = trials[chosen], float(costs[chosen]), True
+        return cost, cells
+
+    def _trials(self, cells: Integers, node: int) -> Integers:
+        """Every move of ``node`` to a cell, changing places with whoever is there, shape (cells, nodes)."""
+        trials = np.repeat(cells[None], len(self._grid), axis=0)
+        for other in range(self._count):
+            trials[cells[other], other] = cells[node]
+        trials[:, node] = np.arange(len(self._grid))
+        return trials
+
+    def _cost(self, cells: Floats) -> Floats:
+        """Price each trial, shape (trials,), from its cells, shape (trials, nodes, 2)."""
+        points = cells * self._unit
+        start, end = points[:, self._edges[:, 0]], points[:, self._edges[:, 1]]
+        length = np.hypot(*np.moveaxis(end - start, -1, 0))
+        crossings = _cross(start[:, self._first], end[:, self._first], start[:, self._second], end[:, self._second])
+        backwards = np.maximum(cells[:, self._donors, 0] - cells[:, self._recipients, 0], 0)
+        span = cells[..., 0] * self._pull + cells[..., 1] * self._upward
+        middle = np.abs(cells[..., 1] - (self._rows - 1) / 2)
+        price: Floats = (
+            (length + 0.5 * length**2).sum(axis=1)
+            + 3.0 * crossings.sum(axis=1)
+            + 4.0 * self._blocked(points, start, end).sum(axis=(1, 2))
+            + 0.8 * self._narrow(points).sum(axis=1)
+            + 0.35 * backwards.sum(axis=1)
+            + span.sum(axis=1)
+            + 0.02 * middle.sum(axis=1)
+        )
+        return price
+
+    def _blocked(self, points: Floats, start: Floats, end: Floats) -> Floats:
+        """How far each arc runs into the boxes of other nodes, shape (trials, edges, nodes)."""
+        along = end - start
+        square = np.maximum((along**2).sum(axis=-1), 1e-12)
+        offset = points[:, None] - start[:, :, None]
+        share = np.clip((offset * along[:, :, None]).sum(axis=-1) / square[..., None], 0, 1)
+        gap = (offset - share[..., None] * along[:, :, None]) / self._unit
+        near: Floats = np.clip(1.6 - 3 * np.abs(gap).max(axis=-1), 0, 1)
+        rows = np.arange(len(self._edges))
+        near[:, rows, self._edges[:, 0]] = 0
+        near[:, rows, self._edges[:, 1]] = 0
+        return near
+
+    def _narrow(self, points: Floats) -> Floats:
+        """Cosine above 0.8 between two arcs of one node, shape (trials, pairs): labels would collide."""
+        a, b = (self._edges[side] for side in self._shared)
+        hub = np.where((a[:, :1] == b).any(axis=1), a[:, 0], a[:, 1])
+        one, two = a.sum(axis=1) - hub, b.sum(axis=1) - hub
+        left, right = points[:, one] - points[:, hub], points[:, two] - points[:, hub]
+        norm = np.hypot(*np.moveaxis(left, -1, 0)) * np.hypot(*np.moveaxis(right, -1, 0))
+        cosine = (left * right).sum(axis=-1) / np.maximum(norm, 1e-12)
+        narrow: Floats = np.maximum(cosine - 0.8, 0) * 5
+        return narrow
+
+
+def _pull(role: Role) -> float:
+    """Price of one column to the right."""
+    if role is Role.NONRENEWABLE_RESERVOIR:
+        return 0.6
+    if role is Role.ENVIRONMENT:
+        return -0.2
+    return -0.6 if role in SINKS else 0.0
+
+
+def _cross(a: Floats, b: Floats, c: Floats, d: Floats) -> NDArray[np.bool_]:
+    """Whether the segments a–b and c–d cross."""
+    one = _turn(a, b, c) * _turn(a, b, d)
+    two = _turn(c, d, a) * _turn(c, d, b)
+    crossed: NDArray[np.bool_] = (one < 0) & (two < 0)
+    return crossed
+
+
+def _turn(a: Floats, b: Floats, c: Floats) -> Floats:
+    """Twice the signed area of the triangles a–b–c."""
+    u, v = b - a, c - a
+    area: Floats = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    return area

@@ -1,0 +1,100 @@
+"""Colours, numbers and the writing of pictures that all reports share."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from cirl_marl.network.elements import Role
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK = "#222222"
+MUTED = "#5f6368"
+GRID = "#e3e5e8"
+WARNING = "#d55e00"
+GOOD = "#009e73"
+NEUTRAL = "#9aa0a6"
+# Okabe and Ito's palette, which people with any kind of colour blindness can tell apart.
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#000000")
+DASHES = ("-", "--", "-.", ":")
+ROLE_COLOURS = {
+    Role.NONRENEWABLE_RESERVOIR: "#e8b84a",
+    Role.TECHNOSPHERE: "#9db4d6",
+    Role.LANDFILL: "#c9a3c4",
+    Role.INCINERATOR: "#c9a3c4",
+    Role.ENVIRONMENT: "#86d0e6",
+}
+ROLE_NAMES = {
+    Role.NONRENEWABLE_RESERVOIR: "non-renewable reservoir",
+    Role.TECHNOSPHERE: "technosphere",
+    Role.LANDFILL: "landfill",
+    Role.INCINERATOR: "incinerator",
+    Role.ENVIRONMENT: "environment",
+}
+DPI = 200
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def number(value: float) -> str:
+    """Write a value with three digits, without an exponent unless it is very large or small.
+
+    >>> number(46.83), number(-1830.84), number(1e6), number(0.0)
+    ('46.8', '−1831', '1×10⁶', '0')
+    """
+    if not math.isfinite(value):
+        return str(value)
+    size = abs(value)
+    if size < 1e-9:
+        return "0"
+    if 1e-3 <= size < 99_999.5:
+        text = f"{value:.0f}" if size >= 99.95 else f"{value:.3g}"
+        return text.replace("-", "−")
+    mantissa, exponent = f"{value:.2e}".split("e")
+    mantissa = mantissa.rstrip("0").rstrip(".").replace("-", "−")
+    return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+
+
+def spoken(identifier: str) -> str:
+    """Write an id with spaces."""
+    return identifier.replace("_", " ")
+
+
+def dressed(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9.0) -> None:
+    """Give axes the plain look of the reports, without touching matplotlib's settings."""
+    axes.set_title(title, loc="left", fontsize=size + 1, color=INK, fontweight="bold")
+    axes.set_ylabel(ylabel, fontsize=size, color=INK)
+    axes.tick_params(labelsize=size - 1, color=GRID, labelcolor=MUTED)
+    axes.grid(True, color=GRID, linewidth=0.7)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(NEUTRAL)
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write ``figure`` as a PNG; a reader never sees half of it.
+
+    Returns:
+        The path written to; missing folders are made.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
+    os.close(handle)
+    try:
+        FigureCanvasAgg(figure)
+        figure.savefig(temporary, format="png", dpi=DPI, facecolor="white")
+        Path(temporary).chmod(0o644)
+        os.replace(temporary, target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return target

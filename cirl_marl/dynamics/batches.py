@@ -1,0 +1,139 @@
+"""Material that moves in whole batches: collected at the donor, in transit for a while, delivered at once.
+
+Batch arcs are compartments that hold mass, so they have rows of their own in the stocks, between the nodes and the unit
+row. An arc with a ``delay`` of n control intervals is a line of n slots, one per interval; an arc with a vehicle holds
+what is aboard until the vehicle's model says that it has arrived. Batches leave on schedule, at the start of an
+interval, or when the model of the compartment ``by`` has completed one, at its end::
+
+    collecting --complete--> packed --vehicle at the donor--> aboard --arrived--> recipient
+    collecting --complete--> slots, n intervals --> recipient
+
+Mass is only ever taken from one row and added to another. m_fb, the net batch mass moved finite-time sustainably, has
+two parts: that not through the environment and that through it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cirl_marl.dynamics.inner import InnerPhysics
+from cirl_marl.dynamics.rows import Line, Rows
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import Law
+from cirl_marl.network.rowsum import RowSum, disposable
+
+
+class Batches:
+    """The batch arcs of a network, compiled.
+
+    Attributes:
+        arcs: position of each batch arc among the arcs.
+        lines: the batch arcs.
+    """
+
+    def __init__(self, network: Network, rows: Rows) -> None:
+        """Compile the batch arcs, whose rows are those of ``rows``."""
+        self._network, self._rows, self.lines = network, rows, rows.lines
+        self.arcs = [k for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH]
+        self._releasing = [line for line in self.lines if line.by]
+        self._vehicles = [(i, line) for i, line in enumerate(self.lines) if not line.slots]
+        self._receiving = sorted({line.recipient for line in self.lines})
+        count, every, lines = len(self.lines), np.arange(len(self.lines)), self.lines
+        self._delivery = RowSum([line.recipient for line in lines], every, np.ones(count), (rows.masses, count))
+        parts = [line.part for line in lines]
+        self._arrivals = RowSum(parts, every, [line.arrives for line in lines], (2, count))
+        self._held = RowSum(
+            [i for i, line in enumerate(lines) for _ in line.rows],
+            [row for line in lines for row in line.rows],
+            np.ones(sum(len(line.rows) for line in lines)),
+            (count, rows.masses),
+        )
+        self._delayed = np.flatnonzero([line.slots > 0 for line in lines])
+        self._first = np.array([lines[i].first for i in self._delayed], dtype=np.intp)[:, None]
+        self._slots = np.array([lines[i].slots for i in self._delayed], dtype=np.intp)[:, None]
+        self._compile_schedule()
+
+    def _compile_schedule(self) -> None:
+        """Collect the masses that leave on schedule, and the donors of them."""
+        network, lines = self._network, [line for line in self.lines if not line.by]
+        count = len(lines)
+        self._schedule = np.zeros((count, network.episode.horizon))
+        for masses, line in zip(self._schedule, lines, strict=True):
+            for time, mass in network.arcs[network.arc_index[line.id]].batches:
+                step = round(time / network.episode.control_interval)
+                if step < len(masses):
+                    masses[step] += mass
+        self._sent_first = np.array([line.first for line in lines], dtype=np.intp)[:, None]
+        self._sent_slots = np.array([line.slots for line in lines], dtype=np.intp)[:, None]
+        self._sent_donor = np.array([line.donor for line in lines], dtype=np.intp)
+        self._departure = RowSum(self._sent_donor, np.arange(count), -np.ones(count), (self._rows.masses, count))
+        parts, weights = [line.part for line in lines], [line.leaves for line in lines]
+        self._departures = RowSum(parts, np.arange(count), weights, (2, count))
+
+    def dispatch(self, stock: Floats, step: Integers) -> Floats:
+        """Send off, in place, what is scheduled for the start of the interval; return its m_fb, shape (2, B).
+
+        A donor that holds less than is scheduled sends what it has, split in proportion.
+        """
+        mass = self._schedule[:, step]
+        if not mass.any():
+            return np.zeros((2, stock.shape[1]))
+        asked, left = -self._departure(mass), self._departure.add_to(stock.copy(), mass)
+        share = np.divide(disposable(stock, len(mass)), asked, out=np.ones_like(asked), where=left < 0)
+        mass = mass * share.take(self._sent_donor, axis=0)
+        self._departure.add_to(stock, mass)
+        # the slot that is read at the end of the last interval of the delay
+        stock[self._sent_first + (step - 1) % self._sent_slots, np.arange(stock.shape[1])] += mass
+        return self._departures(mass)
+
+    def settle(self, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> tuple[Floats, Floats]:
+        """Deliver, release and send off, in place, what is due at the end of the interval.
+
+        Args:
+            stock: all masses and the unit row, shape (rows, B).
+            inner: inner states, shape (states, B); vehicles turn, plants receive.
+            step: index of the interval in each copy, shape (B,).
+            physics: the models that release batches, drive vehicles and receive deliveries.
+
+        Returns:
+            Mass delivered by each batch arc, shape (batch arcs, B), and m_fb of the interval's end, shape (2, B).
+        """
+        delivered = np.empty((len(self.lines), stock.shape[1]))
+        slots, copies = self._first + step % self._slots, np.arange(stock.shape[1])
+        delivered[self._delayed] = stock[slots, copies]
+        stock[slots, copies] = 0.0
+        for i, line in self._vehicles:
+            delivered[i] = np.where(physics.arrive(line.id, inner), stock[line.first], 0.0)
+            stock[line.first] -= delivered[i]
+        arrived = self._delivery(delivered)
+        stock += arrived
+        for node in self._receiving:
+            physics.receive(node, inner, arrived[node])
+        counted = self._arrivals(delivered)
+        for line in self._releasing:
+            counted[line.part] += line.leaves * self._collect(line, stock, physics.released(line.by, line.port, inner))
+            self._send(line, stock, inner, step, physics)
+        return delivered, counted
+
+    def _collect(self, line: Line, stock: Floats, released: Floats) -> Floats:
+        """Move what the model of ``by`` released in this interval out of the donor."""
+        mass: Floats = np.minimum(line.unit * released, stock[line.donor])
+        stock[line.donor] -= mass
+        stock[line.collecting] += mass
+        return mass
+
+    def _send(self, line: Line, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> None:
+        """Send complete batches on their way."""
+        complete = np.where(physics.complete(line.by, inner), stock[line.collecting], 0.0)
+        stock[line.collecting] -= complete
+        if line.packed is None:
+            stock[line.first + step % line.slots, np.arange(stock.shape[1])] += complete
+            return
+        stock[line.packed] += complete
+        load = np.where(physics.board(line.id, inner, stock[line.packed] > 0.0), stock[line.packed], 0.0)
+        stock[line.packed] -= load
+        stock[line.first] += load
+
+    def loads(self, stock: Floats) -> Floats:
+        """Return the mass that each batch arc holds, shape (batch arcs, B)."""
+        return self._held(stock)

@@ -1,0 +1,142 @@
+"""The flow laws of a network, compiled to arrays.
+
+Every law is one product, ``f_k = r_k · y[driver_k]``. The driver is the stock of the donor or of the recipient (r in
+1/time), the constant 1 for scheduled flows (r in mass/time), or the output of a compartment's model (r in mass/time per
+unit of output). All of these are rows of one array (``rows.Rows``). Batch arcs carry no continuous flow.
+
+Arrays are compartment-major, shape (compartments, batch), contiguous along the batch. Gather, multiply and sparse
+segment sum treat each column alike, so a column's bits do not depend on the batch it is in.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cirl_marl.dynamics.rows import Rows
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import Arc, ControlKind, Law
+from cirl_marl.network.rowsum import RowSum
+
+SCHEDULED = (Law.CONTROLLED, Law.EXOGENOUS)
+
+
+class FlowLaws:
+    """Drivers, rates and controls of every arc.
+
+    Attributes:
+        network: whose laws they are.
+        rows: which row of the masses is what.
+        incidence: S with empty rows for batches and unit, shape (masses, arcs).
+        driver: row of the extended stocks that drives each arc, shape (arcs,).
+        scheduled: arcs that flow by schedule, shape (arcs,).
+        control_low: lower bounds of the controls, in the rows of ``network.control_rows``.
+        control_high: upper bounds.
+        neutral: values while nobody acts.
+        max_rate: r of each arc with every control at its upper bound, shape (arcs,).
+    """
+
+    def __init__(self, network: Network) -> None:
+        """Compile ``network``."""
+        self.network = network
+        arcs = len(network.arcs)
+        self.rows = rows = Rows(network)
+        donors, recipients = network.donors, network.recipients
+        columns = np.arange(arcs)
+        self.incidence = RowSum(
+            np.concatenate([donors, recipients]),
+            np.tile(columns, 2),
+            np.repeat([-1.0, 1.0], arcs),
+            (rows.masses, arcs),
+        )
+        laws = np.array([arc.law for arc in network.arcs])
+        self.scheduled = np.isin(laws, SCHEDULED)
+        constant = self.scheduled | (laws == Law.BATCH)
+        self.driver: Integers = np.where(constant, rows.unit, np.where(laws == Law.RECIPIENT, recipients, donors))
+        for k in np.flatnonzero(laws == Law.COMPARTMENT):
+            self.driver[k] = rows.outputs[network.arcs[k].by]
+        self._compile_controls()
+        self._series_arcs: Integers = np.flatnonzero([bool(arc.times) for arc in network.arcs])
+        self._series = np.array([_interval_means(network.arcs[k], network) for k in self._series_arcs])
+        self._series = self._series.reshape(len(self._series_arcs), network.episode.horizon)
+        self.max_rate: Floats = self.rate(self.control_high[:, None])[:, 0]
+        if len(self._series_arcs):
+            self.max_rate[self._series_arcs] *= self._series.max(axis=1)
+
+    def rate(self, controls: Floats, step: Integers | None = None) -> Floats:
+        """Return r of each arc for given controls.
+
+        Args:
+            controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
+            step: index of the control interval in each environment, shape (B,); picks the value of time series, which
+                without it count as 1.
+
+        Returns:
+            r, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
+        """
+        if self._partial:  # some arc lacks a control: let a row of ones stand in for it
+            controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
+        rate: Floats = controls.take(self._own_control, axis=0)
+        rate *= self._base
+        rate *= controls.take(self._donor_control, axis=0)
+        if step is not None and len(self._series_arcs):
+            rate[self._series_arcs] *= self._series[:, step]
+        return rate
+
+    def flow(self, stock: Floats, rate: Floats) -> Floats:
+        """Return the instantaneous flows f = r ∘ y[driver], shape (arcs, B), mass/time."""
+        flow: Floats = stock.take(self.driver, axis=0)
+        flow *= rate
+        return flow
+
+    def extend(self, stock: Floats) -> Floats:
+        """Append empty batch rows and the unit row to stocks of shape (nodes, B)."""
+        return np.concatenate(
+            [stock, np.zeros((len(self.rows.batch_names), stock.shape[1])), np.ones((1, stock.shape[1]))]
+        )
+
+    def _compile_controls(self) -> None:
+        """Find for each arc the rows of the control array that act on it; the row past the last is 1."""
+        network = self.network
+        acting = [network.compartments[id_] for id_ in network.controllable]
+        controls = [c.control for c in acting for _ in range(c.actions) if c.control is not None]
+        position = {
+            c.id: network.control_rows[c.id].start
+            for c in acting
+            if c.control is not None and c.control.kind is not ControlKind.INPUT
+        }
+        none = len(controls)
+        self.control_low: Floats = np.array([c.low for c in controls], dtype=float)
+        self.control_high: Floats = np.array([c.high for c in controls], dtype=float)
+        self.neutral: Floats = np.array([c.neutral for c in controls], dtype=float)
+
+        def acting_on(arc: Arc) -> tuple[int, int]:
+            donor = network.compartments[arc.donor]
+            own, valve = position.get(arc.id, none), position.get(arc.donor, none)
+            if donor.control is not None and donor.control.kind is ControlKind.FLOW:
+                return (valve, none) if arc.law is Law.CONTROLLED else (own, none)
+            return own, valve
+
+        rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
+        self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
+        self._partial = bool((rows == none).any())
+        self._base: Floats = np.array([_base_rate(arc) for arc in network.arcs]).reshape(-1, 1)
+
+
+def _base_rate(arc: Arc) -> float:
+    if arc.law is Law.BATCH:
+        return 0.0
+    if arc.law not in SCHEDULED:
+        return arc.rate
+    if arc.law is Law.EXOGENOUS and not arc.times:
+        return arc.flow[0]
+    return 1.0
+
+
+def _interval_means(arc: Arc, network: Network) -> Floats:
+    """Mean of a step function over each control interval; the last value holds on."""
+    edges = np.arange(network.episode.horizon + 1) * network.episode.control_interval
+    times, values = np.array(arc.times), np.array(arc.flow)
+    total = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(times))])
+    index = np.searchsorted(times, edges, side="right") - 1
+    means: Floats = np.diff(total[index] + values[index] * (edges - times[index])) / np.diff(edges)
+    return means

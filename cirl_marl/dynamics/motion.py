@@ -1,0 +1,341 @@
+"""Batched integration of a material network and of the inner physics of its compartments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from cirl_marl.dynamics.batches import Batches
+from cirl_marl.dynamics.inner import InnerPhysics
+from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import MAX_STEPS, Law
+from cirl_marl.network.rowsum import RowSum, disposable
+
+MAX_TURNOVER = 1.0
+"""Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
+
+TRUNCATION = 1e-13
+"""Bound on the first neglected term of the exact solver's series, relative to the mass in the network."""
+
+Passing = Callable[..., Floats]
+"""``(rate, settled) → moved``: mass that a substep moves along each arc; flows in ``settled`` hold, but for NaN."""
+
+RUNGE_KUTTA = {"rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), "euler": ((0.0,), (1.0,))}
+"""Nodes and weights of the explicit schemes; each stage starts from the slope of the one before."""
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """What one control interval did.
+
+    Attributes:
+        stock: stocks after the interval with batch rows and unit row, shape (masses, B), mass.
+        inner: inner states of the models after the interval, shape (states, B).
+        moved: mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass.
+        flow: realised continuous flows at the end of the interval, shape (arcs, B), mass/time.
+        batched: m_fb of the interval, net batch mass moved finite-time sustainably at its start and at its end, not
+            through and through the environment, shape (2, 2, B), mass; None without batch arcs.
+    """
+
+    stock: Floats
+    inner: Floats
+    moved: Floats
+    flow: Floats
+    batched: Floats | None = None
+
+
+class Dynamics(FlowLaws):
+    """Moves mass along the arcs and advances the inner physics.
+
+    ``exact`` solves ẋ = S(r ∘ y[driver]) for constant r by its Taylor series, summed in Horner form for the mean of
+    the state over the substep, ȳ = x + (h/2)·ẋ(x + (h/3)·ẋ(x + …)); the mass moved is h·r∘ȳ[driver]. A node turns over
+    at most its stock in a substep, so the series is free of cancellation, and it is cut where the neglected term is
+    below ``TRUNCATION``. ``rk4`` and ``euler`` take stocks and inner states together. In the physical mode (all but
+    ``euler``) no flow is negative or exceeds what its donor holds.
+
+    Attributes:
+        inner: the models of the compartments.
+        batches: the batch arcs.
+        physical: whether stocks are kept non-negative.
+        substeps: solver steps per control interval.
+        terms: terms of the series of the exact solver.
+    """
+
+    def __init__(self, network: Network) -> None:
+        """Compile ``network``."""
+        super().__init__(network)
+        rows = self.rows
+        self.inner, self.batches = InnerPhysics(network, rows), Batches(network, rows)
+        episode = network.episode
+        self.physical = episode.solver != "euler"
+        self._exact = episode.solver == "exact"
+        stock_driven = self.driver < rows.nodes.stop
+        turnover = np.bincount(
+            self.driver[stock_driven], weights=self.max_rate[stock_driven], minlength=rows.nodes.stop
+        ).astype(float)
+        fastest = float(turnover.max(initial=0.0))
+        self._check_turnover(turnover)
+        if self._exact:
+            self.substeps = max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
+        else:
+            assert episode.solver_step is not None
+            self.substeps = round(episode.control_interval / episode.solver_step)
+        self.substep = episode.control_interval / self.substeps
+        self.terms = self._series_terms() if self._exact else 0
+        self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
+        shape = (rows.masses, len(network.arcs))
+        self._outgoing = RowSum(network.donors, np.arange(shape[1]), np.ones(shape[1]), shape)
+        self._busiest = int(np.bincount(network.donors, minlength=1).max())
+        laws = {arc.law for arc in network.arcs}
+        self._pulls = Law.RECIPIENT in laws
+        self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
+        self._timed = [arc.id for arc in network.arcs if arc.times or arc.law is Law.BATCH]
+        self._compile_orders()
+
+    def _series_terms(self) -> int:
+        """Smallest K ≥ 2 for which the first neglected term of the mean, ‖|A|^K‖₁·h^K/(K + 1)!, is ≤ TRUNCATION.
+
+        A, entry by entry, is largest in absolute value with every control at its upper bound, so that bound serves all.
+        """
+        donors, recipients = self.network.donors, self.network.recipients
+        nodes = self.rows.nodes.stop
+        driven = np.flatnonzero(self.driver < nodes)
+        reach, term, k = np.ones(nodes), 1.0, 0
+        while term > TRUNCATION or k < 2:
+            k += 1
+            moved = self.max_rate[driven] * (reach[donors[driven]] + reach[recipients[driven]]) * self.substep
+            reach = np.bincount(self.driver[driven], weights=moved, minlength=nodes) / (k + 1)
+            term = float(reach.max(initial=0.0))
+        return k
+
+    def _check_turnover(self, turnover: Floats) -> None:
+        """Refuse rates that the solver cannot follow.
+
+        Raises:
+            CirlError: naming the fastest node, its rate and the largest usable step.
+        """
+        episode = self.network.episode
+        if not self.physical or not len(turnover):
+            return
+        node = int(turnover.argmax())
+        rate = f"{turnover[node]:.4g}/{self.network.time_unit}"
+        where = f"network '{self.network.name}': node '{self.network.nodes[node].id}' turns over {rate}"
+        if turnover[node] * episode.control_interval > MAX_STEPS * MAX_TURNOVER:
+            raise CirlError(
+                f"{where}; a control interval of {episode.control_interval:g} {self.network.time_unit} would need more "
+                f"than {MAX_STEPS:,} solver steps. Is a rate in the wrong unit?"
+            )
+        if (
+            episode.solver == "rk4"
+            and episode.solver_step is not None
+            and turnover[node] * episode.solver_step > MAX_TURNOVER
+        ):
+            raise CirlError(
+                f"{where}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / turnover[node]:.4g} "
+                f"{self.network.time_unit}, not {episode.solver_step:g}"
+            )
+
+    def _compile_orders(self) -> None:
+        """Find the donors of scheduled flows, and their outflows by schedule and in proportion to their stock."""
+        network = self.network
+        self._order_arcs: Integers = np.flatnonzero(self.scheduled)
+        self._order_donors, order_slot = np.unique(network.donors[self._order_arcs], return_inverse=True)
+        self._order_slot: Integers = order_slot
+        slot = {int(node): i for i, node in enumerate(self._order_donors)}
+        exits = [k for k, d in enumerate(network.donors) if int(d) in slot and network.arcs[k].law is Law.DONOR]
+        exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
+        self._orders_and_exits = RowSum(
+            np.concatenate([order_slot, np.array(exit_slot, dtype=np.intp)]),
+            np.concatenate([self._order_arcs, np.array(exits, dtype=np.intp)]),
+            np.ones(len(self._order_arcs) + len(exits)),
+            (2 * len(slot), len(network.arcs)),
+        )
+
+    def advance(self, stock: Floats, inner: Floats, controls: Floats, step: Integers | None = None) -> Transition:
+        """Hold ``controls`` for one control interval.
+
+        In the physical mode scheduled flows are first cut to what their donor can deliver, so the realised flows may be
+        lower than those asked for.
+
+        Args:
+            stock: stocks with batch rows and unit row, shape (masses, B).
+            inner: inner states of the models, shape (states, B).
+            controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
+            step: index of the control interval in each environment, shape (B,); networks without time series and
+                batches need none.
+
+        Raises:
+            CirlError: if ``step`` is missing though an arc needs it, or if a state is no longer a finite number, as the
+                solver's step is too long for the physics.
+        """
+        if step is None and self._timed:
+            raise CirlError(
+                f"network '{self.network.name}': advance needs step, the index of the control interval of each copy: "
+                f"time series and batches depend on it, those of arc '{self._timed[0]}' for one"
+            )
+        rate = realised = self.rate(controls, step)
+        sent = None
+        if self.batches.lines and step is not None:
+            stock = stock.copy()
+            sent = self.batches.dispatch(stock, step)
+        inner = self.inner.tick(inner, controls, stock)
+        total = None
+        for _ in range(self.substeps):
+            realised = self._limit_orders(stock, rate) if self.physical else rate
+            if self._exact:
+                stock, moved, realised = self._settle(stock, realised, partial(self._moved_exactly, stock))
+            else:
+                stock, inner, moved, realised = self._explicit_step(stock, inner, realised, controls)
+            total = moved if total is None else total + moved
+        assert total is not None
+        batched = None
+        if sent is not None and step is not None:
+            inner = inner.copy()
+            delivered, counted = self.batches.settle(stock, inner, step, self.inner)
+            total[self.batches.arcs] = delivered
+            batched = np.stack([sent, counted])
+        self._check_finite(stock, inner)
+        return Transition(stock, inner, total, self.flow_at(stock, inner, controls, realised), batched)
+
+    def _check_finite(self, stock: Floats, inner: Floats) -> None:
+        if np.isfinite(stock).all() and np.isfinite(inner).all():
+            return
+        states = np.concatenate([stock, inner])
+        row, copy_ = np.argwhere(~np.isfinite(states))[0]
+        name = [*self.rows.mass_names, *self.rows.state_names][row]
+        raise CirlError(
+            f"network '{self.network.name}': {name} in copy {copy_} became {states[row, copy_]}: solver "
+            f"'{self.network.episode.solver}' cannot follow the physics in steps of {self.substep:g} "
+            f"{self.network.time_unit}; take a shorter solver_step or tighter bounds of the controls"
+        )
+
+    def start_flow(self, stock: Floats, inner: Floats, controls: Floats) -> Floats:
+        """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
+        rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp))
+        if self.physical:
+            rate = self._limit_orders(stock, rate)
+        flow = self.flow_at(stock, inner, controls, rate)
+        if not self._heedless:
+            return flow
+        out = self._outgoing(flow) * self.substep
+        share = np.divide(stock, out, out=np.ones_like(out), where=out > stock)
+        return flow * share.take(self.network.donors, axis=0)
+
+    def flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats) -> Floats:
+        """Return the instantaneous flows r ∘ y[driver], shape (arcs, B), mass/time."""
+        return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate))
+
+    def _forward(self, flow: Floats) -> Floats:
+        """Stop, in place, flows that a model or the stage of a solver would reverse."""
+        return np.maximum(flow, 0.0, out=flow) if self.physical and not self._exact else flow
+
+    def _explicit_step(
+        self, stock: Floats, inner: Floats, rate: Floats, controls: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Take one Runge-Kutta step of stocks and inner states together; models with a step of their own go ahead."""
+        h = self.substep
+        ahead, means = self.inner.own_steps(inner, controls, h, stock)
+        nodes, weights = RUNGE_KUTTA[self.network.episode.solver]
+        change = np.zeros_like(inner)
+
+        def passing(rate: Floats, settled: Floats | None = None) -> Floats:
+            """Go through the stages; leaves the change of the inner states in ``change``."""
+            flow, slope, moved = np.zeros_like(rate), np.zeros_like(inner), np.zeros_like(rate)
+            change.fill(0.0)
+            for node, weight in zip(nodes, weights, strict=True):
+                stage = self.incidence.add_to(stock.copy(), flow * (node * h)) if node else stock
+                stage_inner = inner + slope * (node * h) if node else inner
+                flow = self._forward(self.flow(self.inner.extend(stage, stage_inner, controls, means), rate))
+                if settled is not None:
+                    np.copyto(flow, settled, where=~np.isnan(settled))
+                slope = self.inner.derivative(stage_inner, controls, stage)
+                moved += flow * (weight * h)
+                np.add(change, slope * (weight * h), out=change)
+            return moved
+
+        if self.physical:
+            after, moved, rate = self._settle(stock, rate, passing)
+        else:
+            moved = passing(rate)
+            after = self.incidence.add_to(stock.copy(), moved)
+        return after, self.inner.moved(ahead, change), moved, rate
+
+    def _moved_exactly(self, stock: Floats, rate: Floats, settled: Floats | None = None) -> Floats:
+        """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep.
+
+        Flows given in ``settled``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
+        """
+        mean, moved = stock.copy(), np.empty_like(rate)
+        for incidence in (*self._horner, None):
+            mean.take(self.driver, axis=0, out=moved, mode="clip")
+            moved *= rate
+            if settled is not None:
+                np.copyto(moved, settled, where=~np.isnan(settled))
+            if incidence is not None:
+                mean[...] = stock
+                incidence.add_to(mean, moved)
+        moved *= self.substep
+        if self._pulls:
+            np.maximum(moved, 0.0, out=moved)  # the mean of an overdrawn stock may be negative
+        return moved
+
+    def _limit_orders(self, stock: Floats, rate: Floats) -> Floats:
+        """Cut scheduled flows so that no donor is overdrawn.
+
+        A donor with stock x, proportional exits a and a constant outflow U obeys ẋ ≥ −a·x − U, which stays
+        non-negative for a substep h if U ≤ x·a/(e^{ah} − 1). Flows from one donor are cut by the same factor.
+        """
+        if not len(self._order_arcs):
+            return rate
+        outflows = self._orders_and_exits(rate)
+        outflows *= self.substep
+        asked, turned_over = outflows[: len(self._order_donors)], outflows[len(self._order_donors) :]
+        held = stock.take(self._order_donors, axis=0)
+        if (asked <= held * (1.0 - turned_over) * (1.0 - 1e-12)).all():
+            return rate  # x·a/(e^{ah} − 1) ≥ x(1 − ah)/h: nothing can be overdrawn
+        share = np.divide(turned_over, np.expm1(turned_over), out=np.ones_like(held), where=turned_over > 1e-12)
+        available = held * share * (1.0 - 1e-12)
+        factor = np.divide(available, asked, out=np.ones_like(held), where=asked > available)
+        rate = rate.copy()
+        rate[self._order_arcs] *= factor.take(self._order_slot, axis=0)
+        return rate
+
+    def _settle(self, stock: Floats, rate: Floats, passing: Passing) -> tuple[Floats, Floats, Floats]:
+        """Move mass; where a flow that does not heed its donor asked for more than that held, send what was there.
+
+        Proportional and scheduled flows never overdraw. A recipient or a model that asks for more than there is gets
+        its share: all outflows of the overdrawn node, and their rates, are scaled to the stock it started with. They
+        are then settled, and the others follow from them, lest the recipient passes on what it did not get. Each pass
+        settles at least one more node.
+
+        Args:
+            stock: stocks at the start of the substep, shape (masses, B).
+            rate: rates of the flows, shape (arcs, B).
+            passing: what moves at given rates.
+
+        Returns:
+            Stocks at the end, mass moved, and the rates realised.
+        """
+        moved = passing(rate)
+        after = self.incidence.add_to(stock.copy(), moved)
+        if after.min() >= 0:
+            return after, moved, rate
+        held = disposable(stock, self._busiest)
+        settled = np.full_like(moved, np.nan)
+        while (after < 0).any():  # asked of every copy, as a NaN in one says nothing of the others
+            out = self._outgoing(moved)
+            short = (after < 0) & (out > 0)
+            share = np.divide(held, out, out=np.ones_like(out), where=short & (out > held))
+            share = share.take(self.network.donors, axis=0)
+            cut = short.take(self.network.donors, axis=0)
+            settled[cut] = (moved * share)[cut] / self.substep
+            rate = rate * share
+            moved = passing(rate, settled)
+            after = self.incidence.add_to(stock.copy(), moved)
+        return after, moved, rate

@@ -1,0 +1,132 @@
+"""Which row is what in the arrays of a network's motion; nobody else computes row numbers.
+
+Masses are kept as one array: the stocks of the nodes, the masses of batch arcs, then the *unit row*, which is 1 and
+drives scheduled flows; the outputs of models follow it where flows are computed. Inner states are a second array.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Law, Role
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One batch arc and its rows.
+
+    Attributes:
+        id: the arc.
+        by: compartment whose model releases batches; empty for a schedule.
+        port: what it releases into this arc.
+        unit: mass per unit released.
+        donor: row of the node that gives.
+        recipient: row of the node that receives.
+        collecting: row of the batch that is being put together.
+        packed: row of complete batches that wait for the vehicle; None without a vehicle.
+        first: first row of the slots, or the row of what is aboard.
+        slots: number of slots; 0 with a vehicle.
+        leaves: weight with which mass that leaves the donor counts in m_fb.
+        arrives: weight with which mass that reaches the recipient counts in m_fb.
+        part: part of m_fb in which it counts, 1 if the arc touches the environment, else 0.
+    """
+
+    id: str
+    by: str
+    port: str
+    unit: float
+    donor: int
+    recipient: int
+    collecting: int
+    packed: int | None
+    first: int
+    slots: int
+    leaves: float
+    arrives: float
+    part: int
+
+    @property
+    def rows(self) -> range:
+        """All rows of the arc."""
+        return range(self.collecting, self.first + max(self.slots, 1))
+
+
+class Rows:
+    """The rows of masses and inner states of a network, and their names.
+
+    Attributes:
+        nodes: rows of the stocks.
+        batches: rows of the masses of batch arcs.
+        unit: the unit row; the rows before it hold all the mass there is.
+        masses: number of rows of the masses, the unit row included.
+        batch_names: ``arc.row`` of each batch row.
+        mass_names: nodes, batch rows and the unit.
+        lines: the batch arcs, in their order among the arcs.
+        aboard: row of what the vehicle of an arc carries, by the arc's id.
+        owners: compartments with a model, in network order.
+        states: rows of each owner's inner states.
+        state_names: ``compartment.state`` of each inner state.
+        start_names: nodes, then inner states: what an episode starts from, and plans and snapshots are compared by.
+        outputs: row of each owner's output, past the unit row.
+    """
+
+    def __init__(self, network: Network) -> None:
+        """Lay out the rows of ``network``."""
+        nodes = len(network.nodes)
+        names: list[str] = []
+        self.lines = tuple(
+            _line(network, k, nodes, names) for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH
+        )
+        self.batch_names = tuple(names)
+        self.nodes, self.batches = slice(0, nodes), slice(nodes, nodes + len(names))
+        self.unit = self.batches.stop
+        self.masses = self.unit + 1
+        self.mass_names = (*(f"stock of node '{node.id}'" for node in network.nodes), *names, "unit")
+        self.aboard = {line.id: line.first for line in self.lines if not line.slots}
+        models = {c.id: c.model for c in network.compartments.values() if c.model is not None}
+        self.owners = tuple(models)
+        self.state_names = tuple(f"{owner}.{name}" for owner, model in models.items() for name in model.state_names)
+        self.start_names = (*network.node_index, *self.state_names)
+        self.states: dict[str, slice] = {}
+        first = 0
+        for owner, model in models.items():
+            self.states[owner] = slice(first, first := first + len(model.state_names))
+        self.outputs = {owner: self.masses + i for i, owner in enumerate(self.owners)}
+
+    def start_of(self, masses: Floats, inner: Floats) -> Floats:
+        """Return stocks and inner states in one array, the rows of ``start_names``, shape (rows, B)."""
+        return np.concatenate([masses[self.nodes], inner])
+
+    def split(self, start: Floats) -> tuple[Floats, Floats]:
+        """Return the stocks, shape (nodes, B), and the inner states of what ``start_of`` returned."""
+        return start[self.nodes], np.ascontiguousarray(start[self.nodes.stop :])
+
+
+def _line(network: Network, k: int, nodes: int, names: list[str]) -> Line:
+    """Lay out the rows of one batch arc after the nodes and those that have ``names``, and name them."""
+    arc = network.arcs[k]
+    start = nodes + len(names)
+    slots = round(arc.delay / network.episode.control_interval)
+    tail = [f"slot_{i}" for i in range(slots)] if slots else ["packed", "aboard"]
+    names += (f"{arc.id}.{name}" for name in ("collecting", *tail))
+    sign = float(network.sustainability[k])
+    donor = network.nodes[network.node_index[arc.donor]]
+    early = donor.role in (Role.NONRENEWABLE_RESERVOIR, Role.ENVIRONMENT)
+    return Line(
+        id=arc.id,
+        by=arc.by,
+        port=arc.port,
+        unit=arc.rate,
+        donor=network.node_index[arc.donor],
+        recipient=network.node_index[arc.recipient],
+        collecting=start,
+        packed=None if slots else start + 1,
+        first=start + (1 if slots else 2),
+        slots=slots,
+        leaves=sign if early else 0.0,
+        arrives=0.0 if early else sign,
+        part=int(network.environmental[k]),
+    )

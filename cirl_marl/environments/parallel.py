@@ -1,0 +1,259 @@
+"""The environment of a material network for PettingZoo: parallel, and AEC through PettingZoo's conversion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike, NDArray
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import conversions
+
+from cirl_marl.environments.actuators import wrong_shape
+from cirl_marl.environments.state import Outcome, Snapshot
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.network import Floats, Network
+
+RENDER_MODES = ("rgb_array", "human")
+OPTIONS = ("observe", "circularity", "circularity_weight", "horizon")
+
+
+class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
+    """One copy of a material network whose compartments are PettingZoo agents.
+
+    Each agent has its own Box(−1, 1) action and its own float32 observation; ``observation_names[agent]`` says what
+    each entry is. Episodes end by truncation at the horizon. ``infos[agent]`` carries ``circularity`` (λ at the end of
+    the step, mass), ``local_reward``, ``flows`` (mean flows in the order of ``network.arcs``, mass/time) and
+    ``service_level``; for an agent whose model has a criterion of success also ``success``.
+
+    Attributes:
+        network: the network under the chosen scenario.
+        possible_agents: compartments that act.
+        state_names: what the entries of ``state()`` are, but for the last, the elapsed share of the episode.
+        agents: the same while an episode runs, empty after it.
+        batch: the same environment for those who want arrays, with a single copy.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (PettingZoo declares it so)
+        "name": "cirl_marl",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        network: str | Path | Network,
+        *,
+        scenario: str | None = None,
+        agents: Sequence[str] | None = None,
+        reward: str | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        """Make the environment; ``options`` and errors are those of ``VectorEnv``."""
+        for option in options:
+            if option not in OPTIONS:
+                raise CirlError(unknown("option", option, (*OPTIONS, "scenario", "agents", "reward", "render_mode")))
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise CirlError(unknown("render_mode", render_mode, RENDER_MODES))
+        self.batch = VectorEnv(network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options)
+        self.network = self.batch.network
+        if not self.batch.agents:
+            raise CirlError(f"network '{self.network.name}': no compartment has a control, so nothing can act")
+        self.layout = self.batch.layout
+        self.possible_agents = list(self.batch.agents)
+        self.agents: list[str] = []
+        self.observation_spaces = dict(self.batch.observation_spaces)
+        self.observation_names = self.batch.observation_names
+        self.action_spaces = dict(self.batch.action_spaces)
+        self.state_names = self.batch.state_names
+        self._entries = sum(len(neutral) for neutral in self.batch.neutral_action.values())
+        self.state_space = Box(-np.inf, np.inf, (len(self.state_names) + 1,), np.float64)
+        self.render_mode = render_mode
+        self._canvas: Any = None
+
+    def observation_space(self, agent: str) -> Box[np.float32]:
+        """Return the observation space of ``agent``, always the same object."""
+        return self.batch.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Box[np.float32]:
+        """Return the action space of ``agent``, always the same object."""
+        return self.batch.action_spaces[agent]
+
+    @property
+    def neutral_action(self) -> dict[str, NDArray[np.float32]]:
+        """The action of each agent that leaves it neutral."""
+        return {agent: action.astype(np.float32) for agent, action in self.batch.neutral_action.items()}
+
+    def reset(
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
+        """Start an episode; ``options={"initial_state": {node: stock}}`` starts it from a given state."""
+        observation = self.batch.reset(seed, options)
+        self.agents = list(self.possible_agents)
+        if self.render_mode == "human":
+            self.render()
+        return {agent: seen[0] for agent, seen in observation.items()}, {agent: {} for agent in self.agents}
+
+    def step(
+        self, actions: Mapping[str, ArrayLike]
+    ) -> tuple[
+        dict[str, NDArray[np.float32]],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Hold one action per agent, each in its Box(−1, 1), for one control interval.
+
+        Raises:
+            ControlError: for missing or unknown agents, wrong shapes, NaN or values out of bounds.
+        """
+        if not self.agents:
+            if actions:
+                raise ControlError("no episode is running: call reset()")
+            return {}, {}, {}, {}, {}
+        agents = self.possible_agents
+        outcome = self.batch.advance(self._stack(actions))
+        truncated = bool(outcome.truncated[0])
+        if truncated:
+            self.agents = []
+        if self.render_mode == "human":
+            self.render()
+        seen = outcome.observation[:, 0]
+        slices = self.layout.slices
+        return (
+            {agent: seen[slices[agent]] for agent in agents},
+            dict(zip(agents, outcome.reward[:, 0].tolist(), strict=True)),
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, truncated),
+            self._infos(outcome),
+        )
+
+    def state(self) -> Floats:
+        """Return the whole physical state: every stock in mass units, then the elapsed share of the episode."""
+        state: Floats = self.batch.state()[0]
+        return state
+
+    def local_rewards(self) -> dict[str, float]:
+        """Return the local reward that the current state gives each compartment, whether it acts or not."""
+        return {name: float(reward[0]) for name, reward in self.batch.local_rewards().items()}
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the whole environment state, random streams included."""
+        return self.batch.snapshot()
+
+    def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
+        """Go back to a snapshot and return the observations there."""
+        observation = self.batch.restore(snapshot)
+        over = int(self.batch.physical.step[0]) >= self.network.episode.horizon
+        self.agents = [] if over else list(self.possible_agents)
+        return {agent: seen[0] for agent, seen in observation.items()}
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``.
+
+        Raises:
+            CirlError: if the environment was made without a ``render_mode``.
+        """
+        if self.render_mode is None:
+            raise CirlError(
+                f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when making the environment"
+            )
+        from cirl_marl.drawing.digraph import Canvas
+
+        if self._canvas is None:
+            self._canvas = Canvas(self.network, window=self.render_mode == "human")
+        state = self.batch.physical
+        time = float(state.step[0]) * self.network.episode.control_interval
+        stock, flow = state.stock[self.batch.rows.nodes, 0], state.flow[:, 0]
+        circularity = float(self.network.circularity(flow, state.batched[:, 0]))
+        image: NDArray[np.uint8] = self._canvas.draw(stock, flow, time, circularity)
+        return image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._canvas is not None:
+            self._canvas.close()
+            self._canvas = None
+
+    def _stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
+        """Stack the actions; only if they do not stack are they looked at one by one, to say why."""
+        if not isinstance(actions, Mapping):
+            raise ControlError(f"actions must be a mapping agent → action, not {actions!r}")
+        try:
+            stacked = np.array([actions[agent] for agent in self.possible_agents])
+        except (KeyError, ValueError):
+            stacked = np.empty(0)
+        if (
+            stacked.dtype.kind not in "biuf"
+            or stacked.shape != (self._entries, 1)
+            or len(actions) != len(self.possible_agents)
+        ):
+            return self.batch.stack({agent: self._checked(agent, action)[None] for agent, action in actions.items()})
+        return stacked
+
+    def _checked(self, agent: str, action: ArrayLike) -> NDArray[Any]:
+        """Refuse an action of the wrong shape; the batch would say it with an axis that is not the user's."""
+        found, space = np.asarray(action), self.batch.action_spaces.get(agent)
+        if space is not None and found.shape != space.shape:
+            raise ControlError(wrong_shape(agent, found.shape, space.shape))
+        return found
+
+    def _infos(self, outcome: Outcome) -> dict[str, dict[str, Any]]:
+        circularity, service = float(outcome.circularity[0]), float(outcome.service_level[0])
+        flows = outcome.flow[:, 0]
+        infos: dict[str, dict[str, Any]] = {
+            agent: {
+                "circularity": circularity,
+                "local_reward": local,
+                "flows": flows,
+                "service_level": service,
+            }
+            for agent, local in zip(self.possible_agents, outcome.local[:, 0].tolist(), strict=True)
+        }
+        for agent, success in outcome.success.items():
+            if agent in infos:
+                infos[agent]["success"] = bool(success[0])
+        return infos
+
+
+def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParallelEnv:
+    """Return the network as a PettingZoo ParallelEnv.
+
+    Args:
+        network: catalogue name, path of a definition file, or a network.
+        **options: ``scenario``, ``agents``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``,
+            ``horizon``, ``render_mode``.
+
+    >>> env = parallel_env("copper_net", agents=["mine", "use_to_collection"])
+    >>> observations, infos = env.reset(seed=0)
+    >>> observations, rewards, *_ = env.step({"mine": [-1.0], "use_to_collection": [1.0]})
+    >>> sorted(rewards)
+    ['mine', 'use_to_collection']
+    """
+    return NetworkParallelEnv(network, **options)
+
+
+def aec_env(network: str | Path | Network, **options: Any) -> AECEnv[str, Any, Any]:
+    """Return the network as a PettingZoo AECEnv: agents act in turn, the network moves when all have acted."""
+    return conversions.parallel_to_aec(NetworkParallelEnv(network, **options))
+
+
+def vector_env(network: str | Path | Network, num_envs: int = 64, **options: Any) -> VectorEnv:
+    """Return ``num_envs`` copies of the network, arrays in and out; see ``VectorEnv``.
+
+    >>> env = vector_env("copper_net", num_envs=3)
+    >>> env.reset(seed=0)["mine"].shape
+    (3, 4)
+    """
+    known = ("scenario", "agents", "reward", *OPTIONS)
+    for option in options:
+        if option not in known:
+            raise CirlError(unknown("option", option, known))
+    return VectorEnv(network, num_envs=num_envs, **options)

@@ -1,0 +1,129 @@
+"""Who is paid what for the circularity of a step: the team's reward, local rewards, and each agent's difference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cirl_marl.dynamics.motion import Dynamics, Transition
+from cirl_marl.environments.scoring import Scoring
+from cirl_marl.environments.state import State
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats
+
+CELLS = 4_000_000
+"""Largest number of stocks and inner states that difference rewards re-simulate at once."""
+
+
+class Credit:
+    """Pays the agents by one of these rewards.
+
+    With w the circularity weight and c the circularity scale of the network::
+
+        circularity       λ
+        difference        D = λ − λ had the agent been neutral, re-simulated from the same state
+        local             r, the local reward
+        mixed             w·λ/c + (1 − w)·r
+        mixed_difference  w·D/c + (1 − w)·r
+        team              w·λ/c − (1 − w)·Σ_s weight_s·shortfall_s over all services
+        local_sum         the sum of the local rewards of all compartments, acting or not
+
+    λ is that at the ``end`` of the interval or its ``mean`` over it.
+    """
+
+    def __init__(self, dynamics: Dynamics, scoring: Scoring, agents: Sequence[str], mode: str, measure: str) -> None:
+        """Pay ``agents`` by ``mode``; ``measure`` is ``end`` or ``mean``."""
+        self.mode = mode
+        self._dynamics, self._scoring, self._agents = dynamics, scoring, tuple(agents)
+        self._measure = measure
+        objective = dynamics.network.objective
+        self._rest = 1.0 - objective.circularity_weight
+        self._per_mass = objective.circularity_weight / objective.circularity_scale
+
+    def circularity(self, state: State, transition: Transition, flow: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return λ at the end of the interval, its mean over the interval, and m_fb, shape (B,) each, mass.
+
+        Batches that leave at the start of the interval count in its mean, those of its end do not.
+        """
+        network = self._dynamics.network
+        if transition.batched is None:
+            return network.circularity(transition.flow), network.circularity(flow), state.batched
+        during = state.batched + transition.batched[0]
+        after = during + transition.batched[1]
+        return network.circularity(transition.flow, after), network.circularity(flow, during), after
+
+    def pay(
+        self, end: Floats, mean: Floats, local: Floats, terms: Floats, levels: Floats, state: State, controls: Floats
+    ) -> Floats:
+        """Return the reward of each agent, shape (agents, B).
+
+        Args:
+            end: λ at the end of the interval, shape (B,), mass.
+            mean: its mean over the interval, shape (B,), mass.
+            local: local rewards, shape (agents, B).
+            terms: what local rewards consist of (``Scoring.terms``), shape (terms, B).
+            levels: of the services, shape (services, B).
+            state: at the start of the interval.
+            controls: during it, shape (controls, B).
+
+        Raises:
+            CirlError: if the solver cannot follow what would have been, had an agent been neutral; names the agent.
+        """
+        if self.mode == "local":
+            return local.copy()
+        if self.mode == "local_sum":
+            return self._same_for_all(self._scoring.local_sum(terms))
+        paid = end if self._measure == "end" else mean
+        if self.mode in ("difference", "mixed_difference"):
+            paid = paid - self._counterfactuals(state, controls)
+        if self.mode in ("mixed", "mixed_difference"):
+            mixed: Floats = local * self._rest
+            mixed += paid * self._per_mass
+            return mixed
+        if self.mode == "team":
+            paid = paid * self._per_mass - self._rest * self._scoring.shortfall(levels)
+        return paid if self.mode == "difference" else self._same_for_all(paid)
+
+    def _same_for_all(self, reward: Floats) -> Floats:
+        return np.repeat(reward[None], len(self._agents), axis=0)
+
+    def _counterfactuals(self, state: State, controls: Floats) -> Floats:
+        """λ had each agent in turn been neutral, re-simulated from the same state, shape (agents, B)."""
+        chunk = max(1, CELLS // max(state.stock.size + state.inner.size, state.flow.size))
+        starts = range(0, len(self._agents), chunk)
+        results = [self._with_neutral(self._agents[start : start + chunk], state, controls) for start in starts]
+        return np.concatenate(results) if results else np.empty((0, controls.shape[1]))
+
+    def _with_neutral(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
+        """λ had each of ``agents`` in turn been neutral, all in one batch, shape (agents, B).
+
+        Raises:
+            CirlError: if a re-simulated state is no longer a finite number; names the agent.
+        """
+        try:
+            return self._imagined(agents, state, controls)
+        except CirlError as error:
+            if len(agents) == 1:
+                raise CirlError(
+                    f"with agent '{agents[0]}' neutral, as difference rewards imagine it: {error}"
+                ) from error
+        return np.concatenate([self._with_neutral([agent], state, controls) for agent in agents])
+
+    def _imagined(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
+        dynamics, count, batch = self._dynamics, len(agents), controls.shape[1]
+        imagined = np.tile(controls, (1, count))
+        for i, agent in enumerate(agents):
+            rows = dynamics.network.control_rows[agent]
+            imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows, None]
+        transition = dynamics.advance(
+            np.tile(state.stock, (1, count)),
+            np.tile(state.inner, (1, count)),
+            imagined,
+            np.tile(state.step, count),
+        )
+        imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
+        flow = transition.moved / dynamics.network.episode.control_interval
+        end, mean, _ = self.circularity(imagined_state, transition, flow)
+        return (end if self._measure == "end" else mean).reshape(count, batch)

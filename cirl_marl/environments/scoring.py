@@ -1,0 +1,123 @@
+"""Local rewards of compartments, service levels and the team's circularity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cirl_marl.environments.observations import ObservationLayout
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.rowsum import RowSum
+
+
+class Scoring:
+    """Scores stocks and mean flows.
+
+    The local reward of compartment c with quantity q (stock of a node, mean flow of an arc) is::
+
+        r_c = −((q − set_point)/scale)² − Σ_s weight_s · shortfall_s,    s over the services that c owes
+
+    plus the reward of its model, if it has one. Here shortfall = 1 − level, and the level of a service with band
+    [low, high] is min(1, q/low, high/q), without q/low if low = 0.
+
+    Args of all methods are compartment-major, shape (rows, B).
+    """
+
+    def __init__(self, network: Network, layout: ObservationLayout, agents: Sequence[str], batch: int) -> None:
+        """Compile the scores of ``agents`` and of the network as a whole, for arrays of ``batch`` columns."""
+        compartments = list(network.compartments.values())
+        position = {c.id: i for i, c in enumerate(compartments)}
+        chosen = network.objective.tracked or [c.id for c in compartments if c.set_point is not None]
+        tracked = [position[c] for c in chosen]
+        set_point = np.array([c.set_point or 0.0 for c in compartments])
+        inverse_scale = 1.0 / np.array([c.scale for c in compartments])
+        self._set_point = np.repeat(set_point[:, None], batch, axis=1)  # equal shapes are faster than a broadcast
+        self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
+        services = network.services
+        self._measure = _measurement(network, layout)
+        self._low = np.array([s.low for s in services]).reshape(-1, 1)
+        self._high = np.array([s.high for s in services]).reshape(-1, 1)
+        self._bounded = bool(np.isfinite(self._high).any())
+        self._no_least = np.flatnonzero(self._low[:, 0] == 0.0)
+        self._low[self._no_least] = 1.0
+        modelled = [position[c.id] for c in compartments if c.model is not None]
+        count = len(compartments)
+        terms = count + len(services) + len(modelled)
+        debts = [(position[d], count + i, s.weight) for i, s in enumerate(services) for d in s.debtors]
+        inner = range(count + len(services), terms)
+        owners = np.array([*tracked, *(owner for owner, _, _ in debts), *modelled], dtype=np.intp)
+        columns = np.array([*tracked, *(term for _, term, _ in debts), *inner], dtype=np.intp)
+        weights = np.array([*[1.0] * len(tracked), *(weight for _, _, weight in debts), *[-1.0] * len(modelled)])
+        self._everyone = RowSum(owners, columns, -weights, (len(compartments), terms))
+        self._agents = self._everyone.chosen([position[agent] for agent in agents])
+        sums = self._everyone.column_sums()
+        counted = np.flatnonzero(sums)
+        self._all = RowSum(np.zeros(len(counted), dtype=np.intp), counted, sums[counted], (1, terms))
+        self._weighted_shortfall = RowSum(
+            [0] * len(services), range(len(services)), [s.weight for s in services], (1, len(services))
+        )
+        self._sum_of_levels = RowSum(
+            [0] * len(services), range(len(services)), [1.0] * len(services), (1, len(services))
+        )
+
+    def levels(self, quantities: Floats) -> Floats:
+        """Return the level of each service in [0, 1], shape (services, B)."""
+        measured = self._measure(quantities)
+        level: Floats = measured / self._low
+        level[self._no_least] = 1.0
+        if self._bounded:
+            np.divide(self._high, measured, out=level, where=measured > self._high)
+        np.minimum(level, 1.0, out=level)
+        return np.maximum(level, 0.0, out=level)
+
+    def terms(self, quantities: Floats, levels: Floats, inner: Floats) -> Floats:
+        """Return every squared scaled distance, service shortfall and model's reward, shape (terms, B)."""
+        count, services = len(self._set_point), len(levels)
+        terms = np.empty((count + services + len(inner), quantities.shape[1]))
+        distance = terms[:count]
+        np.subtract(quantities[:count], self._set_point, out=distance)
+        distance *= self._inverse_scale
+        distance *= distance
+        np.subtract(1.0, levels, out=terms[count : count + services])
+        terms[count + services :] = inner
+        return terms
+
+    def local(self, terms: Floats) -> Floats:
+        """Return the local reward of each agent, shape (agents, B)."""
+        return self._agents(terms)
+
+    def local_of_all(self, terms: Floats) -> Floats:
+        """Return the local reward of each compartment, nodes first, shape (nodes + arcs, B)."""
+        return self._everyone(terms)
+
+    def local_sum(self, terms: Floats) -> Floats:
+        """Return the sum of the local rewards of all compartments, shape (B,)."""
+        total: Floats = self._all(terms)[0]
+        return total
+
+    def shortfall(self, levels: Floats) -> Floats:
+        """Return Σ_s weight_s · (1 − level_s), shape (B,)."""
+        total: Floats = self._weighted_shortfall(1.0 - levels)[0]
+        return total
+
+    def service_level(self, levels: Floats) -> Floats:
+        """Return the mean level over the services, shape (B,); 1 for a network that owes none."""
+        if len(levels) == 0:
+            return np.ones(levels.shape[1])
+        total: Floats = self._sum_of_levels(levels)[0]
+        total /= len(levels)
+        return total
+
+
+def _measurement(network: Network, layout: ObservationLayout) -> RowSum:
+    """Matrix that reads each service off the quantities, shape (services, quantities)."""
+    rows, columns = [], []
+    for row, service in enumerate(network.services):
+        if service.quantity == "outflow":
+            read = [layout.signals.flows.start + int(k) for k in network.metered(service)]
+        else:
+            read = [layout.row(service.provider, service.quantity, service.measure)]
+        rows += [row] * len(read)
+        columns += read
+    return RowSum(rows, columns, np.ones(len(rows)), (len(network.services), layout.signals.quantities))

@@ -1,0 +1,160 @@
+"""One agent of a material network as a Gymnasium environment; the others hold their neutral control."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.parallel import OPTIONS, NetworkParallelEnv
+from cirl_marl.environments.state import Snapshot
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network import Network
+
+SHARED = ("reward", "render_mode")
+"""What the PettingZoo view takes besides its options, and this one as well."""
+
+
+class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One compartment of a network acts.
+
+    With ``scenario="paper"`` this is the environment of the CiRL paper: its observation is the state in the paper's
+    order and its reward the paper's. ``info["state"]`` is that state in float64; the rest of ``info`` is that of the
+    PettingZoo view.
+
+    Attributes:
+        agent: the compartment that acts.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self,
+        network: str | Path | Network,
+        agent: str | None = None,
+        *,
+        scenario: str | None = None,
+        legacy_episode: bool = False,
+        **options: Any,
+    ) -> None:
+        """Make the environment.
+
+        Args:
+            network: catalogue name, path of a definition file, or a network.
+            agent: who acts; None if the scenario has exactly one agent.
+            scenario: scenario of the definition; where several agents have one each, as in ``paper_truck`` and
+                ``paper_incinerator``, ``paper`` means that of ``agent``.
+            legacy_episode: reproduce the step counter of the published classes. It is checked at the start of a step
+                and survives ``reset``: when it has reached the horizon, the state is drawn anew, one step is taken from
+                there, and its time limit is reported as termination. So the first episode has horizon + 1 steps, and
+                each later one horizon − 1 and one more from a fresh start.
+            **options: those of ``parallel_env``, but for ``agents``.
+
+        Raises:
+            CirlError: if ``agent`` is missing or unknown, or the scenario is not the only one of its name for it.
+        """
+        if "agents" in options:
+            raise CirlError("a single-agent environment takes agent=, not agents=")
+        for option in options:
+            if option not in (*OPTIONS, *SHARED):
+                own = ("agent", "scenario", "legacy_episode")
+                raise CirlError(unknown("option", option, (*OPTIONS, *own, *SHARED)))
+        if not isinstance(agent, str | None):
+            raise CirlError(f"agent must be the name of one agent, got {agent!r}")
+        chosen = None if agent is None else [agent]
+        found = load_network(network) if isinstance(network, str | Path) else network
+        scenario = _scenario_of(found, scenario, agent)
+        self.parallel = NetworkParallelEnv(found, scenario=scenario, agents=chosen, **options)
+        if len(self.parallel.possible_agents) != 1:
+            raise CirlError(
+                f"network '{self.parallel.network.name}' has several agents: "
+                f"give agent=, one of {', '.join(self.parallel.possible_agents)}"
+            )
+        self.agent = self.parallel.possible_agents[0]
+        self._legacy = legacy_episode
+        self._elapsed = 0
+        self.render_mode = self.parallel.render_mode
+        self.observation_space = self.parallel.observation_space(self.agent)
+        self.action_space = self.parallel.action_space(self.agent)
+        self.observation_names = {self.agent: self.parallel.observation_names[self.agent]}
+        rows = {name: row for row, name in enumerate(self.parallel.state_names)}
+        self._order = np.array([rows[name] for name in self.parallel.layout.array_order or rows], dtype=np.intp)
+
+    @property
+    def network(self) -> Network:
+        """The network under the chosen scenario."""
+        return self.parallel.network
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; ``options={"initial_state": …}`` takes a mapping or, in the paper scenarios, an array."""
+        super().reset(seed=seed)
+        observations, _ = self.parallel.reset(seed=seed, options=options)
+        return observations[self.agent], {"state": self._paper_state()}
+
+    def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Hold the action, shape (1,) in [−1, 1], for one control interval."""
+        over = self._legacy and self._elapsed >= self.network.episode.horizon
+        if over:
+            self.parallel.reset()
+            self._elapsed = 0
+        self._elapsed += 1
+        observations, rewards, terminations, truncations, infos = self.parallel.step({self.agent: action})
+        info = {**infos[self.agent], "state": self._paper_state()}
+        agent = self.agent
+        truncated = truncations[agent] and not self._legacy
+        return observations[agent], rewards[agent], terminations[agent] or over, truncated, info
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the whole environment state, random streams included."""
+        return replace(self.parallel.snapshot(), elapsed=self._elapsed)
+
+    def restore(self, snapshot: Snapshot) -> NDArray[np.float32]:
+        """Go back to a snapshot and return the observation there."""
+        observations = self.parallel.restore(snapshot)
+        self._elapsed = snapshot.elapsed
+        return observations[self.agent]
+
+    def render(self) -> Any:
+        """Draw the network; see ``NetworkParallelEnv.render``."""
+        return self.parallel.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.parallel.close()
+
+    def _paper_state(self) -> NDArray[np.float64]:
+        return self.parallel.state()[self._order]
+
+
+def _scenario_of(network: Network, scenario: str | None, agent: str | None) -> str | None:
+    """Return ``scenario`` or, if there is none of that name, the ``scenario_…`` in which ``agent`` alone acts."""
+    if scenario is None or scenario == network.scenario_name or scenario in network.scenarios:
+        return scenario
+    fitting = [
+        name
+        for name, other in network.scenarios.items()
+        if name.startswith(f"{scenario}_") and agent is not None and other.acting == (agent,)
+    ]
+    if len(fitting) > 1:
+        raise CirlError(
+            f"network '{network.name}': agent '{agent}' has the scenarios {', '.join(fitting)}: give one of them"
+        )
+    return fitting[0] if fitting else scenario
+
+
+def single_agent_env(network: str | Path | Network, agent: str | None = None, **options: Any) -> SingleAgentEnv:
+    """Return one agent of ``network`` as a Gymnasium environment; see ``GoalEnv`` for one whose task is a goal.
+
+    >>> env = single_agent_env("copper_net", agent="use_to_collection", scenario="paper")
+    >>> observation, info = env.reset(seed=0)
+    >>> info["state"]
+    array([  65.,   80.,   80., 1300.,   15.,   15.])
+    """
+    return SingleAgentEnv(network, agent, **options)

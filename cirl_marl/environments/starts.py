@@ -1,0 +1,186 @@
+"""Where episodes start: drawn from one random stream per copy, or given by the caller."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.errors import ControlError, unknown
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import ranged_states
+
+
+class Starts:
+    """Initial stocks and inner states of B copies, each with a random stream of its own.
+
+    Attributes:
+        names: nodes, then ``compartment.state`` of the inner states; the rows of every array here.
+        streams: one generator per copy.
+    """
+
+    def __init__(self, network: Network, dynamics: Dynamics, num_envs: int, order: Sequence[str]) -> None:
+        """Compile the initial ranges; the streams are seeded from the operating system.
+
+        Args:
+            network: whose starts they are.
+            dynamics: its compiled dynamics.
+            num_envs: B.
+            order: names of the rows that an array of initial values gives; empty if only mappings are taken.
+        """
+        inner = dynamics.inner
+        self.names = dynamics.rows.start_names
+        self._rows = {name: row for row, name in enumerate(self.names)}
+        self.streams = [np.random.default_rng() for _ in range(num_envs)]
+        self._network = network
+        self._bounds = _bounds(network)
+        self._wholes = _wholes(network)
+        inseparable = {name for names in self._wholes.values() for name in names}
+        self._array_order = () if inseparable & set(order) else tuple(order)
+        self._physical = dynamics.physical
+        nodes = dynamics.rows.nodes.stop
+        self._nodes, self._inner = dynamics.rows.nodes, inner
+        self._ranged = np.concatenate([np.arange(nodes), nodes + inner.ranged])
+        self._own = np.setdiff1d(np.arange(len(self.names)), self._ranged)
+        self._low = np.concatenate([[node.initial[0] for node in network.nodes], inner.low])
+        self._width = np.concatenate([[node.initial[1] for node in network.nodes], inner.high]) - self._low
+
+    def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
+        """Return the state in which every copy starts, shape (rows, B); see ``VectorEnv.reset``.
+
+        Raises:
+            ControlError: for a seed, option or state that cannot be used; the streams are left as they were.
+        """
+        streams = self.streams if seed is None else self._seeded(seed)
+        given = self._given({} if options is None else options)
+        self.streams = streams
+        drawn = self.draw(range(len(streams)))
+        for row, values in given.items():
+            drawn[row] = values
+        return drawn
+
+    def draw(self, which: Sequence[int] | range | Integers) -> Floats:
+        """Draw initial stocks and inner states of some copies, each from its own stream, shape (rows, len(which)).
+
+        Models that draw their own start come first, so that a lone robot starts as it does in its own library.
+        """
+        by_copy = np.empty((len(which), len(self._low)))
+        own = np.empty((len(self._own), len(which)))
+        for column, (row, i) in enumerate(zip(by_copy, which, strict=True)):
+            if len(own):
+                own[:, column] = self._inner.start(self.streams[i])
+            self.streams[i].random(out=row)
+        uniform = np.ascontiguousarray(by_copy.T)
+        uniform *= self._width[:, None]
+        uniform += self._low[:, None]
+        if not len(own):
+            return uniform
+        drawn = np.empty((len(self.names), len(which)))
+        drawn[self._ranged], drawn[self._own] = uniform, own
+        return drawn
+
+    def saved_streams(self) -> tuple[Mapping[str, Any], ...]:
+        """Return a copy of the state of every stream."""
+        return tuple(copy.deepcopy(dict(stream.bit_generator.state)) for stream in self.streams)
+
+    def restore_streams(self, saved: Sequence[Mapping[str, Any]]) -> None:
+        """Put every stream back."""
+        for stream, state in zip(self.streams, saved, strict=True):
+            stream.bit_generator.state = copy.deepcopy(dict(state))
+
+    def _seeded(self, seed: int | Sequence[int]) -> list[np.random.Generator]:
+        copies = len(self.streams)
+        if isinstance(seed, int | np.integer):
+            seeds = [int(seed) + i for i in range(copies)]
+        else:
+            seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else []
+        if len(seeds) != copies or any(not isinstance(s, int | np.integer) or s < 0 for s in seeds):
+            raise ControlError(f"seed {seed!r} must be a non-negative integer, or {copies} of them")
+        return [np.random.default_rng(s) for s in seeds]
+
+    def _given(self, options: Mapping[str, Any]) -> dict[int, Floats]:
+        """Return the given initial stocks and inner states by their row."""
+        if not isinstance(options, Mapping):
+            raise ControlError(f"reset options must be a mapping, not {options!r}")
+        for key in options:
+            if key not in ("initial_state", "options"):  # PettingZoo's own test passes the key "options"
+                raise ControlError(f"reset options: {unknown('option', key, ['initial_state'])}")
+        given = options.get("initial_state", {})
+        if not isinstance(given, Mapping):
+            names = self._array_order
+            values = _numbers("initial_state", given)
+            if not names or values.shape != (len(names),):
+                raise ControlError(
+                    f"initial_state has shape {values.shape}: give a mapping node → stock"
+                    + (f", or the values of {', '.join(names)} in this order" if names else "")
+                )
+            given = dict(zip(names, values, strict=True))
+        checked = {self._row(id_): self._initial(id_, values) for id_, values in given.items()}
+        for owner, whole in self._wholes.items():
+            named = [name for name in whole if name in given]
+            if named and len(named) < len(whole):
+                raise ControlError(
+                    f"initial_state of '{named[0]}': a start of '{owner}' is the state of its simulator, all "
+                    f"{len(whole)} entries together; snapshot() and restore() go back to one"
+                )
+        most = (self._low + self._width)[self._nodes]
+        limit = float(most.sum())
+        if self._physical and checked:
+            held = [np.broadcast_to(checked.get(i, most[i]), len(self.streams)) for i in range(len(most))]
+            total = float(np.sum(held, axis=0).max())
+            if total > limit * (1 + 1e-9):
+                raise ControlError(
+                    f"initial_state: {total:.6g} {self._network.mass_unit} in all, but the observation space of "
+                    f"'{self._network.name}' covers {limit:.6g}; widen the initial ranges of the definition"
+                )
+        return checked
+
+    def _row(self, id_: str) -> int:
+        if id_ not in self._rows:
+            raise ControlError(f"initial_state: {unknown('node or inner state', id_, self.names)}")
+        return self._rows[id_]
+
+    def _initial(self, id_: str, values: ArrayLike) -> Floats:
+        stock = _numbers(f"initial_state of '{id_}'", values)
+        if stock.shape not in ((), (len(self.streams),)):
+            raise ControlError(
+                f"initial_state of '{id_}' has shape {stock.shape}, expected () or {(len(self.streams),)}"
+            )
+        is_stock = self._physical and id_ in self._network.node_index
+        if not np.isfinite(stock).all() or (is_stock and (stock < 0).any()):
+            raise ControlError(f"initial_state of '{id_}' is {values!r}: stocks are finite and not negative")
+        low, high = self._bounds.get(id_, (-np.inf, np.inf))
+        if (stock < low).any() or (stock > high).any():
+            raise ControlError(f"initial_state of '{id_}' is {values!r}: its model holds for [{low:g}, {high:g}]")
+        return stock
+
+
+def _bounds(network: Network) -> dict[str, tuple[float, float]]:
+    """Return the values of inner states for which their models hold, by ``compartment.state``."""
+    return {
+        f"{owner}.{name}": bounds
+        for owner, compartment in network.compartments.items()
+        for name, bounds in getattr(compartment.model, "bounds", {}).items()
+    }
+
+
+def _wholes(network: Network) -> dict[str, tuple[str, ...]]:
+    """Return the states that only make sense together: those of models that draw their start, but for their goals."""
+    found = {}
+    for owner, compartment in network.compartments.items():
+        model = compartment.model
+        if model is not None and not ranged_states(model):
+            goals = getattr(model, "desired_names", ())
+            found[owner] = tuple(f"{owner}.{name}" for name in model.state_names if name not in goals)
+    return found
+
+
+def _numbers(what: str, values: ArrayLike) -> Floats:
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ControlError(f"{what} is {values!r}; it must hold numbers") from None

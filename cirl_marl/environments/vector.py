@@ -1,0 +1,347 @@
+"""The multi-agent environment of a material network, batched: arrays in and out.
+
+Every other view (PettingZoo, Gymnasium, the seats of the learners) stands on this one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.dynamics.motion import Dynamics, Transition
+from cirl_marl.environments.actuators import Actuators
+from cirl_marl.environments.observations import ObservationLayout
+from cirl_marl.environments.rewards import Credit
+from cirl_marl.environments.scoring import Scoring
+from cirl_marl.environments.starts import Starts
+from cirl_marl.environments.state import Outcome, Snapshot, State
+from cirl_marl.errors import CirlError, ControlError, unknown
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import MOMENTS, REWARDS
+
+Infos = dict[str, dict[str, Any]]
+
+
+class VectorEnv:
+    """``num_envs`` independent copies of a material network, stepped together.
+
+    Observations, rewards and so on are dicts agent → array with leading axis ``num_envs``. A copy whose episode ended
+    starts the next one within the same step; its last observation and state are then in
+    ``infos[agent]["final_observation"]`` and ``["final_state"]``, valid where ``["_final_observation"]`` is true.
+
+    Attributes:
+        network: the network under the chosen scenario.
+        agents: compartments that act, in the order of every stacked array.
+        reward_mode: one of those of ``credit.Credit``.
+        observation_spaces: by agent.
+        observation_names: by agent, what each entry of its observation is.
+        action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
+        rows: which row of the physical state is what.
+        state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
+            order of ``state()``.
+        episodes: episodes begun in each copy, those gone back to included, shape (num_envs,).
+    """
+
+    def __init__(
+        self,
+        network: str | Path | Network,
+        *,
+        num_envs: int = 64,
+        scenario: str | None = None,
+        agents: Sequence[str] | None = None,
+        reward: str | None = None,
+        observe: str | None = None,
+        circularity: str = "end",
+        circularity_weight: float | None = None,
+        horizon: int | None = None,
+    ) -> None:
+        """Make the environments.
+
+        Args:
+            network: catalogue name, path of a definition file, or a network.
+            num_envs: B, number of copies.
+            scenario: scenario of the definition; None is the default, physical one.
+            agents: who acts; the others hold their neutral control. None: the network's own choice.
+            reward: reward mode; None takes the scenario's own, which is ``mixed`` unless the definition says otherwise.
+            observe: ``local``, ``neighbours``, ``full`` or ``model``; None takes the scenario's own.
+            circularity: whether the team reward is λ at the ``end`` of the interval or its ``mean`` over it.
+            circularity_weight: w in [0, 1], weight of λ in the reward; None takes the definition's.
+            horizon: decisions per episode; None takes the definition's.
+
+        Raises:
+            CirlError: for an unknown network, scenario, agent or option.
+        """
+        found = load_network(network) if isinstance(network, str | Path) else network
+        if not isinstance(found, Network):
+            raise CirlError(f"network must be a name of the catalogue, a file or a Network, got {found!r}")
+        found = found.scenario(scenario)
+        for name, value in (("num_envs", num_envs), ("horizon", found.episode.horizon if horizon is None else horizon)):
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+                raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
+        if horizon is not None:
+            found = found.with_options(episode={"horizon": horizon})
+        if circularity_weight is not None:
+            found = found.with_options(objective={"circularity_weight": _share(circularity_weight)})
+        self.network = found
+        self.num_envs = num_envs
+        self.reward_mode = _choice("reward", found.objective.reward if reward is None else reward, REWARDS)
+        measure = _choice("circularity", circularity, MOMENTS)
+        self.dynamics = Dynamics(found)
+        self._actuators = Actuators(self.dynamics, agents, num_envs)
+        self.agents = self._actuators.agents
+        self.action_spaces = self._actuators.spaces
+        self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
+        self.scoring = Scoring(found, self.layout, self.agents, num_envs)
+        self._credit = Credit(self.dynamics, self.scoring, self.agents, self.reward_mode, measure)
+        self.observation_spaces = self.layout.spaces
+        self.observation_names = self.layout.names
+        self._starts = Starts(found, self.dynamics, num_envs, self.layout.array_order)
+        self.rows = self.dynamics.rows
+        self.state_names = (*self.rows.start_names, *self.rows.batch_names)
+        self._metered = self.layout.signals.measures
+        self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
+        self._state: State | None = None
+        _keep_freed_memory()
+
+    @property
+    def neutral_action(self) -> dict[str, Floats]:
+        """Normalised action of each agent that leaves it neutral, shape (entries,) each."""
+        return self._actuators.neutral_action
+
+    @property
+    def physical(self) -> State:
+        """The current physical state; its arrays must not be written to.
+
+        Raises:
+            ControlError: before the first ``reset``.
+        """
+        if self._state is None:
+            raise ControlError("the environment has no state yet: call reset() first")
+        return self._state
+
+    def reset(
+        self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
+    ) -> dict[str, NDArray[np.float32]]:
+        """Start an episode in every copy and return the observations.
+
+        Args:
+            seed: an integer s seeds copy i with s + i; a sequence gives each copy its own; None goes on with the
+                streams.
+            options: ``{"initial_state": …}``: a mapping of node → stock and ``compartment.state`` → inner state (a
+                number or shape (num_envs,)), the rest being drawn; or, if a single agent observes ``stocks`` or its
+                ``model``, an array in the order of its observation.
+
+        Raises:
+            ControlError: for a seed, option or state that cannot be used; the environment is left as it was.
+        """
+        self._state = self._fresh(self._starts.begin(seed, options))
+        self.episodes = self.episodes + 1
+        return self.by_agent(self._observe(self._state))
+
+    def step(
+        self, actions: Mapping[str, ArrayLike]
+    ) -> tuple[
+        dict[str, NDArray[np.float32]],
+        dict[str, Floats],
+        dict[str, NDArray[np.bool_]],
+        dict[str, NDArray[np.bool_]],
+        Infos,
+    ]:
+        """Hold the actions for one control interval.
+
+        Args:
+            actions: agent → array of shape (num_envs, entries of its action) in [−1, 1].
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos, each by agent.
+
+        Raises:
+            ControlError: for missing or unknown agents, wrong shapes, NaN or values out of bounds.
+        """
+        outcome = self.advance(self.stack(actions))
+        infos: Infos = outcome.infos(self.agents)
+        observation = outcome.observation
+        if outcome.truncated.any():
+            self._report_ends(infos, outcome)
+            observation = self._restart(outcome.truncated)
+        terminated = np.zeros(self.num_envs, dtype=bool)
+        terminated.flags.writeable = outcome.truncated.flags.writeable = False  # one array for all agents
+        return (
+            self.by_agent(observation),
+            {agent: outcome.reward[i] for i, agent in enumerate(self.agents)},
+            dict.fromkeys(self.agents, terminated),
+            dict.fromkeys(self.agents, outcome.truncated),
+            infos,
+        )
+
+    def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
+        """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
+        return self._actuators.stack(actions)
+
+    def unstack(self, actions: Floats) -> dict[str, Floats]:
+        """Split stacked actions, shape (entries, B), into agent → (B, entries of its action)."""
+        return self._actuators.unstack(actions)
+
+    def advance(self, actions: Floats) -> Outcome:
+        """Hold stacked actions, shape (entries, B), for one control interval; no copy is restarted.
+
+        Raises:
+            ControlError: for NaN, values outside [−1, 1], or an episode that is over.
+            CirlError: if the solver cannot follow the physics, which leaves the environment as it was.
+        """
+        state, dynamics = self.physical, self.dynamics
+        horizon = self.network.episode.horizon
+        if (state.step >= horizon).any():
+            raise ControlError(f"the episode is over after {horizon} steps: call reset()")
+        controls = self._actuators.controls(actions)
+        transition = dynamics.advance(state.stock, state.inner, controls, state.step)
+        quantities, flow = self._measured(transition, controls)
+        levels = self.scoring.levels(quantities)
+        service = self.scoring.service_level(levels)
+        terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
+        local = self.scoring.local(terms)
+        circularity, mean, batched = self._credit.circularity(state, transition, flow)
+        reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
+        step = state.step + 1
+        self._state = State(
+            transition.stock,
+            transition.inner,
+            flow,
+            quantities[self._metered],
+            step,
+            batched,
+            state.circularity + mean,
+            state.service + service,
+        )
+        observation = self.layout.observe(quantities, step / horizon, levels)
+        success = dynamics.inner.successes(transition.inner, controls)
+        return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
+
+    def local_rewards(self) -> dict[str, Floats]:
+        """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
+        state = self.physical
+        neutral = np.repeat(self.dynamics.neutral[:, None], self.num_envs, axis=1)
+        quantities = self._quantities(state)
+        inner = self.dynamics.inner.rewards(state.inner, state.inner, neutral)
+        rewards = self.scoring.local_of_all(self.scoring.terms(quantities, self.scoring.levels(quantities), inner))
+        return dict(zip(self.network.compartments, rewards, strict=True))
+
+    def state(self) -> Floats:
+        """Return the whole state, shape (B, entries): ``state_names``, then the elapsed share of time."""
+        state = self.physical
+        time = state.step / self.network.episode.horizon
+        return np.concatenate([state.stock[self.rows.nodes], state.inner, state.stock[self.rows.batches], time[None]]).T
+
+    def observations(self) -> dict[str, NDArray[np.float32]]:
+        """Return the observations that the agents act on next, equal to what the last reset, step or restore gave.
+
+        Raises:
+            ControlError: before the first ``reset``.
+        """
+        return self.by_agent(self._observe(self.physical))
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the state and the random streams; environments are not changed."""
+        return Snapshot(self.physical.copied(), self._starts.saved_streams(), self.agents, self.network)
+
+    def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
+        """Go back to a snapshot and return the observations there.
+
+        Raises:
+            ControlError: if the snapshot is of another network, horizon, batch size or choice of agents.
+        """
+        snapshot.check(self.network, self.num_envs, self.agents)
+        self._starts.restore_streams(snapshot.streams)
+        self._state = snapshot.state.copied()
+        self.episodes = self.episodes + 1
+        return self.by_agent(self._observe(self._state))
+
+    def close(self) -> None:
+        """Do nothing; the environment holds no resources."""
+
+    def by_agent(self, stacked: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
+        return {agent: stacked[rows].T for agent, rows in self.layout.slices.items()}
+
+    def _report_ends(self, infos: Infos, outcome: Outcome) -> None:
+        """Add the final observations and the episode's λ̄ and service level of the copies that ended."""
+        state, ended = self.physical, outcome.truncated
+        steps = np.maximum(state.step, 1)
+        final, whole = self.by_agent(outcome.observation), self.state()
+        for agent, info in infos.items():
+            info["final_observation"] = final[agent]
+            info["final_state"] = whole
+            info["_final_observation"] = ended
+            info["episode_circularity"] = state.circularity / steps
+            info["episode_service_level"] = state.service / steps
+
+    def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Start the next episode in the copies that ended and return the observation of all."""
+        self.episodes = self.episodes + ended
+        which = np.flatnonzero(ended)
+        old = self.physical
+        drawn = self.rows.start_of(old.stock, old.inner)
+        drawn[:, which] = self._starts.draw(which)
+        self._state = old.renewed(ended, self._fresh(drawn))
+        return self._observe(self._state)
+
+    def _fresh(self, drawn: Floats) -> State:
+        """State at the start of an episode; flows and measures are those that neutral control would give."""
+        dynamics, batch = self.dynamics, drawn.shape[1]
+        stocks, inner = self.rows.split(drawn)
+        stock = dynamics.extend(stocks)
+        step = np.zeros(batch, dtype=np.intp)
+        neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
+        flow = dynamics.start_flow(stock, inner, neutral)
+        measures = dynamics.inner.measures(inner, neutral)
+        zeros = np.zeros(batch)
+        return State(stock, inner, flow, measures, step, np.zeros((2, batch)), zeros, zeros)
+
+    def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
+        """Return all quantities in one array, and the mean flows, which are read-only."""
+        signals, dynamics = self.layout.signals, self.dynamics
+        quantities = np.empty((signals.quantities, self.num_envs))
+        flow = quantities[signals.flows]
+        np.divide(transition.moved, self.network.episode.control_interval, out=flow)
+        quantities[self.rows.nodes] = transition.stock[self.rows.nodes]
+        if signals.inside:
+            quantities[signals.states] = transition.inner
+            quantities[signals.measures] = dynamics.inner.measures(transition.inner, controls)
+            quantities[signals.loads] = dynamics.batches.loads(transition.stock)
+        flow.flags.writeable = False  # infos hand it out, and the state keeps it
+        return quantities, flow
+
+    def _quantities(self, state: State) -> Floats:
+        loads = self.dynamics.batches.loads(state.stock)
+        return np.concatenate([state.stock[self.rows.nodes], state.flow, state.inner, state.measures, loads])
+
+    def _observe(self, state: State) -> NDArray[np.float32]:
+        quantities = self._quantities(state)
+        time = state.step / self.network.episode.horizon
+        return self.layout.observe(quantities, time, self.scoring.levels(quantities))
+
+
+def _share(weight: float) -> float:
+    if isinstance(weight, bool) or not isinstance(weight, int | float | np.number) or not 0 <= weight <= 1:
+        raise CirlError(f"circularity_weight must be a number in [0, 1], got {weight!r}")
+    return float(weight)
+
+
+def _choice(what: str, value: str, known: Sequence[str]) -> str:
+    if value not in known:
+        raise CirlError(unknown(what, value, known))
+    return value
+
+
+def _keep_freed_memory() -> None:
+    """Make glibc keep freed arrays for the next step instead of returning their pages to the system.
+
+    Its thresholds follow the largest block freed so far; below them a step of 1 024 copies spends more time on page
+    faults than on arithmetic. The block is never touched, so it costs nothing; other allocators ignore it.
+    """
+    np.empty(30 * 2**20, dtype=np.uint8)

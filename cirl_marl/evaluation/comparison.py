@@ -1,0 +1,244 @@
+"""Comparison of trained policies and controllers on the same fresh episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
+from cirl_marl.controllers.watched import Watched
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError
+from cirl_marl.evaluation.contenders import contenders
+from cirl_marl.evaluation.figures import gain, relative
+from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds
+from cirl_marl.evaluation.yardstick import Yardstick, yardstick
+from cirl_marl.learners.run import RunDirectory
+from cirl_marl.network import Floats, Network
+from cirl_marl.optimum import NoCertificate
+
+FIGURES = ("circularity", "gain", "service", "bound", "gap")
+EVERYWHERE = (-np.inf, np.inf)
+LIMITS = {"service": SHARE, "gap": (0.0, np.inf)}
+"""Within which figures lie: the bound is proved, so that no gap is below 0."""
+SOLVING = 0.7
+"""Share of solving programs in the work on bounds; the rest is to evaluate their multipliers for every episode."""
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """The episodes of one policy or controller.
+
+    Attributes:
+        name: of its row.
+        seed: training seed; None if nothing was trained.
+        run: where it was trained.
+        checkpoint: name of the checkpoint that acted; empty if nothing was trained.
+        rollout: its episodes.
+        gain: circularity gain over neutral control from the same start, shape (episodes,).
+        bound: the highest λ̄ of any episode from the same start with at least the same mean service level, shape
+            (episodes,), mass; None if nothing is proved.
+    """
+
+    name: str
+    seed: int | None
+    run: RunDirectory | None
+    checkpoint: str
+    rollout: Rollout
+    gain: Floats
+    bound: Floats | None
+
+    @property
+    def circularity(self) -> Floats:
+        """λ̄ of each episode, shape (episodes,), mass."""
+        return self.rollout.episode_circularity
+
+    @property
+    def service(self) -> Floats:
+        """Mean service level of each episode, shape (episodes,)."""
+        return self.rollout.episode_service
+
+    @property
+    def gap(self) -> Floats | None:
+        """(bound − λ̄)/|bound| of each episode, shape (episodes,); NaN where the bound is 0."""
+        return None if self.bound is None else relative(self.bound - self.circularity, self.bound)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A recipe with all its seeds, or a controller.
+
+    Attributes:
+        name: recipe or controller.
+        entries: one for each training seed.
+    """
+
+    name: str
+    entries: tuple[Entry, ...]
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Training seeds; empty if nothing was trained."""
+        return tuple(entry.seed for entry in self.entries if entry.seed is not None)
+
+    @property
+    def few(self) -> bool:
+        """Whether there are fewer training seeds than an interval over them should rest on."""
+        return 0 < len(self.seeds) < ENOUGH_SEEDS
+
+    def figure(self, which: str) -> Aggregate | None:
+        """Return one of FIGURES: over seeds the IQM of means over episodes, else the mean over episodes."""
+        samples = [getattr(entry, which) for entry in self.entries]
+        if any(each is None for each in samples):
+            return None
+        if not self.seeds:
+            return over_episodes(samples[0], LIMITS.get(which, EVERYWHERE))
+        return over_seeds([[each.mean() for each in samples]])
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What every policy and controller did in the same episodes.
+
+    Attributes:
+        network: under its scenario and horizon.
+        agents: who acted.
+        first_seed: episode i starts from seed ``first_seed + i``.
+        entries: of every policy and controller.
+        yardstick: the bounds that they are held against.
+    """
+
+    network: Network
+    agents: tuple[str, ...]
+    first_seed: int
+    entries: tuple[Entry, ...]
+    yardstick: Yardstick
+
+    @property
+    def episodes(self) -> int:
+        """Episodes of each entry."""
+        return len(self.entries[0].circularity)
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """Entries by name: seeds of one recipe together."""
+        grouped: dict[str, list[Entry]] = {}
+        for entry in self.entries:
+            grouped.setdefault(entry.name, []).append(entry)
+        return tuple(Row(name, tuple(entries)) for name, entries in grouped.items())
+
+
+def compare(
+    runs: Sequence[str | Path | RunDirectory] = (),
+    controllers: Sequence[str] = ("neutral", "random"),
+    *,
+    network: str | Path | Network | None = None,
+    scenario: str | None = None,
+    episodes: int = 64,
+    seed: int = 0,
+    min_service: float | None = None,
+    bounds: bool = True,
+    progress: Progress = lambda what, share: None,
+) -> Comparison:
+    """Let trained policies and controllers act in the same fresh episodes.
+
+    Everyone meets the same start states and random streams, whose seeds no training draws. Neutral control, to which
+    gains refer, is always there.
+
+    Args:
+        runs: training runs of one environment.
+        controllers: names of controllers, see ``controllers.named``.
+        network: catalogue name, definition file or network; None is that of the first run.
+        scenario: of ``network``; None is the default.
+        episodes: at least 2.
+        seed: different seeds share no episode.
+        min_service: mean service level that ``mpc`` and ``optimum`` plan for; None: as much as can be had.
+        bounds: whether to hold the episodes against the best possible.
+        progress: called with what is being done and the share of all that is done.
+
+    Raises:
+        CirlError: for input that cannot be used, a controller that does not fit the network, or a solver that fails.
+        RunError: if a run is incomplete, or of another environment.
+    """
+    if episodes < 2:
+        raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
+    if network is None and scenario is not None:
+        raise CirlError(f"scenario '{scenario}' goes with a network; runs have their own")
+    found = load_network(network) if isinstance(network, str | Path) else network
+    from cirl_marl.learners.trained import Trained  # it needs torch
+
+    asked = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
+    everyone = controllers if "neutral" in controllers else ["neutral", *controllers]
+    entered, env = contenders(asked, everyone, None if found is None else found.scenario(scenario), min_service)
+    first = first_seed(seed)
+    share = 1 / (len(entered) + (len({each.name for each in entered}) if bounds else 0))
+    rollouts, checkpoints = [], []
+    for place, contender in enumerate(entered):
+        controller = contender.controller()
+        checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
+        watched = Watched(controller, _told(progress, contender.name, place * share, share))
+        rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.acted))
+    measure, proved = _unproved(len(entered), "")
+    if bounds:
+        starts = starting_stocks(entered[0].env(episodes), first)
+        done = len(entered) * share
+        measure, proved = _measured(
+            env,
+            starts,
+            [each.name for each in entered],
+            rollouts,
+            lambda part: progress("bounds", done + part * (1 - done)),
+        )
+    plain = [contender.run is None and contender.name == "neutral" for contender in entered]
+    neutral = rollouts[plain.index(True)]
+    entries = tuple(
+        Entry(contender.name, contender.seed, contender.run, checkpoint, run, gain(run, neutral), bound)
+        for contender, checkpoint, run, bound in zip(entered, checkpoints, rollouts, proved, strict=True)
+    )
+    return Comparison(env.network, env.agents, first, entries, measure)
+
+
+def starting_stocks(env: VectorEnv, seed: int) -> Floats:
+    """Return the stocks in which the copies of ``env`` start, shape (copies, nodes), mass."""
+    env.reset(seed=seed)
+    return env.physical.stock[env.rows.nodes].T.copy()
+
+
+def _measured(
+    env: VectorEnv,
+    starts: Floats,
+    names: Sequence[str],
+    rollouts: Sequence[Rollout],
+    progress: Callable[[float], None],
+) -> tuple[Yardstick, list[Floats | None]]:
+    """Return the yardstick of all rows, and the bounds of the episodes of each rollout."""
+    services: dict[str, list[Floats]] = {}
+    for name, run in zip(names, rollouts, strict=True):
+        services.setdefault(name, []).append(run.episode_service)
+    delivered = [np.mean(each, axis=0) for each in services.values()]
+    try:
+        measure = yardstick(
+            env.network, env.agents, starts, delivered, progress=lambda share: progress(SOLVING * share)
+        )
+        proved = []
+        for place, run in enumerate(rollouts):
+            proved.append(measure.at(starts, run.episode_service))
+            progress(SOLVING + (1 - SOLVING) * (place + 1) / len(rollouts))
+        return measure, proved
+    except NoCertificate as missing:
+        progress(1.0)
+        return _unproved(len(rollouts), str(missing))
+
+
+def _unproved(entries: int, reason: str) -> tuple[Yardstick, list[Floats | None]]:
+    return Yardstick(None, np.empty((0, 2)), reason), [None] * entries
+
+
+def _told(progress: Progress, what: str, done: float, each: float) -> Callable[[float], None]:
+    progress(what, done)
+    return lambda share: progress(what, done + each * share)

@@ -1,0 +1,141 @@
+"""Who is compared: trained policies and controllers that need no training, all in the same network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from cirl_marl.controllers.basic import Controller
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError, RunError
+from cirl_marl.learners.run import RunDirectory
+from cirl_marl.network import Network
+from cirl_marl.optimum.named import CONTROLLERS, named_controller
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """A policy or controller that is yet to act.
+
+    Attributes:
+        name: of the row that it belongs to.
+        seed: training seed; None if nothing was trained.
+        run: where it was trained.
+        controller: makes the controller.
+        env: makes the environment in which it acts, with so many copies.
+    """
+
+    name: str
+    seed: int | None
+    run: RunDirectory | None
+    controller: Callable[[], Controller]
+    env: Callable[[int], VectorEnv]
+
+
+def contenders(
+    runs: Sequence[RunDirectory], controllers: Sequence[str], network: Network | None, min_service: float | None
+) -> tuple[list[Contender], VectorEnv]:
+    """Return everyone who is compared, and a copy of the environment that they share.
+
+    What a policy observes and is rewarded with is its own affair; network, acting agents and horizon must be the same.
+
+    Raises:
+        CirlError: if there is nothing to compare, a controller is unknown or named twice, or two runs are of one seed.
+        RunError: if a run is incomplete, or of another environment; names it and what differs.
+    """
+    if not runs and network is None:
+        raise CirlError("nothing to compare in: give a training run or a network")
+    if len(set(controllers)) != len(controllers):
+        raise CirlError(f"controllers {list(controllers)} must be distinct")
+    envs = [run.make_env(1) for run in runs]
+    first = envs[0] if network is None else VectorEnv(network, num_envs=1)
+    if envs and envs[0].network.name == first.network.name:
+        first = VectorEnv(first.network, num_envs=1, agents=envs[0].agents)
+    for run, env in zip(runs, envs, strict=True):
+        where = "the network given" if network is not None else str(runs[0].path)
+        if found := list(differences(env, first)):
+            raise RunError(f"{run.path}: not the same environment as {where}: {'; '.join(found)}")
+
+    def shared(copies: int) -> VectorEnv:
+        if network is None:
+            return runs[0].make_env(copies)
+        return VectorEnv(network, num_envs=copies, agents=first.agents)
+
+    plain = [_untrained(name, shared, min_service) for name in controllers]
+    return [*_trained(runs), *plain], first
+
+
+def differences(env: VectorEnv, other: VectorEnv) -> Iterator[str]:
+    """Yield what makes an episode of ``env`` another than one of ``other``; observations and rewards do not count."""
+    ours, theirs = env.network, other.network
+    if ours.name != theirs.name:
+        yield f"network '{ours.name}', not '{theirs.name}'"
+        return
+    if env.agents != other.agents:
+        yield f"agents {list(env.agents)}, not {list(other.agents)}"
+    physics, reference = _physics(ours), _physics(theirs)
+    found = [
+        f"{what} {physics[what]!r}, not {reference[what]!r}" for what in physics if physics[what] != reference[what]
+    ]
+    parts, counterparts = _parts(ours), _parts(theirs)
+    changed = [f"'{key[1]}'" for key in parts | counterparts if parts.get(key) != counterparts.get(key)]
+    if changed:
+        found.append(f"the definition of {', '.join(changed[:5])}{' and others' if len(changed) > 5 else ''}")
+    if found and ours.scenario_name != theirs.scenario_name:
+        yield f"scenario '{ours.scenario_name}', not '{theirs.scenario_name}'"
+    else:
+        yield from found
+
+
+def _physics(network: Network) -> dict[str, Any]:
+    objective = network.objective
+    return {
+        "horizon": network.episode.horizon,
+        "episode": replace(network.episode, horizon=1),
+        "reference interval": objective.reference_interval,
+        "net_zero": objective.net_zero,
+        "units": (network.mass_unit, network.time_unit),
+    }
+
+
+def _parts(network: Network) -> dict[tuple[str, str], object]:
+    """Return compartments and services, which may share ids, by what they are and their id."""
+    parts = {("compartment", id_): compartment for id_, compartment in network.compartments.items()}
+    return parts | {("service", service.id): service for service in network.services}
+
+
+def _trained(runs: Sequence[RunDirectory]) -> Iterator[Contender]:
+    """Yield the policies; runs that differ in their seed alone have one name, and one that is not complete its own."""
+    names: dict[str, str] = {}
+    seen: dict[tuple[str, int], RunDirectory] = {}
+    for run in runs:
+        config = run.config
+        plain = config.as_dict()
+        status = run.status
+        asked = repr([plain[field] for field in ("recipe", "steps", "envs", "options")])
+        name = config.recipe.name
+        if status["state"] != "complete":
+            name += f", {status['state']} after {status['joint_steps'] * config.envs:,} of {config.steps:,} steps"
+            asked += str(run.path)
+        if asked not in names:
+            names[asked] = f"{name} ({run.path})" if name in (*names.values(), *CONTROLLERS) else name
+        twin = seen.setdefault((asked, config.seed), run)
+        if twin is not run:
+            raise RunError(f"{run.path}: the same recipe and seed {config.seed} as {twin.path}; give one of them")
+        yield Contender(names[asked], config.seed, run, _policy(run), run.make_env)
+
+
+def _policy(run: RunDirectory) -> Callable[[], Controller]:
+    def load() -> Controller:
+        from cirl_marl.learners.trained import Trained
+
+        return Trained(run)
+
+    return load
+
+
+def _untrained(name: str, env: Callable[[int], VectorEnv], min_service: float | None) -> Contender:
+    demanded = min_service if name in ("mpc", "optimum") else None
+    named_controller(name, min_service=demanded)  # an unknown name fails before anything is computed
+    return Contender(name, None, None, lambda: named_controller(name, min_service=demanded), env)

@@ -1,0 +1,61 @@
+"""The figures that compare controllers: circularity gain, gap, time-window circularity, and all of them for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.evaluation.statistics import SHARE, over_episodes
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.staged import CIRO_FACTOR
+
+
+def relative(difference: Floats, reference: Floats) -> Floats:
+    """Return ``difference``/|``reference``|, NaN where the reference is 0."""
+    return np.divide(difference, np.abs(reference), out=np.full_like(difference, np.nan), where=reference != 0)
+
+
+def gain(rollout_: Rollout, neutral: Rollout) -> Floats:
+    """Return the circularity gain (λ̄ − λ̄_neutral)/|λ̄_neutral| of each episode, shape (B,); NaN where λ̄_neutral = 0."""
+    reference = neutral.episode_circularity
+    return relative(rollout_.episode_circularity - reference, reference)
+
+
+def time_window(network: Network, rollout_: Rollout) -> Floats:
+    """Return 2·c·λ̄ of each episode, shape (B,), mass; c is the criticality that the network states.
+
+    It is the time-window circularity of CIRO7.2: see ``staged.time_window_circularity``.
+    """
+    assert network.objective.criticality is not None
+    return CIRO_FACTOR * network.objective.criticality * rollout_.episode_circularity
+
+
+def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
+    """Return the figures of each controller beside those of ``neutral``, ready for JSON.
+
+    Each figure is a mean over episodes with its 95 % confidence interval; gains are paired, episode by episode, with
+    the neutral controller's from the same start. A network that states the criticality of its material has its
+    time-window circularity as well (see ``time_window``).
+    """
+    neutral = rollouts["neutral"]
+    figures = {}
+    for name, run in rollouts.items():
+        figures[name] = {
+            "circularity": over_episodes(run.episode_circularity).as_dict(),
+            "circularity_gain": over_episodes(gain(run, neutral)).as_dict(),
+            "service_level": over_episodes(run.episode_service, SHARE).as_dict(),
+            "service_level_over_neutral": over_episodes(run.episode_service - neutral.episode_service).as_dict(),
+            "return": _by_agent(env, run.returns),
+            "local_return": _by_agent(env, run.local_returns),
+        }
+        if env.network.objective.criticality is not None:
+            figures[name]["time_window_circularity"] = over_episodes(time_window(env.network, run)).as_dict()
+    return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}
+
+
+def _by_agent(env: VectorEnv, samples: Floats) -> dict[str, Any]:
+    return {agent: over_episodes(row).as_dict() for agent, row in zip(env.agents, samples, strict=True)}

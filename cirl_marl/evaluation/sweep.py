@@ -1,0 +1,241 @@
+"""Service against circularity: what is possible, what plans achieve, and where learners with other weights end up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from cirl_marl import learners
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError, RunError
+from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.contenders import differences
+from cirl_marl.evaluation.yardstick import FRONT
+from cirl_marl.learners import Recipe, RunDirectory, load_recipe
+from cirl_marl.network import Floats, Network
+from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
+from cirl_marl.optimum.mpc import SERVICE_FIRST
+
+WEIGHED = ("mixed", "mixed_difference", "team")
+"""Reward modes in which the circularity weight has a part."""
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """A point in the plane of service and circularity.
+
+    Attributes:
+        kind: ``bound``, ``plan``, ``trained`` or ``neutral``.
+        service: mean service level; of a bound, the least that is demanded.
+        circularity: λ̄; of a bound, the highest with this service or more.
+        weight: circularity weight that was trained with.
+        seed: training seed.
+    """
+
+    kind: str
+    service: float
+    circularity: float
+    weight: float | None = None
+    seed: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """All points of a network.
+
+    Attributes:
+        network: under its scenario.
+        recipe: what was trained; None for nothing.
+        points: of every kind.
+        runs: training runs.
+        reason: why there is no bound; empty if there is.
+        front: service levels and what the multipliers of all bounds prove there, shape (levels, 2).
+    """
+
+    network: Network
+    recipe: Recipe | None
+    points: tuple[Point, ...]
+    runs: tuple[RunDirectory, ...] = field(default=())
+    reason: str = ""
+    front: Floats = field(default_factory=lambda: np.empty((0, 2)))
+
+    def of(self, kind: str) -> list[Point]:
+        """Return the points of one kind."""
+        return [point for point in self.points if point.kind == kind]
+
+
+def pareto(
+    network: str | Path | Network,
+    recipe: str | Path | Recipe | None = None,
+    *,
+    directory: Path,
+    scenario: str | None = None,
+    points: int = 5,
+    seeds: int = 1,
+    steps: int | None = None,
+    episodes: int = 16,
+    progress: Progress = lambda what, share: None,
+) -> Sweep:
+    """Sweep the weight between circularity and service.
+
+    The bound and its plans start in the middle of all initial ranges and demand a mean service level from what the
+    highest circularity leaves to the most there can be. Learners are trained with circularity weights from 0 to 1, in
+    ``directory/runs``; a finished run there is not repeated, an interrupted one goes on.
+
+    Args:
+        network: catalogue name, definition file, or network.
+        recipe: what to train; None for nothing.
+        directory: where runs are kept.
+        scenario: scenario of the definition; None is the default.
+        points: how many service levels and weights, at least 2.
+        seeds: training seeds 0, 1, … of each weight.
+        steps: environment steps of each training; None is the recipe's.
+        episodes: fresh episodes on which each policy is evaluated.
+        progress: called with what is being done and the share of all that is done.
+
+    Raises:
+        CirlError: for input that cannot be used, or a reward in which the weight has no part.
+        NoCertificate: if there is no bound and nothing to train either.
+        RunError: if ``directory`` holds the runs of something else.
+    """
+    if points < 2 or seeds < 1:
+        raise CirlError(f"points must be at least 2 and seeds at least 1, got {points} and {seeds}")
+    found = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    chosen = load_recipe(recipe) if isinstance(recipe, str | Path) else recipe
+    if chosen is not None:
+        _check_fit(found, chosen)
+    share = 1.0 if chosen is None else points / (points + points * seeds)
+    reason = ""
+    possible: tuple[Point, ...] = ()
+    front = np.empty((0, 2))
+    try:
+        possible, front = _possible(found, points, lambda what, part: progress(what, part * share))
+    except NoCertificate as missing:
+        if chosen is None:
+            raise
+        reason, share = str(missing), 0.0
+    if chosen is None:
+        return Sweep(found, None, possible, front=front)
+    runs = []
+    for place in range(points * seeds):
+        asked = _Asked(found, chosen, place // seeds / (points - 1), place % seeds, steps)
+        told = _part(progress, f"training {asked}", share, (1 - share) / (points * seeds), place)
+        runs.append(asked.run(directory / "runs", told))
+    groups = [runs[first : first + seeds] for first in range(0, len(runs), seeds)]
+    learnt = tuple(point for group in groups for point in _learnt(group, episodes))
+    neutral = [each for each in learnt if each.kind == "neutral"][:1]
+    trained = [each for each in learnt if each.kind == "trained"]
+    return Sweep(found, chosen, (*possible, *trained, *neutral), tuple(runs), reason, front)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """A training run of a sweep."""
+
+    network: Network
+    recipe: Recipe
+    weight: float
+    seed: int
+    steps: int | None
+
+    def __str__(self) -> str:
+        return f"weight {self.weight:.3g}, seed {self.seed}"
+
+    def run(self, folder: Path, progress: Callable[[float], None]) -> RunDirectory:
+        """Train, go on training, or find the finished run."""
+        run = RunDirectory(folder / f"{self.recipe.name}-weight{self.weight:.6g}-seed{self.seed}")
+        if run.path.exists():
+            self._check(run)
+            if run.status["state"] != "complete":
+                learners.resume(run.path, report=lambda now: progress(now.env_steps / max(now.total, 1)))
+        else:
+            learners.train(
+                self.network,
+                self.recipe,
+                directory=run.path,
+                steps=self.steps,
+                seed=self.seed,
+                circularity_weight=self.weight,
+                report=lambda now: progress(now.env_steps / max(now.total, 1)),
+            )
+        return run
+
+    def _check(self, run: RunDirectory) -> None:
+        """Refuse a run that answers another question."""
+        config = run.config
+        steps = self.recipe.run.steps if self.steps is None else self.steps
+        found = list(differences(run.make_env(1), _env(self.network, self.recipe)))
+        found += [f"{config.steps} steps, not {steps}"] if config.steps != steps else []
+        found += ["another recipe of this name"] if config.recipe != self.recipe else []
+        if found:
+            raise RunError(f"{run.path}: is of another sweep ({'; '.join(found)}); choose another folder")
+
+
+def _env(network: Network, recipe: Recipe) -> VectorEnv:
+    options = {name: value for name, value in recipe.environment.items() if name != "scenario"}
+    return VectorEnv(network, num_envs=1, **options)
+
+
+def _check_fit(network: Network, recipe: Recipe) -> None:
+    named = recipe.environment.get("scenario", network.scenario_name)
+    if named != network.scenario_name:
+        raise CirlError(
+            f"recipe '{recipe.name}' is for scenario '{named}', the sweep for '{network.scenario_name}': ask for one"
+        )
+    env = _env(network, recipe)
+    recipe.check_agents(env.agents)
+    if env.reward_mode not in WEIGHED:
+        raise CirlError(
+            f"recipe '{recipe.name}' is paid by '{env.reward_mode}', in which the weight of circularity has no part; "
+            f"choose one that is paid by {', '.join(WEIGHED)}"
+        )
+
+
+def _possible(network: Network, points: int, progress: Progress) -> tuple[tuple[Point, ...], Floats]:
+    """Return bounds by demanded service, what their improved plans do in the simulator, and the front they prove."""
+    found: list[Point] = []
+    bounds: list[Bound] = []
+    progress("bounds and plans", 0.0)
+    least, most = (bound(network, service_weight=weight).service for weight in (1 / SERVICE_FIRST, SERVICE_FIRST))
+    for place, level in enumerate(_levels(least, most, points)):
+        solved = bound(network, min_service=level, near=bounds[-1] if bounds else None)
+        bounds.append(solved)
+        found.append(Point(kind="bound", service=level, circularity=solved.objective))
+        episode = achieved(improved(solved, progress=_planned(progress, place / points, 1 / points)))
+        service, circularity = float(episode.episode_service[0]), float(episode.episode_circularity[0])
+        found.append(Point(kind="plan", service=service, circularity=circularity))
+        progress("bounds and plans", (place + 1) / points)
+    levels = np.linspace(least, most, FRONT)
+    return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels)], axis=1)
+
+
+def _planned(progress: Progress, done: float, each: float) -> Callable[[float], None]:
+    return lambda share: progress("bounds and plans", done + each * share)
+
+
+def _levels(least: float, most: float, points: int) -> list[float]:
+    """Return service levels from least to most, rounded down a little so that the most can be had."""
+    levels: Floats = np.linspace(least, most, points)
+    return sorted({math.floor(level * 1e4) / 1e4 for level in levels.tolist()})
+
+
+def _learnt(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
+    """Yield where the policies of one weight are, and neutral control."""
+    for entry in compare(runs, ["neutral"], episodes=episodes, bounds=False).entries:
+        yield Point(
+            kind="neutral" if entry.run is None else "trained",
+            service=float(entry.service.mean()),
+            circularity=float(entry.circularity.mean()),
+            weight=None if entry.run is None else entry.run.config.options["circularity_weight"],
+            seed=entry.seed,
+        )
+
+
+def _part(progress: Progress, what: str, done: float, each: float, place: int) -> Callable[[float], None]:
+    return lambda share: progress(what, done + each * (place + min(1.0, share)))

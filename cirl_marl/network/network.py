@@ -1,0 +1,248 @@
+"""The thermodynamical material network: compartments, flow laws, roles and the circularity they imply.
+
+A network is a digraph of compartments that handle one target material. A *node* holds a stock ``x_i``; an *arc*
+``k: i → j`` carries a flow ``f_k``. Only the network moves mass::
+
+    dx/dt = S f,    S[i, k] = -1 if i donates to arc k, +1 if i receives from it
+
+so mass is conserved by construction. Circularity is derived from the roles of the nodes and is never written by hand
+(Zocco et al., CiRL, Definition 2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.network.elements import (
+    SINKS,
+    Compartment,
+    Law,
+    Role,
+    Service,
+)
+from cirl_marl.network.parts import Parts
+from cirl_marl.network.rowsum import Floats, Integers, RowSum
+from cirl_marl.network.validate import problems
+
+if TYPE_CHECKING:
+    import networkx
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network(Parts):
+    """A thermodynamical material network under one scenario; its attributes are those of ``Parts``."""
+
+    def __post_init__(self) -> None:
+        """Refuse a network that cannot be simulated, naming every fault."""
+        found = list(problems(self))
+        if found:
+            raise NetworkError(f"network '{self.name}'", found)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Pickle the fields, not the arrays derived from them."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+    def scenario(self, name: str | None) -> Network:
+        """Return this network under scenario ``name`` (None: as it is).
+
+        Raises:
+            CirlError: if the definition has no such scenario.
+        """
+        if name is None or name == self.scenario_name:
+            return self
+        if name not in self.scenarios:
+            known = sorted({self.scenario_name, *self.scenarios})
+            hint = "" if self.scenarios else " A network with other options has no other scenarios: choose it first."
+            raise CirlError(f"network '{self.name}': {unknown('scenario', name, known)}{hint}")
+        found: Network = self.scenarios[name]
+        return found
+
+    def with_options(self, **groups: Mapping[str, object]) -> Network:
+        """Return a copy with fields of ``episode``, ``objective`` or ``observation`` replaced.
+
+        The copy has no other scenarios: they would not have these options.
+
+        >>> from cirl_marl import load_network
+        >>> load_network("copper_net").with_options(episode={"horizon": 3}).episode.horizon
+        3
+        """
+        known_groups = ("episode", "objective", "observation")
+        for group, values in groups.items():
+            if group not in known_groups:
+                raise CirlError(f"with_options: {unknown('group', group, known_groups)}")
+            known = [each.name for each in fields(getattr(self, group))]
+            for name in values:
+                if name not in known:
+                    raise CirlError(f"with_options: {group}: {unknown('field', name, known)}")
+        changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
+        return replace(self, **changes, scenarios={})
+
+    def in_local_order(self) -> Network:
+        """Return the same network with neighbours next to each other: nodes by reverse Cuthill-McKee, arcs by donor.
+
+        It changes the order of every array and nothing else, but for round-off; the copy has no other scenarios. A step
+        of a large network whose compartments come in random order spends most of its time waiting for memory; in this
+        order it does not.
+        """
+        size = len(self.nodes)
+        links = sparse.csr_array((np.ones(len(self.arcs)), (self.donors, self.recipients)), shape=(size, size))
+        order = csgraph.reverse_cuthill_mckee(sparse.csr_array(links + links.T), symmetric_mode=True)
+        place = np.empty(size, dtype=np.intp)
+        place[order] = np.arange(size)
+        arcs = np.lexsort((place[self.recipients], place[self.donors]))
+        return replace(
+            self,
+            nodes=tuple(self.nodes[i] for i in order),
+            arcs=tuple(self.arcs[k] for k in arcs),
+            scenarios={},
+        )
+
+    @cached_property
+    def compartments(self) -> Mapping[str, Compartment]:
+        """Every compartment by id, nodes first."""
+        return MappingProxyType({c.id: c for c in (*self.nodes, *self.arcs)})
+
+    @cached_property
+    def node_index(self) -> Mapping[str, int]:
+        """Position of each node in stock arrays."""
+        return MappingProxyType({node.id: i for i, node in enumerate(self.nodes)})
+
+    @cached_property
+    def arc_index(self) -> Mapping[str, int]:
+        """Position of each arc in flow arrays."""
+        return MappingProxyType({arc.id: k for k, arc in enumerate(self.arcs)})
+
+    @cached_property
+    def donors(self) -> Integers:
+        """Donor node of each arc, shape (arcs,)."""
+        return _read_only(np.array([self.node_index[arc.donor] for arc in self.arcs], dtype=np.intp))
+
+    @cached_property
+    def recipients(self) -> Integers:
+        """Recipient node of each arc, shape (arcs,)."""
+        return _read_only(np.array([self.node_index[arc.recipient] for arc in self.arcs], dtype=np.intp))
+
+    @cached_property
+    def controllable(self) -> tuple[str, ...]:
+        """Compartments that have a control, nodes first, in definition order."""
+        return tuple(c.id for c in self.compartments.values() if c.control is not None)
+
+    @cached_property
+    def control_rows(self) -> Mapping[str, slice]:
+        """Rows of each controllable compartment in control arrays: one, or one per input of its model."""
+        edges = np.cumsum([0, *(self.compartments[id_].actions for id_ in self.controllable)]).tolist()
+        return MappingProxyType({id_: slice(edges[i], edges[i + 1]) for i, id_ in enumerate(self.controllable)})
+
+    @cached_property
+    def agents(self) -> tuple[str, ...]:
+        """Compartments that act by default."""
+        return self.acting or self.controllable
+
+    @cached_property
+    def sustainability(self) -> Floats:
+        """σ_k of each arc: the sign with which its flow counts as finite-time sustainable, shape (arcs,).
+
+        +1 if material leaves a non-renewable reservoir or enters a landfill, an incinerator or, as a pollutant, the
+        environment; −1 if it leaves the environment or returns to a reservoir; 0 otherwise or if both hold. What goes
+        from one compartment of the environment to another neither enters nor leaves it.
+        """
+        signs = []
+        for arc in self.arcs:
+            donor, recipient = self._role(arc.donor), self._role(arc.recipient)
+            within = donor is recipient is Role.ENVIRONMENT
+            enters = recipient in SINKS and not within and (recipient is not Role.ENVIRONMENT or arc.pollutant)
+            lost = donor is Role.NONRENEWABLE_RESERVOIR or enters
+            regained = (donor is Role.ENVIRONMENT and not within) or recipient is Role.NONRENEWABLE_RESERVOIR
+            signs.append(float(lost) - float(regained))
+        return _read_only(np.array(signs))
+
+    @cached_property
+    def environmental(self) -> NDArray[np.bool_]:
+        """Arcs that touch the environment, whose net flow is φ_nz, shape (arcs,)."""
+        through = [Role.ENVIRONMENT in (self._role(a.donor), self._role(a.recipient)) for a in self.arcs]
+        return _read_only(np.array(through, dtype=bool))
+
+    @cached_property
+    def graph(self) -> networkx.DiGraph:
+        """The network as a frozen networkx digraph; parallel arcs share an edge, whose ``arcs`` are all of them."""
+        import networkx
+
+        graph = networkx.DiGraph(name=self.name)
+        for node in self.nodes:
+            graph.add_node(node.id, role=node.role.value, compartment=node)
+        for arc in self.arcs:
+            known = graph.get_edge_data(arc.donor, arc.recipient, {"arcs": ()})["arcs"]
+            graph.add_edge(arc.donor, arc.recipient, arcs=(*known, arc))
+        networkx.freeze(graph)
+        return graph
+
+    def circularity(self, flow: Floats, batched: Floats | None = None) -> Floats:
+        """Return λ(N;t) = −(m_fb + Δ·σᵀf), σᵀf summed over the continuous flows.
+
+        With ``net_zero = "abs"`` the part through the environment enters by its absolute value,
+        λ = −(m_rest + Δ·σ_rest·f) − |m_env + Δ·σ_env·f|. Given mean flows this is λ of the mean flows, which for
+        ``abs`` is not the mean of λ if the net flow changes its sign within the interval.
+
+        Args:
+            flow: f, shape (arcs, ...), mass/time; entries of batch arcs are ignored.
+            batched: m_fb, net batch mass moved finite-time sustainably so far, not through and through the environment,
+                shape (2, ...), mass; None if nothing moves in batches.
+
+        Returns:
+            λ, shape (...), mass.
+
+        Raises:
+            CirlError: if there is not one flow for each arc.
+
+        References: Zocco et al., CiRL (arXiv 2505.21536), Definition 2.
+        """
+        if flow.shape[:1] != (len(self.arcs),):
+            raise CirlError(
+                f"network '{self.name}': flows of shape {flow.shape}; the first axis is that of its {len(self.arcs)} "
+                f"arcs, {', '.join(self.arc_index)}"
+            )
+        columns = (2, math.prod(flow.shape[1:]))
+        parts = self._circularity_parts(flow.reshape(len(self.arcs), columns[1]))
+        if batched is not None:
+            parts = parts - batched.reshape(columns)
+        through = -np.abs(parts[1]) if self.objective.net_zero == "abs" else parts[1]
+        circularity: Floats = (parts[0] + through).reshape(flow.shape[1:])
+        return circularity
+
+    @cached_property
+    def circularity_weights(self) -> Floats:
+        """−Δ·σ_rest and −Δ·σ_env, weights in λ of flows not through and through the environment, shape (2, arcs)."""
+        continuous = np.array([arc.law is not Law.BATCH for arc in self.arcs], dtype=bool)
+        weights = -self.objective.reference_interval * self.sustainability * continuous
+        return _read_only(np.stack([weights * ~self.environmental, weights * self.environmental]))
+
+    @cached_property
+    def _circularity_parts(self) -> RowSum:
+        rows, arcs = np.nonzero(self.circularity_weights)
+        return RowSum(rows, arcs, self.circularity_weights[rows, arcs], (2, len(self.arcs)))
+
+    def metered(self, service: Service) -> Integers:
+        """Return the arcs whose flows add up to what a service of quantity ``flow`` or ``outflow`` measures."""
+        if service.quantity == "outflow":
+            return np.flatnonzero(self.donors == self.node_index[service.provider])
+        return np.array([self.arc_index[service.provider]])
+
+    def _role(self, node: str) -> Role:
+        return self.nodes[self.node_index[node]].role
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """Keep what a network derives once from being written to: networks are shared."""
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,49 @@
+"""The parts of a network as they are given: what checks look at, and what a ``Network`` adds its arrays to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cirl_marl.network.elements import Arc, Episode, Node, Objective, Observation, Service
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """What a network under one scenario is made of, before anything is known to be wrong with it.
+
+    Attributes:
+        name: name in the catalogue, or of the definition file.
+        nodes: compartments with a stock, in the order of every stock array.
+        arcs: compartments with a flow, in the order of every flow array.
+        services: what the network owes its users.
+        episode: time and solver.
+        objective: circularity and rewards.
+        observation: default observation.
+        acting: compartments that act by default; empty means every compartment with a control.
+        mass_unit: unit of stocks.
+        time_unit: unit of time.
+        title: one line for tables.
+        source: definition file that it was read from; None if it was built in Python.
+        source_sha256: hash of that file as it was then.
+        scenario_name: the scenario that this network describes.
+        scenarios: the other scenarios of the same definition, by name.
+    """
+
+    name: str
+    nodes: tuple[Node, ...]
+    arcs: tuple[Arc, ...]
+    services: tuple[Service, ...] = ()
+    episode: Episode = field(default_factory=Episode)
+    objective: Objective = field(default_factory=Objective)
+    observation: Observation = field(default_factory=Observation)
+    acting: tuple[str, ...] = ()
+    mass_unit: str = "kg"
+    time_unit: str = "day"
+    title: str = ""
+    source: Path | None = field(default=None, repr=False, compare=False)
+    source_sha256: str | None = field(default=None, repr=False, compare=False)
+    scenario_name: str = "default"
+    scenarios: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)

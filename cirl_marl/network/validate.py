@@ -1,0 +1,293 @@
+"""Every reason why a network cannot be simulated, so that a definition is mended in one go."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
+from itertools import pairwise
+
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network.elements import MAX_STEPS, Arc, Compartment, ControlKind, Law, Node, ranged_states
+from cirl_marl.network.parts import Parts
+from cirl_marl.network.units import factor
+from cirl_marl.network.validate_services import service_problems
+from cirl_marl.network.validate_settings import is_whole, repeated, setting_problems
+
+IDENTIFIER = r"^[a-z][a-z0-9_]*$"
+"""How compartments and services may be called; their names are keys of definition files and names of files."""
+
+FIELDS = {
+    Law.DONOR: ("rate",),
+    Law.RECIPIENT: ("rate",),
+    Law.CONTROLLED: (),
+    Law.EXOGENOUS: ("flow", "times"),
+    Law.COMPARTMENT: ("rate", "by"),
+    Law.BATCH: ("rate", "by", "port", "batches", "delay"),
+}
+"""What each law takes, of the fields that only some laws take."""
+
+OWN = {f.name: f.default for f in fields(Arc) if any(f.name in taken for taken in FIELDS.values())}
+"""Those fields, with their defaults."""
+
+
+def problems(network: Parts) -> Iterator[str]:
+    """Yield every reason why ``network`` cannot be simulated."""
+    if not re.fullmatch(IDENTIFIER, network.name):
+        yield f"name '{network.name}': begins with a letter and has lower-case letters, digits and underscores only"
+    for key, unit, base in (("mass", network.mass_unit, "kg"), ("time", network.time_unit, "s")):
+        try:
+            factor(unit, base)
+        except CirlError as error:
+            yield f"units.{key}: {error}"
+    if not network.nodes:
+        yield "nodes: a network needs at least one"
+    yield from _name_problems([*(("node", n.id) for n in network.nodes), *(("arc", a.id) for a in network.arcs)])
+    yield from _name_problems([("service", service.id) for service in network.services])
+    nodes = {node.id: node for node in network.nodes}
+    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
+    for node in network.nodes:
+        yield from _node_problems(network, node)
+    controlled: dict[str, list[Arc]] = {}
+    for arc in network.arcs:
+        yield from _arc_problems(network, arc, nodes, everyone)
+        if arc.law is Law.CONTROLLED:
+            controlled.setdefault(arc.donor, []).append(arc)
+    for node in network.nodes:
+        outflows = controlled.get(node.id, [])
+        if node.control and node.control.kind is ControlKind.FLOW and len(outflows) != 1:
+            yield (
+                f"node '{node.id}': control.kind 'flow' needs exactly one controlled outflow, it has {len(outflows)}"
+            )
+        for arc in outflows:
+            sets_flow = [c for c in (node, arc) if c.control is not None and c.control.kind is ControlKind.FLOW]
+            if len(sets_flow) != 1:
+                yield (
+                    f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', on the arc or on its "
+                    f"donor '{node.id}'; it has {len(sets_flow)}"
+                )
+    carrying = _ports(network)
+    for (donor, port), arcs in carrying.items():
+        if len(arcs) > 1:
+            yield f"arc '{arcs[1]}': port '{port}' of '{donor}' has the arc '{arcs[0]}' already"
+    for node in network.nodes:
+        for port in getattr(node.model, "ports", ()):
+            if (node.id, port) not in carrying:
+                yield (
+                    f"node '{node.id}': what its model releases to port '{port}' would stay; give it an arc of law "
+                    f"'batch' with by = '{node.id}' and port = '{port}'"
+                )
+    yield from service_problems(network)
+    yield from setting_problems(network)
+    acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
+    for agent in network.acting:
+        if agent in everyone and agent not in acting:
+            yield f"agents: '{agent}' has no control, so that it cannot act"
+        elif agent not in acting:
+            yield f"agents: {unknown('agent', agent, acting)}"
+    yield from repeated("agents", network.acting)
+
+
+def _ports(network: Parts) -> dict[tuple[str, str], list[str]]:
+    """Return the arcs that carry what is released, by compartment and port."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for arc in network.arcs:
+        if arc.law is Law.BATCH and arc.by:
+            found.setdefault((arc.by, arc.port), []).append(arc.id)
+    return found
+
+
+def _name_problems(named: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Yield ids that are none, and those used twice, of what shares one set of names, given as (kind, id)."""
+    kinds: dict[str, list[str]] = {}
+    for kind, id_ in named:
+        kinds.setdefault(id_, []).append(kind)
+    for id_, users in kinds.items():
+        who = f"{' and '.join(dict.fromkeys(users))} '{id_}'"
+        if not re.fullmatch(IDENTIFIER, id_):
+            yield f"{who}: an id begins with a letter and has lower-case letters, digits and underscores only"
+        if len(users) > 1:
+            shared = "; nodes and arcs share one set of names" if len(set(users)) > 1 else ""
+            yield f"{who}: the id is used twice{shared}"
+
+
+def _node_problems(network: Parts, node: Node) -> Iterator[str]:
+    low, high = node.initial
+    if not (math.isfinite(low) and math.isfinite(high)) or low > high:
+        yield f"node '{node.id}': initial range [{low}, {high}] is empty or not finite"
+    elif low < 0 and network.episode.solver != "euler":
+        yield f"node '{node.id}': initial stock {low} is negative"
+    yield from _common_problems(f"node '{node.id}'", node, network)
+
+
+def _arc_problems(
+    network: Parts, arc: Arc, nodes: Mapping[str, Node], everyone: Mapping[str, Compartment]
+) -> Iterator[str]:
+    where = f"arc '{arc.id}'"
+    for end, node in (("from", arc.donor), ("to", arc.recipient)):
+        if node not in nodes:
+            yield f"{where}: {end}: {unknown('node', node, nodes)}"
+    if arc.donor == arc.recipient:
+        yield f"{where}: a cycle of zero delay: it returns to its own donor '{arc.donor}' without passing a stock"
+    for name, default in OWN.items():
+        given = getattr(arc, name)
+        if name not in FIELDS[arc.law] and given != default:
+            taken = ", ".join(FIELDS[arc.law]) or "none of these"
+            yield f"{where}: {name} = {given!r}: law '{arc.law}' takes {taken}"
+    if not math.isfinite(arc.rate) or arc.rate < 0:
+        yield f"{where}: rate {arc.rate} must be finite and not negative"
+    if arc.law is Law.COMPARTMENT:
+        yield from _model_flow_problems(where, arc, everyone)
+    if arc.law is Law.BATCH:
+        yield from _batch_problems(where, arc, network, nodes)
+    if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and arc.rate == 0:
+        yield f"{where}: law '{arc.law}' needs a positive rate"
+    if not arc.flow or any(not math.isfinite(f) or f < 0 for f in arc.flow):
+        yield f"{where}: flow {arc.flow} must be finite and not negative"
+    if arc.flow and len(arc.flow) != max(len(arc.times), 1):
+        one = "one for each" if arc.times else "a constant flow has one; a series needs the times at which they begin"
+        yield f"{where}: series has {len(arc.times)} times and {len(arc.flow)} values: {one}"
+    if arc.times and (arc.times[0] != 0 or not all(a < b < math.inf for a, b in pairwise(arc.times))):
+        yield f"{where}: series times {arc.times} must start at 0, increase and be finite"
+    if arc.control and arc.control.kind is ControlKind.FLOW and arc.law is not Law.CONTROLLED:
+        yield f"{where}: control.kind 'flow' needs law 'controlled', not '{arc.law}'"
+    if arc.control and arc.control.kind is ControlKind.RATE and arc.law is Law.CONTROLLED:
+        yield f"{where}: law 'controlled' needs control.kind 'flow', not 'rate'"
+    yield from _common_problems(where, arc, network)
+
+
+def _model_flow_problems(where: str, arc: Arc, everyone: Mapping[str, Compartment]) -> Iterator[str]:
+    ends = (arc.donor, arc.recipient, arc.id)
+    giving = [end for end in ends if end in everyone and hasattr(everyone[end].model, "outflow")]
+    if arc.by not in giving:
+        yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
+
+
+def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, Node]) -> Iterator[str]:
+    interval = network.episode.control_interval
+    vehicle = _has_vehicle(arc)
+    if vehicle == (arc.delay != 0):
+        yield f"{where}: law 'batch' needs a delay or a vehicle as its model, and not both"
+    if vehicle and not arc.by:
+        yield f"{where}: a vehicle carries what a compartment releases: it needs 'by', not a schedule"
+    if arc.by and arc.batches:
+        yield f"{where}: law 'batch' takes 'by' or a schedule of batches, not both"
+    if not arc.by and (arc.rate or arc.port):
+        yield f"{where}: a schedule of batches takes no rate and no port"
+    times = [time for time, _ in arc.batches]
+    if any(not (math.isfinite(value) and value >= 0) for pair in arc.batches for value in pair):
+        yield f"{where}: times and masses of batches {arc.batches} must be finite and not negative"
+        return
+    if math.isfinite(interval) and interval > 0:  # anything else is a problem of its own
+        for what, time in [("delay", arc.delay), *(("batch at", time) for time in times)]:
+            if time < 0:
+                yield f"{where}: {what} {time:g} must not be negative"
+            elif what == "delay" and time / interval > MAX_STEPS:
+                yield (
+                    f"{where}: delay {time:g} {network.time_unit} is {time / interval:.6g} control intervals of "
+                    f"{interval:g} {network.time_unit}, more than {MAX_STEPS:,}. Is it in the wrong unit?"
+                )
+            elif not is_whole(time / interval) or (0 < time < interval / 2):
+                yield f"{where}: {what} {time:g} is not a whole number of control intervals of {interval:g}"
+    for what, given in (("set_point", arc.set_point), ("control of kind 'rate'", _rate_control(arc))):
+        if given is not None:
+            yield f"{where}: law 'batch' takes no {what}"
+    donor = nodes.get(arc.donor)
+    if arc.by and donor is not None:
+        ports = getattr(donor.model, "ports", ())
+        if arc.by != donor.id or not ports:
+            yield f"{where}: by: batches are released by the model of the donor '{donor.id}', which has ports {ports}"
+        elif arc.port not in ports:
+            yield f"{where}: {unknown('port', arc.port, ports)}"
+        if arc.rate <= 0:
+            yield f"{where}: law 'batch' with 'by' needs a positive rate, the mass per unit released"
+        else:
+            yield from _unit_problems(where, arc, network.mass_unit, donor)
+
+
+def _unit_problems(where: str, arc: Arc, mass_unit: str, donor: Node) -> Iterator[str]:
+    """Yield it if a model that knows the mass of what it releases knows another than its arc."""
+    unit_kg = getattr(donor.model, "unit_kg", None)
+    try:
+        carried_kg = arc.rate * factor(mass_unit, "kg")
+    except CirlError:
+        return  # a problem of its own
+    if unit_kg is not None and not math.isclose(carried_kg, unit_kg):
+        yield f"{where}: rate: {carried_kg:g} kg a unit, but '{donor.id}' releases units of {unit_kg:g} kg"
+
+
+def _has_vehicle(arc: Arc) -> bool:
+    return arc.law is Law.BATCH and hasattr(arc.model, "boarding")
+
+
+def _rate_control(arc: Arc) -> str | None:
+    return arc.control.kind if arc.control is not None and arc.control.kind is ControlKind.RATE else None
+
+
+def _common_problems(where: str, compartment: Compartment, network: Parts) -> Iterator[str]:
+    if not math.isfinite(compartment.scale) or compartment.scale <= 0:
+        yield f"{where}: scale {compartment.scale} must be positive and finite"
+    if compartment.set_point is not None and not math.isfinite(compartment.set_point):
+        yield f"{where}: set_point {compartment.set_point} must be finite"
+    states = ranged_states(compartment.model) if compartment.model is not None else ()
+    if not math.isfinite(compartment.reward_scale) or compartment.reward_scale <= 0:
+        yield f"{where}: reward_scale {compartment.reward_scale} must be positive and finite"
+    if len(compartment.inner) != len(states):
+        yield f"{where}: {len(compartment.inner)} initial ranges for the inner states {list(states)}"
+    for low, high in compartment.inner:
+        if not (math.isfinite(low) and math.isfinite(high)) or low > high:
+            yield f"{where}: initial range [{low}, {high}] of an inner state is empty or not finite"
+    control = compartment.control
+    yield from _bound_problems(where, compartment)
+    yield from _context_problems(where, compartment)
+    inputs = compartment.model.input_names if compartment.model is not None else ()
+    if compartment.model is not None and inputs and (control is None or control.kind is not ControlKind.INPUT):
+        yield (
+            f"{where}: model '{compartment.model.kind}' needs a control of kind 'input' for {', '.join(inputs)}, "
+            f"not {control.kind if control else 'none'}"
+        )
+    if control is None:
+        return
+    if control.kind is ControlKind.INPUT and not inputs:
+        yield f"{where}: control.kind 'input' needs a model with inputs"
+    unit = f" {network.mass_unit}/{network.time_unit}" if control.kind is ControlKind.FLOW else ""
+    if control.kind is ControlKind.FLOW and control.low < 0 and network.episode.solver != "euler":
+        yield f"{where}: control.low {control.low:g}{unit} would reverse the flow; use a second arc"
+    if not all(map(math.isfinite, (control.low, control.neutral, control.high))):
+        yield f"{where}: control bounds must be finite"
+    elif not control.low <= control.neutral <= control.high or control.low == control.high:
+        yield (
+            f"{where}: control needs low <= neutral <= high and low < high, "
+            f"got {control.low:g}, {control.neutral:g}, {control.high:g}{unit}"
+        )
+    if control.kind is ControlKind.RATE and control.low < 0:
+        yield f"{where}: control.low {control.low:g} is negative; a valve cannot reverse a flow"
+
+
+def _context_problems(where: str, compartment: Compartment) -> Iterator[str]:
+    """Yield what a compartment's model asks the network for that it is not told there."""
+    told: tuple[str, ...] = ()
+    if isinstance(compartment, Node):
+        told = ("stock_kg",)
+    elif isinstance(compartment, Arc) and _has_vehicle(compartment):
+        told = ("load_kg",)
+    for name in getattr(compartment.model, "context_names", ()):
+        if name not in told:
+            kind = getattr(compartment.model, "kind", "")
+            yield f"{where}: model '{kind}': context_names: {unknown('quantity told to this model', name, told)}"
+
+
+def _bound_problems(where: str, compartment: Compartment) -> Iterator[str]:
+    """Yield starts and controls beyond what the equations of a compartment's model hold for."""
+    model, control = compartment.model, compartment.control
+    if model is None:
+        return
+    states = ranged_states(model)
+    ranges = dict(zip(states, compartment.inner, strict=True)) if len(states) == len(compartment.inner) else {}
+    if control is not None:
+        ranges |= dict.fromkeys(model.input_names, (control.low, control.high))
+    for name, (low, high) in getattr(model, "bounds", {}).items():
+        if name in ranges and not (low <= ranges[name][0] and ranges[name][1] <= high):
+            given = f"[{ranges[name][0]:g}, {ranges[name][1]:g}]"
+            yield f"{where}: model '{model.kind}' holds for {name} in [{low:g}, {high:g}], not for {given}"

@@ -1,0 +1,120 @@
+"""What is wrong with the clock, the objective and the observation of a network."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network.elements import MAX_STEPS, NET_ZERO, OBSERVE, REWARDS, SOLVERS, Compartment, Episode, Law
+from cirl_marl.network.parts import Parts
+from cirl_marl.network.units import factor
+
+
+def setting_problems(network: Parts) -> Iterator[str]:
+    """Yield every mistake in the settings of ``network``."""
+    episode, objective = network.episode, network.objective
+    for what, value, known in (
+        ("solver", episode.solver, SOLVERS),
+        ("net_zero", objective.net_zero, NET_ZERO),
+        ("reward", objective.reward, REWARDS),
+        ("observation mode", network.observation.mode, OBSERVE),
+    ):
+        if value not in known:
+            yield unknown(what, value, known)
+    for name, number in (
+        ("control_interval", episode.control_interval),
+        ("reference_interval", objective.reference_interval),
+        ("circularity_scale", objective.circularity_scale),
+    ):
+        if not math.isfinite(number) or number <= 0:
+            yield f"{name} {number} must be positive and finite"
+    criticality = objective.criticality
+    if criticality is not None and not (math.isfinite(criticality) and criticality >= 0):
+        yield f"criticality {criticality} must be finite and not negative"
+    if episode.horizon < 1:
+        yield f"horizon {episode.horizon} must be at least 1 step"
+    if not 0 <= objective.circularity_weight <= 1:
+        yield f"circularity_weight {objective.circularity_weight} must lie in [0, 1]"
+    if episode.solver != "exact":
+        yield from _step_problems(episode, network.time_unit)
+    else:
+        if episode.solver_step is not None:
+            yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
+        moving = any(c.model is not None and not hasattr(c.model, "interval") for c in (*network.nodes, *network.arcs))
+        if moving or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
+            yield (
+                "solver 'exact' knows no continuous inner physics: a network with models needs solver 'rk4' or 'euler'"
+            )
+    for compartment in (*network.nodes, *network.arcs):
+        yield from _clock_problems(network, compartment)
+    tracked = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None)
+    yield from repeated("objective.tracked", objective.tracked)
+    yield from repeated("observation.nodes", network.observation.nodes)
+    for name in objective.tracked:
+        if name not in tracked:
+            yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
+    if (network.observation.mode == "stocks") != bool(network.observation.nodes):
+        yield "observation: mode 'stocks', and only that mode, lists its nodes"
+    signals = dict.fromkeys(node.id for node in network.nodes)
+    for compartment in (*network.nodes, *network.arcs):
+        if compartment.model is not None:
+            signals |= dict.fromkeys(f"{compartment.id}.{name}" for name in compartment.model.state_names)
+    for name in network.observation.nodes:
+        if name not in signals:
+            yield f"observation: {unknown('node or inner state', name, signals)}"
+
+
+def _clock_problems(network: Parts, compartment: Compartment) -> Iterator[str]:
+    model = compartment.model
+    if model is None:
+        return
+    try:
+        factor(model.time_unit, "s")
+    except CirlError as error:
+        yield f"'{compartment.id}': model '{model.kind}': time_unit: {error}"
+        return
+    try:
+        interval = network.episode.control_interval * factor(network.time_unit, model.time_unit)
+    except CirlError:
+        return  # a problem of its own, units.time
+    step = getattr(model, "interval", None)
+    if step is not None and not math.isclose(interval, step, rel_tol=1e-9):
+        unit = model.time_unit
+        yield (
+            f"'{compartment.id}': model '{model.kind}' moves in steps of {step:g} {unit}; "
+            f"the control interval is {interval:g} {unit}"
+        )
+
+
+def _step_problems(episode: Episode, unit: str) -> Iterator[str]:
+    step = episode.solver_step
+    if step is None or not (math.isfinite(step) and step > 0):
+        yield f"solver '{episode.solver}' needs a positive solver_step, got {step}"
+        return
+    ratio = episode.control_interval / step
+    if not math.isfinite(episode.control_interval):
+        return  # a problem of its own
+    if ratio > MAX_STEPS:
+        yield (
+            f"control_interval {episode.control_interval:g} {unit} is {ratio:.6g} solver steps of {step:g} {unit}, "
+            f"more than {MAX_STEPS:,}. Is solver_step in the wrong unit?"
+        )
+    elif not is_whole(ratio) or round(ratio) < 1:
+        yield (
+            f"control_interval {episode.control_interval} is not a whole number of solver steps of {step} "
+            f"({ratio:.6g} steps)"
+        )
+
+
+def repeated(where: str, names: Iterable[str]) -> Iterator[str]:
+    """Yield names that a list has twice."""
+    for name, times in Counter(names).items():
+        if times > 1:
+            yield f"{where}: names '{name}' twice"
+
+
+def is_whole(ratio: float) -> bool:
+    """Return whether a ratio of times is a whole number, but for rounding."""
+    return math.isfinite(ratio) and math.isclose(ratio, round(ratio), rel_tol=1e-9, abs_tol=1e-9)

@@ -1,0 +1,289 @@
+"""The best plan found where nothing is proved: the cross-entropy method on the simulator itself.
+
+All copies of one ``VectorEnv`` start from the same state; each tries one sequence of actions, that of a known
+controller π plus deviations that are constant between knots,
+
+    a(t) = clip(π(o(t)) + θ_k, −1, 1),    k = ⌊t·knots/steps⌋,
+
+with θ drawn from independent Gaussians whose means and variances follow the best draws so far. The knots are doubled as
+the search goes on: the best constants are found soon, and are a good start for what is finer. π is the best of the
+candidates. It stays in the loop while the search goes on, so that what it balances by feedback does not fall over at
+the first deviation; the plan is the sequence of actions that the best copy took, open loop. As θ = 0 is π itself, no
+plan found is worse than a candidate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cirl_marl.controllers.basic import Constant, Controller, Neutral
+from cirl_marl.controllers.rollout import EVALUATION_SEEDS
+from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.optimum.gaussians import Gaussians, stages
+from cirl_marl.optimum.maximise import DEGREE, check_options
+from cirl_marl.optimum.population import Episodes, Population, named, starting_states
+
+SHORTFALL_PRICE = 10.0
+"""What a mean service level that is short of ``min_service`` by 1 costs, against λ̄/circularity_scale. The penalty is
+exact where more service costs less than that; a steeper one lets the draws hug the demanded level and stall there."""
+KNOTS = 16
+"""Stretches of an episode with deviations of their own, unless another number is asked for."""
+
+Progress = Callable[[float, Floats], None]
+"""Takes the share of all episodes that is simulated and the best merit from each start so far, shape (starts,)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Incumbent:
+    """The best plan found from one start, without certificate: nothing says how much better another could be.
+
+    Attributes:
+        network: the network, under the scenario and horizon that the plan is for.
+        agents: who acts; the others are neutral.
+        initial: stocks and inner states at the start, the first of ``VectorEnv.state_names``, shape (rows,).
+        actions: normalised actions, shape (steps, entries).
+        circularity: λ̄ that the plan achieves in the simulator, mass.
+        service: mean service level that it achieves.
+        candidates: λ̄ and mean service level of each controller that the search could begin with.
+        origin: the candidate that it began with.
+        evaluations: episodes simulated from this start, those of the candidates included.
+    """
+
+    network: Network
+    agents: tuple[str, ...]
+    initial: Floats
+    actions: Floats
+    circularity: float
+    service: float
+    candidates: Mapping[str, tuple[float, float]]
+    origin: str
+    evaluations: int
+
+    def __str__(self) -> str:
+        """Say what the plan achieves, and that nothing is proved about others."""
+        return (
+            f"λ̄ {self.circularity:.6g} {self.network.mass_unit}, service {self.service:.4f}:"
+            f" best plan found in {self.evaluations:,} episodes, no certificate"
+        )
+
+
+def search(
+    network: str | Path | Network,
+    initial: Mapping[str, float] | ArrayLike | None = None,
+    *,
+    service_weight: float | None = None,
+    min_service: float | None = None,
+    agents: Sequence[str] | None = None,
+    scenario: str | None = None,
+    horizon: int | None = None,
+    candidates: Mapping[str, Controller] | None = None,
+    knots: int = KNOTS,
+    population: int = 64,
+    iterations: int = 30,
+    seed: int = 0,
+    progress: Progress = lambda share, merit: None,
+) -> Incumbent:
+    """Look for the actions that do best over one episode, for any network; nothing is proved about the result.
+
+    The merit of an episode is λ̄/circularity_scale; with ``service_weight`` w, λ̄/circularity_scale + w·(mean service
+    level); with ``min_service`` s, λ̄/circularity_scale − SHORTFALL_PRICE·max(0, s − mean service level): a plan may
+    miss s if no better one was found, and its ``service`` tells.
+
+    Args:
+        network: catalogue name, path of a definition file, or a network.
+        initial: node → stock and ``compartment.state`` → inner state, the rest as in the first episode of evaluations;
+            or all of them, shape (rows,). None: the first episode of evaluations, ``rollout``'s.
+        service_weight: w ≥ 0; excludes ``min_service``.
+        min_service: s in [0, 1].
+        agents: who acts; None is the network's own choice.
+        scenario: scenario of the definition; None is the default.
+        horizon: decisions per episode; None takes the definition's.
+        candidates: name → controller; None takes ``standard_candidates``.
+        knots: stretches of the episode in which deviations are constant, at most one for each decision; the search
+            begins with a single one and ends with these.
+        population: plans tried in an iteration.
+        iterations: of the method; 0 takes the best candidate.
+        seed: of the draws; the same seed finds the same plan.
+        progress: called after each interval of the episodes that are simulated side by side.
+
+    Raises:
+        CirlError: for input that cannot be used.
+    """
+    env = VectorEnv(network, num_envs=1, agents=agents, scenario=scenario, horizon=horizon)
+    given: Mapping[str, ArrayLike] = {}
+    if isinstance(initial, Mapping):
+        given = initial
+    elif initial is not None:
+        given = named(env, np.asarray(initial, dtype=float)[None])
+    env.reset(seed=EVALUATION_SEEDS, options={"initial_state": given})
+    return search_each(
+        env.network,
+        starting_states(env),
+        service_weight=service_weight,
+        min_service=min_service,
+        agents=agents,
+        candidates=candidates,
+        knots=knots,
+        population=population,
+        iterations=iterations,
+        seed=seed,
+        progress=progress,
+    )[0]
+
+
+def search_each(
+    network: Network,
+    initial: Floats,
+    *,
+    service_weight: float | None = None,
+    min_service: float | None = None,
+    agents: Sequence[str] | None = None,
+    candidates: Mapping[str, Controller] | None = None,
+    knots: int = KNOTS,
+    population: int = 64,
+    iterations: int = 30,
+    seed: int = 0,
+    progress: Progress = lambda share, merit: None,
+) -> list[Incumbent]:
+    """Look for the best actions from several starts at once, which costs less than one after the other.
+
+    All starts share the draws, so each plan is the one that ``search`` finds from that start alone.
+
+    Args:
+        network: under its scenario and horizon.
+        initial: stocks and inner states, the first of ``VectorEnv.state_names``, shape (starts, rows).
+        service_weight: see ``search``.
+        min_service: see ``search``.
+        agents: see ``search``.
+        candidates: see ``search``.
+        knots: see ``search``.
+        population: plans tried from each start in an iteration.
+        iterations: see ``search``.
+        seed: see ``search``.
+        progress: see ``search``.
+
+    Raises:
+        CirlError: see ``search``.
+    """
+    check_options(service_weight, min_service, DEGREE)
+    for name, value, least in (("population", population, 8), ("iterations", iterations, 0), ("knots", knots, 1)):
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+            raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    if knots > network.episode.horizon:
+        raise CirlError(f"knots: {knots} are more than the {network.episode.horizon} decisions of an episode")
+    merit = _Merit(network.objective.circularity_scale, service_weight, min_service)
+    starts = np.asarray(initial, dtype=float)
+    copies = Population(network, agents, starts, population)
+    known = standard_candidates(copies.agents) if candidates is None else dict(candidates)
+    if not known:
+        raise CirlError("candidates: give at least one controller to begin with")
+    evaluations = len(known) + population * iterations
+    highest = np.full(len(starts), -np.inf)
+    simulated = 0
+
+    def told(episodes: int) -> Callable[[float], None]:
+        return lambda share: progress((simulated + episodes * share) / evaluations, highest)
+
+    controllers = list(known.values())
+    entrants = np.tile(np.arange(len(known)), (len(starts), 1))
+    first = Population(network, copies.agents, starts, len(known)).run(
+        controllers, entrants, np.zeros((*entrants.shape, 1, copies.entries)), told(len(known))
+    )
+    best = _Best.among(first, merit.of(first))
+    origin = best.copy
+    gaussians = Gaussians(best.merit, population, copies.entries, seed)
+    simulated, highest = len(known), best.merit
+    for count in stages(knots, iterations):
+        gaussians.refine(count)
+        which = np.repeat(origin[:, None], population, axis=1)
+        tried = copies.run(controllers, which, gaussians.draw(), told(population))
+        gaussians.learn(merit.of(tried), tried.deviation)
+        best = best.or_better(_Best.among(tried, merit.of(tried)))
+        simulated, highest = simulated + population, best.merit
+    progress(1.0, best.merit)
+    return [
+        Incumbent(
+            network=network,
+            agents=copies.agents,
+            initial=starts[i].copy(),
+            actions=best.actions[i],
+            circularity=float(best.circularity[i]),
+            service=float(best.service[i]),
+            candidates=dict(
+                zip(known, zip(first.circularity[i].tolist(), first.service[i].tolist(), strict=True), strict=True)
+            ),
+            origin=list(known)[origin[i]],
+            evaluations=evaluations,
+        )
+        for i in range(len(starts))
+    ]
+
+
+def standard_candidates(agents: Sequence[str]) -> dict[str, Controller]:
+    """Return neutral control, scripts (neutral for agents without one), and all agents at either end of their range."""
+    ends = {"lowest": -1.0, "highest": 1.0}
+    held = {name: Constant(dict.fromkeys(agents, value)) for name, value in ends.items()}
+    return {"neutral": Neutral(), "scripted": Scripted(), **held}
+
+
+@dataclass(frozen=True, slots=True)
+class _Merit:
+    """What is maximised; see ``search``."""
+
+    scale: float
+    service_weight: float | None
+    min_service: float | None
+
+    def of(self, episodes: Episodes) -> Floats:
+        """Return the merit of each episode, shape (starts, copies)."""
+        merit: Floats = episodes.circularity / self.scale
+        if self.service_weight is not None:
+            merit = merit + self.service_weight * episodes.service
+        if self.min_service is not None:
+            merit = merit - SHORTFALL_PRICE * np.maximum(0.0, self.min_service - episodes.service)
+        return merit
+
+
+@dataclass(frozen=True, slots=True)
+class _Best:
+    """The best episode from each start.
+
+    Attributes:
+        copy: which of the copies it was, shape (starts,).
+        merit: shape (starts,).
+        circularity: λ̄, shape (starts,), mass.
+        service: mean service level, shape (starts,).
+        actions: shape (starts, steps, entries).
+    """
+
+    copy: Integers
+    merit: Floats
+    circularity: Floats
+    service: Floats
+    actions: Floats
+
+    @classmethod
+    def among(cls, episodes: Episodes, merit: Floats) -> _Best:
+        """Return the first of the best ``episodes``, of ``merit`` (starts, copies)."""
+        copy, start = merit.argmax(axis=1), np.arange(len(merit))
+        actions = np.stack([episodes.actions[:, :, i, c] for i, c in zip(start, copy, strict=True)])
+        return cls(copy, merit[start, copy], episodes.circularity[start, copy], episodes.service[start, copy], actions)
+
+    def or_better(self, other: _Best) -> _Best:
+        """Return the better of the two from each start, these if they are equal."""
+        better = other.merit > self.merit
+        return _Best(
+            np.where(better, other.copy, self.copy),
+            np.where(better, other.merit, self.merit),
+            np.where(better, other.circularity, self.circularity),
+            np.where(better, other.service, self.service),
+            np.where(better[:, None, None], other.actions, self.actions),
+        )

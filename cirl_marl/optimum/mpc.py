@@ -1,0 +1,234 @@
+"""Model predictive control over the convex program of the bound.
+
+Every ``replan`` decisions each copy solves the linear program of ``cirl_marl.optimum`` from its true current stocks and
+carries out the first planned actions; what the program promised and the simulator did not do is made up for by the
+next plan. Controls are held within an interval to first order (``Programs(held=True)``): that bounds nothing and plans
+better. Nothing is random.
+
+A receding window ends before the episode does. What comes after it is priced by the multipliers y of the program of the
+whole episode, solved once from the start of the episode: the rows of the interval after the window are moved into the
+objective, c' = c − Aᵀy, which leaves a price on each stock at the window's end. By duality this is an upper bound on
+what those stocks are worth to the rest of the episode, exact along its plan, so that nothing is run down because the
+window ends. With ``horizon=None`` the window shrinks with what is left of the episode and needs no prices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cirl_marl.controllers.basic import Arrays
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError, ControlError
+from cirl_marl.network import Floats
+from cirl_marl.optimum.actions import normalised_actions
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.maximise import check_options
+from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.solver import Basis, Infeasible, Solution, solve
+
+SERVICE_FIRST = 1000.0
+"""Weight of the mean service level, against λ̄/circularity_scale, where the demanded level is out of reach."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """What is planned for one copy.
+
+    Attributes:
+        episode: of the copy, by its number.
+        intervals: of the episode.
+        problem: the program.
+        solution: its optimum.
+        actions: of the first intervals, shape (decisions, entries).
+        unit: what 1 of its objective is in the objective of plans that meet the demand.
+    """
+
+    episode: int
+    intervals: range
+    problem: Program
+    solution: Solution
+    actions: Floats
+    unit: float
+
+    def basis(self, intervals: range) -> Basis | None:
+        """Return the basis from which to plan ``intervals``; None if they are neither as many nor the last of these."""
+        if len(intervals) == len(self.intervals):
+            return self.solution.basis
+        if intervals.stop != self.intervals.stop or intervals.start < self.intervals.start:
+            return None
+        return self.solution.basis.without_first(self.problem, intervals.start - self.intervals.start)
+
+    def levels(self) -> Floats:
+        """Return the planned mean service level of each interval, shape (intervals,)."""
+        layout = self.problem.layout
+        levels = self.solution.plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
+        mean: Floats = levels.mean(axis=1) if levels.size else np.ones(len(levels))
+        return mean
+
+    def prices(self) -> Floats:
+        """Return what the rows of the next interval charge for the stocks at the end of each, shape (intervals, nodes).
+
+        They are the terms of c − Aᵀy − Gᵀμ, for those stocks, of rows that belong to the interval after, in the
+        objective of plans that meet the demand.
+        """
+        problem, certificate = self.problem, self.solution.certificate
+        layout = problem.layout
+        charged = np.zeros(len(problem.cost))
+        for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
+            entries = matrix.tocoo()
+            own = entries.col // layout.size
+            ends = entries.col - own * layout.size
+            later = problem.interval_of_rows(matrix)[entries.row] > own
+            later &= (ends >= layout.end(-1)) & (ends < layout.level)
+            np.subtract.at(charged, entries.col[later], (entries.data * multipliers[entries.row])[later])
+        priced: Floats = charged.reshape(-1, layout.size)[:, layout.end(-1) : layout.level]
+        return priced * self.unit
+
+
+class MPC:
+    """Plans again and again from the current stocks; each copy has its own plan.
+
+    The objective is λ̄ of the episode; with ``service_weight`` w, λ̄/circularity_scale + w·service. With ``min_service``
+    the mean level over the whole episode is held at the demanded level or above: what the past intervals lacked the
+    planned ones have to make up for. If that is out of reach, w = SERVICE_FIRST takes the place of the demand in that
+    plan, which then comes as close as it can.
+
+    Attributes:
+        ahead: see ``Planner``.
+    """
+
+    ahead = 0.1  # a first plan takes longer than the later ones, which start from it
+
+    def __init__(
+        self,
+        *,
+        horizon: int | None = None,
+        min_service: float | None = None,
+        service_weight: float | None = None,
+        degree: int = 1,
+        replan: int = 4,
+    ) -> None:
+        """Choose what is planned.
+
+        Args:
+            horizon: decisions that a plan looks ahead; None looks to the end of the episode.
+            min_service: mean service level demanded, in [0, 1]; excludes ``service_weight``.
+            service_weight: w ≥ 0.
+            degree: degree of the test polynomials; see ``bound``.
+            replan: decisions carried out of each plan.
+
+        Raises:
+            CirlError: for an option that cannot be used.
+        """
+        check_options(service_weight, min_service, degree)
+        for name, value in (("replan", replan), ("horizon", replan if horizon is None else horizon)):
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+                raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
+        if horizon is not None and horizon < replan:
+            raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
+        self._horizon, self._replan = horizon, replan
+        self._demanded, self._weight, self._degree = min_service, service_weight, degree
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        """Make the first plan of every copy; see ``plan``."""
+        self.plan(env, seed, lambda share: None)
+
+    def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
+        """Make the first plan of every copy; ``seed`` has no effect.
+
+        Raises:
+            NoCertificate: for a network whose flows are not linear laws; see ``bound``.
+            CirlError: if HiGHS fails.
+        """
+        network = env.network
+        self._env = env
+        self._admissible = Admissible.of(network, env.agents or None)
+        self._programs = Programs(self._admissible, self._degree, self._weight, held=True)
+        self._urgent = Programs(self._admissible, self._degree, SERVICE_FIRST, held=True)
+        self._outlooks: dict[int, _Plan] = {}
+        self._plans = []
+        for copy in range(env.num_envs):
+            self._plans.append(self._next(copy, None))
+            progress((copy + 1) / env.num_envs)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the next actions, from the current state of the environment that was started.
+
+        Raises:
+            ControlError: after the end of the episode.
+            CirlError: if HiGHS fails.
+        """
+        env = self._env
+        actions = []
+        for copy, step in enumerate(env.physical.step.tolist()):
+            plan = self._plans[copy]
+            if plan.episode != env.episodes[copy]:
+                plan = self._plans[copy] = self._next(copy, None)
+            elif not 0 <= step - plan.intervals.start < len(plan.actions):
+                plan = self._plans[copy] = self._next(copy, plan)
+            actions.append(plan.actions[step - plan.intervals.start])
+        return env.unstack(np.stack(actions, axis=1))
+
+    def _next(self, copy: int, last: _Plan | None) -> _Plan:
+        """Plan for one copy from its current stocks, after the ``last`` plan of its episode."""
+        state, steps = self._env.physical, self._env.network.episode.horizon
+        step = int(state.step[copy])
+        if step >= steps:
+            raise ControlError(f"MPC: the episode is over after {steps} steps: call reset()")
+        rest = range(step, steps)
+        window = rest if self._horizon is None else rest[: self._horizon]
+        missing = None if self._demanded is None else self._demanded * steps - float(state.service[copy])
+        if len(window) == len(rest):
+            return self._plan(copy, window, missing, last.basis(window) if last else None)
+        if last is None:
+            self._outlooks[copy] = self._plan(copy, rest, missing, None)
+        outlook = self._outlooks[copy]
+        after = window.stop - outlook.intervals.start
+        if missing is not None:
+            missing -= float(outlook.levels()[after:].sum())
+        return self._plan(copy, window, missing, last.basis(window) if last else None, outlook.prices()[after - 1])
+
+    def _plan(
+        self, copy: int, intervals: range, missing: float | None, basis: Basis | None, prices: Floats | None = None
+    ) -> _Plan:
+        """Plan some intervals.
+
+        Args:
+            copy: whose stocks they start from.
+            intervals: to be planned.
+            missing: least sum of the service levels of all intervals; None if nothing is demanded.
+            basis: from which the solver starts.
+            prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
+        """
+        stock = self._env.physical.stock[self._env.rows.nodes, copy]
+        demanded = None if missing is None else max(0.0, missing / len(intervals))
+        unit = 1.0
+        what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
+        try:
+            problem = self._priced(self._programs, stock, intervals, demanded, prices)
+            solution = solve(problem, basis, what=what)
+        except Infeasible:
+            if demanded is None:
+                raise
+            unit = self._env.network.objective.circularity_scale
+            prices = None if prices is None else prices / unit
+            problem = self._priced(self._urgent, stock, intervals, 0.0, prices)
+            solution = solve(problem, basis, what=what)
+        planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
+        base = self._admissible.base[intervals.start : intervals.stop][: self._replan]
+        actions = normalised_actions(replace(self._admissible, base=base), problem.layout, planned)
+        return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)
+
+    def _priced(
+        self, programs: Programs, stock: Floats, intervals: range, demanded: float | None, prices: Floats | None
+    ) -> Program:
+        """Return the program of some intervals with the objective of the episode, plus what the last stocks cost."""
+        problem = programs.program(stock, demanded, intervals)
+        layout = problem.layout
+        cost = problem.cost.reshape(len(intervals), -1) * (len(intervals) / self._env.network.episode.horizon)
+        if prices is not None:
+            cost[-1, layout.end(-1) : layout.level] += prices
+        return replace(problem, cost=cost.ravel())

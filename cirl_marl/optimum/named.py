@@ -1,0 +1,58 @@
+"""Controllers by the names that the command line and comparisons know them by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from cirl_marl.controllers.basic import Constant, Controller, Neutral, Random
+from cirl_marl.controllers.lqr import LQR
+from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.errors import CirlError, unknown
+
+SETTABLE = ("constant", "scripted")
+"""Controllers that take values for single agents."""
+CONTROLLERS = ("neutral", "constant", "random", "scripted", "lqr", "mpc", "optimum")
+
+
+def named_controller(
+    name: str, *, held: Mapping[str, float] | None = None, min_service: float | None = None
+) -> Controller:
+    """Return a controller, not yet started.
+
+    Args:
+        name: one of CONTROLLERS.
+        held: agent → constant value in [−1, 1], of a constant or scripted controller.
+        min_service: mean service level that ``mpc`` and ``optimum`` plan for; None: as much as can be had.
+
+    Raises:
+        CirlError: for an unknown name, or options that the controller does not take.
+    """
+    if name not in CONTROLLERS:
+        raise CirlError(unknown("control", name, CONTROLLERS))
+    if held and name not in SETTABLE:
+        raise CirlError(f"values of single agents go with {' or '.join(SETTABLE)} control, not with {name}")
+    if min_service is not None and name not in ("mpc", "optimum"):
+        raise CirlError(f"a demanded service level goes with mpc or optimum control, not with {name}")
+    makers: Mapping[str, Callable[[], Controller]] = {
+        "neutral": Neutral,
+        "constant": lambda: Constant(held),
+        "random": Random,
+        "scripted": lambda: Scripted(held),
+        "lqr": LQR,
+        "mpc": lambda: _mpc(min_service),
+        "optimum": lambda: _optimum(min_service),
+    }
+    return makers[name]()
+
+
+def _mpc(min_service: float | None) -> Controller:
+    from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
+
+    return MPC(min_service=min_service, service_weight=SERVICE_FIRST if min_service is None else None)
+
+
+def _optimum(min_service: float | None) -> Controller:
+    from cirl_marl.optimum.controller import Optimum
+    from cirl_marl.optimum.mpc import SERVICE_FIRST
+
+    return Optimum(min_service=min_service, service_weight=SERVICE_FIRST if min_service is None else None)

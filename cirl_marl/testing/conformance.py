@@ -1,0 +1,249 @@
+"""A conformance suite for multi-agent environments, stricter than PettingZoo's own.
+
+PettingZoo's tests let NaN and out-of-range observations pass, compare no reset with another, and look at
+one step after seeding. ``check_parallel_env`` runs whole episodes of any PettingZoo ``ParallelEnv`` and
+names agent, step and value of the first breach:
+
+>>> import cirl_marl
+>>> from cirl_marl.testing import check_parallel_env
+>>> check_parallel_env(lambda: cirl_marl.parallel_env("copper_net"), steps=20)
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from cirl_marl.testing.nested import ConformanceError, check_member, check_memory, require, same_or_raise
+
+if TYPE_CHECKING:
+    from cirl_marl.environments.vector import VectorEnv
+
+__all__ = ["ConformanceError", "check_parallel_env", "check_vector_env"]
+
+AnyEnv: TypeAlias = ParallelEnv[Any, Any, Any]
+RETURNS = ("observations", "rewards", "terminations", "truncations", "infos")
+REMEMBERED = 4
+"""How many steps back observations are watched for later change."""
+
+
+def check_parallel_env(make: Callable[[], AnyEnv], *, steps: int = 200, seed: int = 0) -> None:
+    """Check a PettingZoo parallel environment, of whatever spaces, over two episodes.
+
+    Two environments are stepped side by side under the same actions, up to the end of the episode or
+    ``steps``; then the first is reset in mid-episode and has to repeat the episode bit for bit. Checked
+    at every step: observations lie in their spaces (NaN, bounds, dtype, shape), share no memory with
+    each other and do not change afterwards; rewards are finite; terminations and truncations are
+    booleans; keys equal the agents that acted; agents leave exactly when they are done and nobody joins;
+    actions are left untouched; spaces are one lasting object per agent.
+
+    Infinite observations pass only where the bound of a ``Box`` is infinite.
+
+    Args:
+        make: makes a fresh environment; called twice.
+        steps: longest stretch to check.
+        seed: seed of the environments; the actions are drawn from it too.
+
+    Raises:
+        ConformanceError: at the first breach.
+    """
+    first, second = make(), make()
+    watched = _Watched(first)
+    recorded = [watched.reset(seed)]
+    _compare(recorded[0], _Watched(second).reset(seed), "two environments after reset with the same seed", 0)
+    actions = _Actions(first, seed)
+    taken = []
+    for step in range(1, steps + 1):
+        if not first.agents:
+            break
+        taken.append(actions.sample(recorded[-1]))
+        recorded.append(watched.step(taken[-1], step))
+        twin = _called(second, taken[-1])
+        _compare(recorded[-1], twin, "two environments with the same seed and actions", step)
+    _check_restart(watched, seed, recorded, taken)
+    first.close()
+    second.close()
+
+
+def check_vector_env(make: Callable[[], VectorEnv], *, steps: int = 200, seed: int = 0) -> None:
+    """Check a ``VectorEnv``: every copy's arrays, over restarts, in two environments side by side.
+
+    Args:
+        make: makes a fresh environment; called twice.
+        steps: joint steps to check.
+        seed: seed of the environments; the actions are drawn from it too.
+
+    Raises:
+        ConformanceError: at the first breach.
+    """
+    first, second = make(), make()
+    generator = np.random.default_rng(seed)
+    observations = first.reset(seed)
+    _compare((observations,), (second.reset(seed),), "two environments after reset with the same seed", 0)
+    _check_batch(first, observations, 0)
+    for step in range(1, steps + 1):
+        kept = copy.deepcopy(observations)
+        drawn = {
+            agent: generator.uniform(-1, 1, (first.num_envs, *space.shape))
+            for agent, space in first.action_spaces.items()
+        }
+        given = copy.deepcopy(drawn)
+        result = first.step(given)
+        same_or_raise(drawn, given, f"step {step}: the actions were changed")
+        same_or_raise(kept, observations, f"step {step}: observations returned at step {step - 1} changed")
+        _compare(result, second.step(drawn), "two environments with the same seed and actions", step)
+        observations, rewards, terminations, truncations, infos = result
+        _check_batch(first, observations, step)
+        check_memory(observations, f"step {step}")
+        for agent in first.agents:
+            where = f"agent {agent!r}, step {step}"
+            require(rewards[agent].shape == (first.num_envs,), f"{where}: rewards of shape {rewards[agent].shape}")
+            require(bool(np.isfinite(rewards[agent]).all()), f"{where}: reward {rewards[agent]} is not finite")
+            for name, ends in (("terminations", terminations[agent]), ("truncations", truncations[agent])):
+                require(ends.dtype == np.bool_, f"{where}: {name} have dtype {ends.dtype}, not bool")
+            ended = terminations[agent] | truncations[agent]
+            if ended.any():
+                final = infos[agent].get("final_observation")
+                require(final is not None, f"{where}: an episode ended without 'final_observation' in infos")
+                _check_rows(first, agent, final, f"{where}, final_observation")
+
+
+class _Actions:
+    """Draws from copies of the action spaces, so that the environment's own are left alone."""
+
+    def __init__(self, env: AnyEnv, seed: int) -> None:
+        self._spaces = {agent: copy.deepcopy(env.action_space(agent)) for agent in env.possible_agents}
+        for i, space in enumerate(self._spaces.values()):
+            space.seed(seed + i)
+
+    def sample(self, returned: tuple[Any, ...]) -> dict[Any, Any]:
+        """Draw one action for each agent that has an observation and is not done."""
+        observations, infos = returned[0], returned[-1]
+        ended = returned[2:4] if len(returned) == len(RETURNS) else ()
+        drawn = {}
+        for agent, seen in observations.items():
+            if any(flags[agent] for flags in ended):
+                continue
+            mask = seen.get("action_mask") if isinstance(seen, Mapping) else infos[agent].get("action_mask")
+            drawn[agent] = self._spaces[agent].sample(mask)
+        return drawn
+
+
+class _Watched:
+    """An environment whose every return is checked."""
+
+    def __init__(self, env: AnyEnv) -> None:
+        self.env = env
+        self._spaces: dict[Any, tuple[spaces.Space[Any], spaces.Space[Any]]] = {}
+        self._returned: list[tuple[int, Any, Any]] = []
+
+    def reset(self, seed: int | None = None) -> tuple[Any, Any]:
+        env = self.env
+        observations, infos = env.reset(seed=seed)
+        require(set(env.agents) <= set(env.possible_agents), f"agents {env.agents} go beyond possible_agents")
+        require(
+            len(set(env.agents)) == len(env.agents) > 0,
+            f"reset: agents {env.agents} are not distinct or none",
+        )
+        self._check_keys({"observations": observations, "infos": infos}, list(env.agents), 0)
+        self._check_spaces(0)
+        self._check_observations(observations, 0)
+        return copy.deepcopy((observations, infos))
+
+    def step(self, actions: Mapping[Any, Any], step: int) -> tuple[Any, ...]:
+        env = self.env
+        before = list(env.agents)
+        given = copy.deepcopy(dict(actions))
+        returned = env.step(given)
+        same_or_raise(dict(actions), given, f"step {step}: the actions were changed")
+        require(len(returned) == len(RETURNS), f"step {step}: returned {len(returned)} things, not {RETURNS}")
+        self._check_keys(dict(zip(RETURNS, returned, strict=True)), before, step)
+        observations, rewards, terminations, truncations, _ = returned
+        joined = [agent for agent in env.agents if agent not in before]
+        require(not joined, f"step {step}: agents {joined} joined in mid-episode")
+        for agent in before:
+            where = f"agent {agent!r}, step {step}"
+            _check_reward(rewards[agent], where)
+            for name, flag in (("termination", terminations[agent]), ("truncation", truncations[agent])):
+                require(isinstance(flag, bool | np.bool_), f"{where}: {name} {flag!r} is not a bool")
+            done = bool(terminations[agent] or truncations[agent])
+            require(done != (agent in env.agents), f"{where}: done is {done}, but env.agents is {env.agents}")
+        self._check_spaces(step)
+        self._check_observations(observations, step)
+        return copy.deepcopy(returned)
+
+    def _check_keys(self, returned: Mapping[str, Any], agents: list[Any], step: int) -> None:
+        for name, by_agent in returned.items():
+            require(isinstance(by_agent, dict), f"step {step}: {name} are a {type(by_agent).__name__}, not a dict")
+            require(
+                set(by_agent) == set(agents),
+                f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}",
+            )
+
+    def _check_spaces(self, step: int) -> None:
+        env = self.env
+        for agent in env.possible_agents:
+            now = (env.observation_space(agent), env.action_space(agent))
+            before = self._spaces.setdefault(agent, now)
+            for name, old, new in zip(("observation_space", "action_space"), before, now, strict=True):
+                require(old is new, f"agent {agent!r}, step {step}: {name} returned another object than before")
+        if step == 0:
+            for (one, mine), (other, theirs) in combinations(self._spaces.items(), 2):
+                for name, a, b in zip(("observation", "action"), mine, theirs, strict=True):
+                    require(a is not b, f"agents {one!r} and {other!r} share one {name} space object")
+
+    def _check_observations(self, observations: Mapping[Any, Any], step: int) -> None:
+        for agent, seen in observations.items():
+            check_member(self._spaces[agent][0], seen, f"agent {agent!r}, step {step}: observation")
+        check_memory(observations, f"step {step}")
+        for earlier, original, kept in self._returned:
+            same_or_raise(kept, original, f"step {step}: observations returned at step {earlier} changed")
+        self._returned = [*self._returned[-REMEMBERED:], (step, observations, copy.deepcopy(observations))]
+
+
+def _called(env: AnyEnv, actions: Mapping[Any, Any]) -> tuple[Any, ...]:
+    return copy.deepcopy(env.step(copy.deepcopy(dict(actions))))
+
+
+def _check_restart(watched: _Watched, seed: int, recorded: list[tuple[Any, ...]], taken: list[dict[Any, Any]]) -> None:
+    """Reset in mid-episode, then repeat what was recorded."""
+    watched.reset(seed + 1)
+    actions = _Actions(watched.env, seed + 1)
+    returned: tuple[Any, ...] = watched.reset(None)
+    for step in (1, 2):
+        if watched.env.agents:
+            returned = watched.step(actions.sample(returned), step)
+    _compare(recorded[0], watched.reset(seed), "one environment reset twice with the same seed", 0)
+    for step, drawn in enumerate(taken, start=1):
+        again = watched.step(drawn, step)
+        _compare(recorded[step], again, "one environment run twice with the same seed and actions", step)
+
+
+def _check_batch(env: VectorEnv, observations: Mapping[str, Any], step: int) -> None:
+    require(list(observations) == list(env.agents), f"step {step}: observations have keys {list(observations)}")
+    for agent, seen in observations.items():
+        _check_rows(env, agent, seen, f"agent {agent!r}, step {step}: observation")
+
+
+def _check_rows(env: VectorEnv, agent: str, seen: Any, where: str) -> None:
+    require(len(seen) == env.num_envs, f"{where}: {len(seen)} rows for {env.num_envs} copies")
+    for i, row in enumerate(seen):
+        check_member(env.observation_spaces[agent], row, f"{where} of copy {i}")
+
+
+def _check_reward(reward: Any, where: str) -> None:
+    number = isinstance(reward, int | float | np.number) or (isinstance(reward, np.ndarray) and reward.shape == ())
+    require(number and not isinstance(reward, bool), f"{where}: reward {reward!r} is not a number")
+    require(bool(np.isfinite(reward)), f"{where}: reward {reward!r} is not finite")
+
+
+def _compare(one: tuple[Any, ...], other: tuple[Any, ...], what: str, step: int) -> None:
+    names = RETURNS if len(one) == len(RETURNS) else ("observations", "infos")
+    for name, a, b in zip(names, one, other, strict=False):
+        same_or_raise(a, b, f"step {step}: {what} differ in {name}")
