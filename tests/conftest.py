@@ -1,9 +1,12 @@
-"""Random networks for property tests, which ``st.from_type(Network)`` draws, and a recipe for short trainings."""
+"""What tests share: random networks (``st.from_type(Network)``), short trainings, and which parameters are sampled."""
 
 from __future__ import annotations
 
 import os
+import random
+import shutil
 import signal
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,6 +38,32 @@ settings.load_profile("cirl_marl")
 GUIDE = Path(__file__).parent.parent / "envs" / "README.md"
 ROLES = list(Role)
 LAWS = [law for law in Law if law is not Law.COMPARTMENT]
+SEED = "CIRL_TEST_SEED"
+
+
+def pytest_configure() -> None:
+    """Settle the seed of what is sampled, before the workers of pytest-xdist start and inherit it."""
+    os.environ.setdefault(SEED, "0" if "CI" in os.environ else str(random.SystemRandom().randrange(10**6)))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of a test marked ``sample(count)`` draw so many of its parameters; the others are ``slow``."""
+    roaming = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("sample"):
+            roaming[item.nodeid.partition("[")[0]].append(item)
+    for name, variants in roaming.items():
+        (count,) = next(variants[0].iter_markers("sample")).args
+        kept = random.Random(f"{os.environ[SEED]} {name}").sample(variants, min(count, len(variants)))
+        for item in variants:
+            if item not in kept:
+                item.add_marker("slow")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the seed, which repeats the sample."""
+    terminalreporter.write_line(f"{SEED}={os.environ[SEED]} drew the parameters of tests marked 'sample'")
 
 
 @pytest.fixture(scope="session")
@@ -66,14 +95,35 @@ def ctrl_c_after() -> Callable[[int], Callable[[Progress], None]]:
     return reports_to
 
 
-@pytest.fixture
-def ppo_recipe() -> Recipe:
+def few_rollouts() -> Recipe:
     """Return a recipe for a few rollouts of PPO in two copies."""
     from cirl_marl.learners.recipe import Learner, Recipe, Run
 
     parameters = {"n_steps": 10, "batch_size": 20, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
     learner = Learner(algorithm="PPO", parameters=parameters)
     return Recipe(name="small", title="small", run=Run(steps=80, envs=2), learner=learner)
+
+
+@pytest.fixture
+def ppo_recipe() -> Recipe:
+    """Return a recipe for a few rollouts of PPO in two copies."""
+    return few_rollouts()
+
+
+@pytest.fixture(scope="session")
+def copper_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run of ``ppo_recipe`` in ``copper_net``, in episodes of five steps, that tests only read."""
+    from cirl_marl.learners import train
+
+    directory = tmp_path_factory.mktemp("copper") / "run"
+    train("copper_net", few_rollouts(), directory=directory, horizon=5)
+    return directory
+
+
+@pytest.fixture
+def own_copper_run(copper_run: Path, tmp_path: Path) -> Path:
+    """Return a copy of ``copper_run``, ``tmp_path / "run"``, that a test may change."""
+    return shutil.copytree(copper_run, tmp_path / "run")
 
 
 def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = False) -> Network:

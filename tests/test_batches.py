@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -129,6 +129,7 @@ def masses(env: VectorEnv) -> Floats:
     return total
 
 
+@settings(max_examples=settings().max_examples // 3)
 @given(seed=st.integers(0, 2**31), nth=st.integers(1, 5), work=st.integers(1, 40))
 def test_mass_in_transit_is_conserved(seed: int, nth: int, work: int) -> None:
     """Under any driving, what left the reservoir is at a node, on the way or aboard."""

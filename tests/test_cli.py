@@ -60,6 +60,7 @@ def test_networks_and_show(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert Path("copper_net.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("name", networks())
 def test_check_has_nothing_to_say_of_the_catalogue(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -284,6 +285,7 @@ def idle_network() -> Network:
     )
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("step", ["0.125", "0.25"])
 def test_check_remarks_on_steps_that_are_too_long(
     step: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

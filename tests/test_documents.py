@@ -102,7 +102,7 @@ def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
         part.split("```")[0] for part in (ROOT / "agents" / "README.md").read_text().split("```toml\n")[1:]
     )
     path.write_text(whole)
-    training = train("copper_net", path, steps=1280)
+    training = train("copper_net", path, steps=640, envs=8)
     assert type(training.trainees["mine"].model).__name__ == "SAC"
     path.write_text(whole + addition)
     assert load_recipe(path).match[1].algorithm == "TQC"

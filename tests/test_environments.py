@@ -62,14 +62,16 @@ def marked(test: Callable[..., None]) -> Callable[..., None]:
     return test
 
 
+@pytest.mark.sample(12)
 @anything
-@pytest.mark.parametrize("observe", [None, "local", "full"])
-def test_catalogue_conforms(name: str, scenario: str, observe: str | None) -> None:
-    """The stricter suite holds for every network, scenario and view."""
-    check_parallel_env(lambda: parallel_env(name, scenario=scenario, observe=observe))
+@pytest.mark.parametrize(("observe", "horizon"), [(None, None), ("local", 12), ("full", 12)])
+def test_catalogue_conforms(name: str, scenario: str, observe: str | None, horizon: int | None) -> None:
+    """The stricter suite holds for every network, scenario and view; in its own view over its whole episode."""
+    check_parallel_env(lambda: parallel_env(name, scenario=scenario, observe=observe, horizon=horizon))
     check_vector_env(lambda: vector_env(name, num_envs=3, scenario=scenario, observe=observe, horizon=7), steps=20)
 
 
+@pytest.mark.sample(5)
 @marked
 @anything
 def test_pettingzoos_own_tests(name: str, scenario: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,17 +246,18 @@ def test_others_hold_their_neutral_control(name: str) -> None:
         np.testing.assert_allclose(one.state(), many.state(), rtol=1e-6, atol=1e-6)
 
 
-def test_zero_throughput_is_not_best() -> None:
+@pytest.mark.sample(2)
+@pytest.mark.parametrize("name", networks())
+def test_zero_throughput_is_not_best(name: str) -> None:
     """Stopping everything is good for λ, but the service fails and the mixed reward falls.
 
     It is compared with neutral control and, where compartments have a script, with the script.
     """
-    for name in networks():
-        env = vector_env(name, num_envs=2)
-        stopped = rollout(env, Constant(dict.fromkeys(env.agents, -1.0)), seed=0)
-        usual = rollout(env, Scripted(), seed=0)
-        assert (stopped.returns.sum(axis=0) < usual.returns.sum(axis=0)).all(), name
-        assert (stopped.episode_service < usual.episode_service).all(), name
+    env = vector_env(name, num_envs=2)
+    stopped = rollout(env, Constant(dict.fromkeys(env.agents, -1.0)), seed=0)
+    usual = rollout(env, Scripted(), seed=0)
+    assert (stopped.returns.sum(axis=0) < usual.returns.sum(axis=0)).all()
+    assert (stopped.episode_service < usual.episode_service).all()
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value encountered")

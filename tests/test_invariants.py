@@ -76,6 +76,7 @@ def test_random_networks_conserve_mass(network: Network, seed: int) -> None:
     assert_conserves(network, seed)
 
 
+@pytest.mark.sample(5)
 @anything
 def test_catalogue_conserves_mass(name: str, scenario: str) -> None:
     """Mass is conserved to round-off and stocks stay non-negative and finite."""
@@ -113,6 +114,7 @@ def test_random_batch_equals_lone(network: Network, seed: int, reward: str) -> N
     assert_batch_is_lone(network, seed, reward)
 
 
+@pytest.mark.sample(30)
 @pytest.mark.parametrize("reward", REWARDS)
 @anything
 def test_catalogue_batch_equals_lone(name: str, scenario: str, reward: str) -> None:

@@ -106,6 +106,7 @@ def test_catalogue_is_readable(name: str) -> None:
             assert (np.abs(curve[:, None] - others) > layout.box / 2).any(axis=-1).all()
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("size", [(2, 1), (3, 2), (9, 16), (20, 40), (50, 90), (2000, 4000)])
 def test_networks_of_any_size(tmp_path: Path, size: tuple[int, int]) -> None:
     """A digraph is drawn from a pair of nodes to thousands."""
@@ -278,6 +279,7 @@ def test_circularity_curves(tmp_path: Path, episodes: int) -> None:
     read(save_circularity(tmp_path / "none.png", network, np.arange(3.0), {}, {}))
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("agents", [0, 1, 2, 7, 20, 33])
 def test_learning_curves(tmp_path: Path, agents: int) -> None:
     """Any number of agents and of episodes, none included."""
@@ -291,6 +293,7 @@ def test_learning_curves(tmp_path: Path, agents: int) -> None:
             read(path)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("network", [lambda: cirl_marl.load_network("copper_net"), lambda: random_network(40, 90)])
 @pytest.mark.parametrize("steps", [1, 60])
 def test_trajectory(tmp_path: Path, network: Callable[[], Network], steps: int) -> None:

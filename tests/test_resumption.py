@@ -36,7 +36,14 @@ def test_a_failed_learner_does_not_take_the_good_checkpoint_with_it(tmp_path: Pa
     """What was saved before goes on to count, the run can be resumed from it, and the step is that of the run."""
     directory = tmp_path / "run"
     with pytest.raises(LearnerError, match="failed at joint step 30"):
-        train("copper_net", ppo_recipe, directory=directory, horizon=5, callbacks={"use": FailsAt(30)})
+        train(
+            "copper_net",
+            ppo_recipe,
+            agents=["mine", "use"],
+            directory=directory,
+            horizon=5,
+            callbacks={"use": FailsAt(30)},
+        )
     run = RunDirectory(directory)
     assert run.status == {"state": "failed", "joint_steps": 28, "checkpoint": "000000028-running"} | {
         "reason": run.status["reason"]
@@ -83,7 +90,7 @@ def test_returns_of_several_steps_end_where_a_run_was_stopped(tmp_path: Path, ct
 def test_a_run_that_goes_on_says_so(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_after: Any) -> None:
     """What is not saved yet is not called saved: the state is that of a running training from the first step."""
     with pytest.raises(KeyboardInterrupt):
-        train("copper_net", ppo_recipe, directory=tmp_path, report=ctrl_c_after(70))
+        train("copper_net", ppo_recipe, agents=["mine", "use"], directory=tmp_path, report=ctrl_c_after(70))
     seen: list[tuple[str, int, int, int]] = []
 
     def watch(now: Progress) -> None:
@@ -130,7 +137,7 @@ def test_a_complete_run_goes_on_to_more_steps(tmp_path: Path, ppo_recipe: Recipe
     with_schedule = ppo_recipe.learner.parameters | {"learning_rate": {"linear_from": 1e-2, "linear_to": 0.0}}
     learner = ppo_recipe.learner.model_copy(update={"parameters": with_schedule})
     recipe = ppo_recipe.model_copy(update={"learner": learner})
-    train("copper_net", recipe, directory=tmp_path, horizon=5)
+    train("copper_net", recipe, agents=["mine", "use"], directory=tmp_path, horizon=5)
     run = RunDirectory(tmp_path)
     before = run.metrics()
     with pytest.raises(KeyboardInterrupt):
@@ -165,7 +172,7 @@ def test_an_interrupted_rollout_is_begun_anew(tmp_path: Path, ppo_recipe: Recipe
     learner = ppo_recipe.learner.model_copy(update={"parameters": parameters})
     recipe = ppo_recipe.model_copy(update={"learner": learner, "run": Run(steps=160, envs=2)})
     with pytest.raises(KeyboardInterrupt):
-        train("copper_net", recipe, directory=tmp_path, report=ctrl_c_after(100))
+        train("copper_net", recipe, agents=["mine", "use"], directory=tmp_path, report=ctrl_c_after(100))
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
             resume(tmp_path, report=ctrl_c_after(60))
@@ -177,7 +184,7 @@ def test_an_interrupted_rollout_is_begun_anew(tmp_path: Path, ppo_recipe: Recipe
 
 def test_a_run_is_trained_by_one_at_a_time(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """Neither do two trainings share a directory, nor the random streams of a process."""
-    train("copper_net", ppo_recipe, directory=tmp_path)
+    train("copper_net", ppo_recipe, agents=["mine", "use"], directory=tmp_path)
     with RunDirectory(tmp_path).claimed(), pytest.raises(RunError, match="is being trained by another process"):
         resume(tmp_path, steps=160)
     refused = []
@@ -246,7 +253,7 @@ def test_what_cannot_be_kept_is_refused_before_anything_is_written(tmp_path: Pat
 
 def test_the_clock_goes_on(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """Training times of a run that went on add up."""
-    train("copper_net", ppo_recipe, directory=tmp_path, horizon=5)
+    train("copper_net", ppo_recipe, agents=["mine", "use"], directory=tmp_path, horizon=5)
     resume(tmp_path, steps=160)
     seconds = RunDirectory(tmp_path).metrics()["seconds"]
     assert len(seconds) == 16

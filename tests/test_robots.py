@@ -227,7 +227,7 @@ class TestTasks:
             found.append(expected)
         assert 0.01 < np.mean(found) < 0.99
 
-    @pytest.mark.parametrize(("robot", "script", "copies"), [(Fetch(), fetch, 200), (Reacher(), reacher, 200)])
+    @pytest.mark.parametrize(("robot", "script", "copies"), [(Fetch(), fetch, 100), (Reacher(), reacher, 100)])
     def test_scripts_do_the_task(self, robot: Robot, script: Callable[[Seen], Floats], copies: int) -> None:
         """Within 50 steps, in at least 95 of 100 attempts."""
         state, done = starts(robot, copies, 1000), np.zeros(copies, dtype=bool)

@@ -52,10 +52,9 @@ def test_network_built_in_python_can_be_kept(tmp_path: Path, ppo_recipe: Recipe)
     assert RunDirectory(tmp_path / "run").make_env(1).network == network
 
 
-def test_half_written_runs_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> None:
+def test_half_written_runs_are_refused(tmp_path: Path, ppo_recipe: Recipe, own_copper_run: Path) -> None:
     """Whatever is missing from a run directory is named; nothing is overwritten."""
-    directory = tmp_path / "run"
-    train("copper_net", ppo_recipe, directory=directory, horizon=5)
+    directory = own_copper_run
     with pytest.raises(RunError, match="not empty"):
         train("copper_net", ppo_recipe, directory=directory, horizon=5)
     for name in ("config.json", "status.json", "network.toml"):
@@ -107,10 +106,9 @@ def test_run_directory_describes_what_was_trained(tmp_path: Path, ppo_recipe: Re
     assert RunDirectory(tmp_path / "paper").config.scenario == "paper"
 
 
-def test_missing_or_damaged_normaliser_is_an_error(tmp_path: Path, ppo_recipe: Recipe) -> None:
+def test_missing_or_damaged_normaliser_is_an_error(own_copper_run: Path) -> None:
     """A policy without its normaliser would act on the wrong numbers."""
-    directory = tmp_path / "run"
-    train("copper_net", ppo_recipe, directory=directory, horizon=5)
+    directory = own_copper_run
     normaliser = RunDirectory(directory).checkpoint / "use.normaliser.pkl"
     normaliser.write_bytes(normaliser.read_bytes()[:50])
     with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
@@ -131,24 +129,20 @@ def test_missing_or_damaged_normaliser_is_an_error(tmp_path: Path, ppo_recipe: R
         ("status.json", '{"state": "complete", "joint_steps": 40, "checkpoint": 5}'),
     ],
 )
-def test_files_that_say_something_else_are_refused(tmp_path: Path, name: str, text: str, ppo_recipe: Recipe) -> None:
+def test_files_that_say_something_else_are_refused(own_copper_run: Path, name: str, text: str) -> None:
     """A readable file with the wrong contents is named."""
-    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
-    (tmp_path / "run" / name).write_text(text)
+    (own_copper_run / name).write_text(text)
     with pytest.raises(RunError, match=name):
-        Trained(tmp_path / "run")
+        Trained(own_copper_run)
 
 
 @pytest.mark.parametrize(("key", "value"), [("seed", "x"), ("steps", 1.5), ("envs", None), ("options", {"horzon": 5})])
-def test_configurations_of_something_else_are_refused(
-    tmp_path: Path, key: str, value: object, ppo_recipe: Recipe
-) -> None:
+def test_configurations_of_something_else_are_refused(own_copper_run: Path, key: str, value: object) -> None:
     """A wrong value is found when it is read, not in the middle of a run."""
-    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
-    path = tmp_path / "run" / "config.json"
+    path = own_copper_run / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
     with pytest.raises(RunError, match=r"config\.json: is not a run configuration: .*(seed|steps|envs|horzon)"):
-        Trained(tmp_path / "run")
+        Trained(own_copper_run)
 
 
 def test_recurrent_policies_remember_within_an_episode_and_forget_after_it(tmp_path: Path) -> None:
@@ -175,23 +169,21 @@ def test_recurrent_policies_remember_within_an_episode_and_forget_after_it(tmp_p
         controller.start(cirl_marl.vector_env("copper_net", num_envs=2, agents=["mine"]), 0)
 
 
-def test_policies_of_others_are_refused(tmp_path: Path, ppo_recipe: Recipe) -> None:
+def test_policies_of_others_are_refused(own_copper_run: Path) -> None:
     """A policy for other observations, or its normaliser, does not act."""
-    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
-    folder = RunDirectory(tmp_path / "run").checkpoint
+    folder = RunDirectory(own_copper_run).checkpoint
     for file in ("{}.zip", "{}.normaliser.pkl"):
         own = (folder / file.format("mine")).read_bytes()
         shutil.copyfile(folder / file.format("use"), folder / file.format("mine"))
         with pytest.raises(RunError, match="'mine' is for other observations"):
-            Trained(tmp_path / "run")
+            Trained(own_copper_run)
         (folder / file.format("mine")).write_bytes(own)
-    Trained(tmp_path / "run")
+    Trained(own_copper_run)
 
 
-def test_policies_act_on_what_they_learnt_to_see(tmp_path: Path, ppo_recipe: Recipe) -> None:
+def test_policies_act_on_what_they_learnt_to_see(copper_run: Path) -> None:
     """An environment that shows something else is refused, with what it shows; options make the difference."""
-    train("copper_net", ppo_recipe, directory=tmp_path / "run")
-    policy = Trained(tmp_path / "run")
+    policy = Trained(copper_run)
     with pytest.raises(RunError, match=r"learnt from other observations .* with the options of the run"):
         policy.start(VectorEnv("copper_net", num_envs=2, observe="full"), seed=0)
     rollout(VectorEnv("copper_net", num_envs=2, horizon=3), policy, seed=0)

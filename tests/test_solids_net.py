@@ -179,6 +179,7 @@ def staged(found: list[Stages], time: Floats, interval: float) -> Floats:
     return total
 
 
+@pytest.mark.sample(4)
 @both
 @controlled
 def test_circularity_is_the_sum_of_the_stages(scenario: str, name: str) -> None:
