@@ -426,6 +426,7 @@ def test_delivery_cools_and_feeds_the_incinerator(scenario: str) -> None:
     assert without["wastebed_degc"] - bed["wastebed_degc"] > 4.0
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(("scenario", "copies"), [("default", 8), ("reacher", 20)])
 def test_scripted_sorter_succeeds(scenario: str, copies: int) -> None:
     """At least 95 % of the items are sorted: of 48 by Fetch, of 120 by Reacher, from what an agent sees."""
@@ -443,6 +444,7 @@ def one_batch(window: int) -> Network:
     return replace(network, arcs=(first_use, replace(recycling, delay=4.0), truck))
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("controller", "sorted_items"), [(Scripted({"sorter": 0.0}), 0), (Mixed(0), 1), (Scripted(), 3)]
 )
@@ -499,6 +501,7 @@ def test_robots_failures_decide_the_coupling() -> None:
     assert (stopped.episode_circularity > bad.episode_circularity).all()  # a truck that never arrives is best for λ
 
 
+@pytest.mark.sample(1)
 @pytest.mark.parametrize("scenario", ["default", "reacher"])
 def test_staying_away_does_not_pay(scenario: str) -> None:
     """A truck that never loads is good for λ, but it owes that nothing piles up, and earns less than one at work."""
