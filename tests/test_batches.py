@@ -129,6 +129,7 @@ def masses(env: VectorEnv) -> Floats:
     return total
 
 
+@pytest.mark.medium
 @settings(max_examples=settings().max_examples // 3)
 @given(seed=st.integers(0, 2**31), nth=st.integers(1, 5), work=st.integers(1, 40))
 def test_mass_in_transit_is_conserved(seed: int, nth: int, work: int) -> None:
@@ -142,6 +143,7 @@ def test_mass_in_transit_is_conserved(seed: int, nth: int, work: int) -> None:
         assert (env.physical.stock >= 0).all()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("nth", "success"), [(1, 0.0), (2, 0.5), (4, 0.75), (9, 1.0)])
 def test_stages_of_circularity(nth: int, success: float) -> None:
     """λ is −m, then −(m + m_u), then −2m for each batch, at the realised T_s and arrival times."""
@@ -228,6 +230,7 @@ def test_load_makes_the_truck_slower() -> None:
     assert speeds["loaded"] == pytest.approx((12e3 / 3400 - friction) * INTERVAL, rel=0.03)
 
 
+@pytest.mark.medium
 def test_snapshot_with_mass_on_the_way() -> None:
     """From a snapshot with slots, dock and truck in use all comes again; copies do not mix over restarts."""
     env = VectorEnv(network(horizon=500), num_envs=3)

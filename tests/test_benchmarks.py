@@ -12,6 +12,8 @@ import typer
 from benchmarks import paper, study
 from cirl_marl import load_network
 
+pytestmark = pytest.mark.medium
+
 ROOT = Path(__file__).parent.parent
 
 

@@ -60,6 +60,7 @@ def test_networks_and_show(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert Path("copper_net.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.medium
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("name", networks())
 def test_check_has_nothing_to_say_of_the_catalogue(
@@ -256,6 +257,7 @@ def test_check_names_the_scenario_that_cannot_run(
     assert "bottles.toml, scenario 'crisis': network 'bottles': node 'households'" in capsys.readouterr().err
 
 
+@pytest.mark.medium
 def test_check_remarks_on_batches_that_never_leave_or_never_end(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -285,6 +287,7 @@ def idle_network() -> Network:
     )
 
 
+@pytest.mark.medium
 @pytest.mark.sample(1)
 @pytest.mark.parametrize("step", ["0.125", "0.25"])
 def test_check_remarks_on_steps_that_are_too_long(
@@ -322,6 +325,7 @@ def test_a_stopped_training_says_what_is_saved(
         assert said in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.medium
 def test_short_trainings_say_that_there_are_no_curves(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -337,6 +341,7 @@ def test_short_trainings_say_that_there_are_no_curves(
     assert "Did you mean 'run'?" in capsys.readouterr().err
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("control", ["neutral", "random", "constant"])
 def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every interval is a row with λ, service, stocks and flows."""
@@ -355,6 +360,7 @@ def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.Monke
     assert Path(f"out/copper_net_{control}.png").is_file()
 
 
+@pytest.mark.medium
 def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A run is trained, evaluated on fresh seeds, drawn, and evaluated again."""
     bottles()
@@ -372,6 +378,7 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert run(monkeypatch, "report", "run", "--episodes", "4") == 0
 
 
+@pytest.mark.medium
 def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A controller's plan has units in its columns; a comparison without runs writes its four files."""
     assert run(monkeypatch, "plan", "carbo_net", "--control", "neutral", "--out", "plan.csv") == 0
@@ -404,6 +411,7 @@ def guide(changes: Mapping[str, str] | None = None, days: int = 7) -> str:
     return text
 
 
+@pytest.mark.medium
 def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Both fronts are printed, tabulated and drawn in one picture; the runs stay."""
     bottles()
@@ -414,6 +422,7 @@ def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
     assert {path.name for path in Path("out").iterdir()} == {"pareto.csv", "pareto.json", "pareto.png", "runs"}
 
 
+@pytest.mark.medium
 def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A run of another network, a plan of a run under a controller, a recipe of other agents: nothing is written."""
     bottles()
@@ -484,6 +493,7 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return fail
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("arguments", "solved", "what"),
     [
@@ -534,6 +544,7 @@ def test_improvement_that_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
 
 
+@pytest.mark.medium
 def test_simulate_with_inner_physics(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -552,6 +563,7 @@ def test_simulate_with_inner_physics(
     assert run(monkeypatch, "simulate", "carbo_net", "--scenario", "paper", "--control", "lqr", "--steps", "5") == 0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

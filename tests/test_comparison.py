@@ -30,6 +30,8 @@ from cirl_marl.records.files import published
 from cirl_marl.report.comparison import FILES, write_comparison
 from cirl_marl.report.run import evaluate_run
 
+pytestmark = pytest.mark.medium
+
 
 @pytest.fixture(scope="module")
 def runs(bottles: Network, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:

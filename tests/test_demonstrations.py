@@ -77,6 +77,7 @@ def shown_by(controller: Controller, seed: int, view_of: Any, steps: int) -> Ite
         yield before, after, joined, view.score(rewards), done
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("controller", ["random", "mpc"])
 @pytest.mark.parametrize("scheme", ["independent", "shared", "joint"])
 def test_buffer_holds_what_the_controller_did(scheme: str, controller: str) -> None:
@@ -110,6 +111,7 @@ def test_last_observation_of_an_episode_is_exact_without_a_normaliser() -> None:
         assert not done or (buffer.observations[t + 1] != after).any()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("starts", "updates"), [(0, 10), (30, 5)])
 def test_steps_count_once(starts: int, updates: int, tmp_path: Path) -> None:
     """In the budget, in ``learning_starts`` and in the metrics; learning begins when the demonstrations are over."""
@@ -137,6 +139,7 @@ def test_others_learn_from_the_start() -> None:
     assert updates == {"mine": 20, "use": 10, "use_to_collection": 20}
 
 
+@pytest.mark.medium
 def test_same_seed_gives_the_same_bits() -> None:
     """Also of what a random controller shows."""
 
@@ -149,6 +152,7 @@ def test_same_seed_gives_the_same_bits() -> None:
     assert (first == again).all() and (first != other).any()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("stop", [6, 14])
 def test_resumed_run_gets_the_rest(stop: int, tmp_path: Path, ctrl_c_after: Any) -> None:
     """Stopped in the middle of the demonstrations it gets the others, stopped after them none; none are lost."""
@@ -196,6 +200,7 @@ def test_goal_task_in_copies(normalise: bool) -> None:
     assert buffer.ep_length[8:12].tolist() == [[4, 4]] * 4
 
 
+@pytest.mark.medium
 def test_tuned_row_counts_its_demonstrations(monkeypatch: pytest.MonkeyPatch) -> None:
     """As steps and as training episodes; the script succeeds where a random policy does not.
 

@@ -50,6 +50,7 @@ def test_readme_lists_the_catalogue_and_the_commands() -> None:
     assert set(re.findall(r"^\| `(\w+)`", section, re.MULTILINE)) == set(cirl_marl.recipes())
 
 
+@pytest.mark.medium
 def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The ten lines of Python run as printed, but for a shorter training."""
     code = (ROOT / "README.md").read_text().split("```python\n")[1].split("```")[0]
@@ -64,6 +65,7 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert (tmp_path / "runs" / "mine" / "status.json").is_file()
 
 
+@pytest.mark.medium
 def test_readme_example_of_one_agent_runs() -> None:
     """One compartment learns as printed, but for a shorter training."""
     code = (ROOT / "README.md").read_text().split("```python\n")[2].split("```")[0]
@@ -95,6 +97,7 @@ def test_own_model_in_the_guide_is_valid(tmp_path: Path) -> None:
     assert infos["tank"]["flows"][0] > 0.0
 
 
+@pytest.mark.medium
 def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The recipe shown to newcomers learns in the network that it is shown for, and what is added to it reads."""
     path = tmp_path / "my_recipe.toml"
@@ -108,6 +111,7 @@ def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
     assert load_recipe(path).match[1].algorithm == "TQC"
 
 
+@pytest.mark.medium
 def test_examples_run() -> None:
     """Each example runs to its end."""
     examples = sorted((ROOT / "examples").glob("*.py"))

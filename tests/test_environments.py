@@ -62,6 +62,7 @@ def marked(test: Callable[..., None]) -> Callable[..., None]:
     return test
 
 
+@pytest.mark.medium
 @pytest.mark.sample(12)
 @anything
 @pytest.mark.parametrize(("observe", "horizon"), [(None, None), ("local", 12), ("full", 12)])
@@ -71,6 +72,7 @@ def test_catalogue_conforms(name: str, scenario: str, observe: str | None, horiz
     check_vector_env(lambda: vector_env(name, num_envs=3, scenario=scenario, observe=observe, horizon=7), steps=20)
 
 
+@pytest.mark.medium
 @pytest.mark.sample(5)
 @marked
 @anything
@@ -230,6 +232,7 @@ def test_copies_restart_by_themselves() -> None:
                 np.testing.assert_array_equal(observations[agent], again[agent])
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", networks())
 def test_others_hold_their_neutral_control(name: str) -> None:
     """A one-agent environment is the whole network with everyone else neutral."""
@@ -246,6 +249,7 @@ def test_others_hold_their_neutral_control(name: str) -> None:
         np.testing.assert_allclose(one.state(), many.state(), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.medium
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("name", networks())
 def test_zero_throughput_is_not_best(name: str) -> None:

@@ -279,6 +279,7 @@ def test_what_does_not_count_is_no_obstacle(network: Network) -> None:
     assert reward == env.compute_reward(seen["achieved_goal"], seen["desired_goal"], {})
 
 
+@pytest.mark.medium
 def test_hindsight_runs() -> None:
     """SAC with a hindsight buffer trains: relabelled goals give rewards of 0 though no object was moved."""
     from stable_baselines3 import SAC, HerReplayBuffer

@@ -53,6 +53,7 @@ def test_imports_go_one_way() -> None:
     assert max(floors(rooms(graph)).values()) <= MOST_FLOORS
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("module", "line"),
     [
@@ -91,6 +92,7 @@ def test_packages_say_their_subject() -> None:
         assert first.startswith('"""') and first.rstrip('"').endswith("."), path
 
 
+@pytest.mark.medium
 def test_import_is_light() -> None:
     """What trains nothing loads neither torch nor mujoco; ``learners`` itself only when a training is asked for."""
     light = [name for name in modules(CHECKOUT) if room_of(name) not in TRAINING and ".robots." not in name]

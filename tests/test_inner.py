@@ -105,6 +105,7 @@ def final(network: Network, dilution: float) -> Floats:
     return np.concatenate([env.physical.stock[:-1, 0], env.physical.inner[:, 0]])
 
 
+@pytest.mark.medium
 def test_runge_kutta_has_order_four_and_the_right_limit() -> None:
     """Stocks and inner states, taken together, converge with order 4 to scipy's solution."""
     network = digester_network()
@@ -155,6 +156,7 @@ def test_empty_store_sends_no_more_than_it_holds() -> None:
     np.testing.assert_allclose(stock.sum(axis=0), 0.5, rtol=1e-14)
 
 
+@pytest.mark.medium
 def test_environments_with_inner_physics_conform() -> None:
     """The conformance suite, batch equality and bit-exact snapshots hold with inner states too."""
     network = digester_network(horizon=6)

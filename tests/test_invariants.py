@@ -76,6 +76,7 @@ def test_random_networks_conserve_mass(network: Network, seed: int) -> None:
     assert_conserves(network, seed)
 
 
+@pytest.mark.medium
 @pytest.mark.sample(5)
 @anything
 def test_catalogue_conserves_mass(name: str, scenario: str) -> None:
@@ -108,12 +109,14 @@ def assert_batch_is_lone(network: Network, seed: int, reward: str) -> None:
             np.testing.assert_array_equal(env.state(), batch.state()[i])
 
 
+@pytest.mark.medium
 @given(network=st.from_type(Network), seed=st.integers(0, 2**31), reward=st.sampled_from(REWARDS))
 def test_random_batch_equals_lone(network: Network, seed: int, reward: str) -> None:
     """Same seed, same bits; a copy of a batch equals a lone environment, and all views agree."""
     assert_batch_is_lone(network, seed, reward)
 
 
+@pytest.mark.medium
 @pytest.mark.sample(30)
 @pytest.mark.parametrize("reward", REWARDS)
 @anything
@@ -141,6 +144,7 @@ def test_single_equals_parallel(name: str, scenario: str) -> None:
     assert truncated
 
 
+@pytest.mark.medium
 @random_networks
 def test_random_networks_conform(network: Network, seed: int) -> None:
     """Determinism and membership, over whole episodes and restarts."""
@@ -200,6 +204,7 @@ def test_window_circularity_is_read_off_the_stocks() -> None:
     np.testing.assert_allclose(means / network.episode.horizon, -lost / time, rtol=1e-10)
 
 
+@pytest.mark.medium
 @random_networks
 def test_snapshot_replays(network: Network, seed: int) -> None:
     """From a snapshot in mid-episode, also a pickled one, all comes again, restarts included."""

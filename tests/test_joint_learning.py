@@ -269,6 +269,7 @@ def learnt(name: str, recipe: Recipe, **options: Any) -> Training:
     return training
 
 
+@pytest.mark.medium
 def test_learners_share_by_match(tmp_path: Path) -> None:
     """Nodes may share one policy and arcs another, beside an agent that learns alone; every policy moves."""
     matches = [

@@ -43,6 +43,7 @@ def test_there_is_room_above_neutral(network: str) -> None:
     assert better.episode_service.mean() >= neutral.episode_service.mean()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("steps", "horizon", "episodes"), [(10_240, 40, 8), pytest.param(35_840, None, 7, marks=pytest.mark.slow)]
 )

@@ -90,6 +90,7 @@ class TestAnyStep:
         assert outflow[0] >= 0.0
         assert (outflow[0] > 0.0) == (model.outflow(after, inputs)[0] > 0.0)
 
+    @pytest.mark.medium
     @given(situations())
     def test_nutrient_is_conserved(self, situation: tuple[Model, Floats, Floats, float]) -> None:
         """N tends to the feed's like a tracer, N = S_in + (N₀ − S_in)e^(−Dt), to round-off."""
@@ -124,6 +125,7 @@ class TestAnyStep:
 class TestAccuracy:
     """Against scipy's Radau at a tolerance of 1e-10."""
 
+    @pytest.mark.medium
     @every_model
     @pytest.mark.parametrize("interval", [0.0125, 0.25])
     def test_jumping_light(self, model: Model, interval: float) -> None:

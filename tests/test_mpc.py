@@ -82,6 +82,7 @@ def test_a_service_out_of_reach_is_approached() -> None:
     np.testing.assert_allclose(run.service[0, 4:], 1.0, atol=1e-3)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 def test_a_short_window_sees_what_comes_after_where_the_service_is_out_of_reach(scale: float) -> None:
     """A long chain has to be filled early, which a window of four decisions learns from prices alone, in their unit."""
@@ -115,6 +116,7 @@ def test_weight_decides_whether_service_is_worth_its_price() -> None:
     assert busy.episode_service[0] > 0.999
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("name", "horizon"), [("copper_net", None), ("copper_net", 12), ("carbo_net", None)])
 def test_keeps_the_service_from_random_starts(name: str, horizon: int | None) -> None:
     """From drawn starts it meets the demanded level, nearer than open-loop plans, within 3 % of the bound."""

@@ -104,6 +104,7 @@ def test_presolve_is_not_believed(make_network: Callable[[int, int, int], Networ
     assert found.verify().bound == found.objective
 
 
+@pytest.mark.medium
 @given(
     network=st.from_type(Network),
     interval=st.floats(0.02, 0.4),
@@ -126,6 +127,7 @@ def test_no_episode_exceeds_the_bound(network: Network, interval: float, seed: i
     )
 
 
+@pytest.mark.medium
 @given(network=st.from_type(Network), interval=st.floats(0.02, 0.4), seed=st.integers(0, 1000))
 def test_no_episode_with_the_service_exceeds_its_bound(network: Network, interval: float, seed: int) -> None:
     """Episodes that keep a mean service level s have at most the λ̄ that the bound allows for s."""
@@ -318,6 +320,7 @@ def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float)
     assert weaker.infeasibility == pytest.approx(max(0.0, other.under.max(initial=0.0)))
 
 
+@pytest.mark.medium
 @given(network=st.from_type(Network), seed=st.integers(0, 1000), weight=st.sampled_from([None, 0.3]))
 def test_multipliers_of_one_start_bound_another(network: Network, seed: int, weight: float | None) -> None:
     """``at`` is the bound itself at its own start, and nowhere less than what is solved there."""
@@ -352,6 +355,7 @@ def test_multipliers_of_one_level_bound_another() -> None:
     assert found.at(starts[:, None], levels).shape == (4, 4)
 
 
+@pytest.mark.medium
 def test_few_solutions_bound_many_starts() -> None:
     """Ten days of copper from 12 drawn starts: three solutions prove within 1 % of what twelve do."""
     env = VectorEnv("copper_net", num_envs=12, horizon=40)
@@ -393,6 +397,7 @@ def test_bad_envelopes(starts: list[float], solves: int, said: str) -> None:
         envelope("carbo_net", starts, solves=solves)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["copper_net", "carbo_net"])
 def test_plan_comes_close_to_the_bound(name: str) -> None:
     """Ten days of each network: the improved plan keeps the service and 99 % of the bound; neutral control does not."""

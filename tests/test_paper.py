@@ -105,6 +105,7 @@ def cirl(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return int(ended.value.code or 0)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("algorithm", "steps", "done"), [("A2C", 300, 300), ("ARS", 300, 800), ("DDPG", 150, 150)])
 def test_row_is_trained_kept_and_not_run_again(
     algorithm: str,
@@ -147,6 +148,7 @@ def test_row_is_trained_kept_and_not_run_again(
     assert capsys.readouterr().out.partition("\n") == (f"rows: 1, done: 1; results in {tmp_path}", "\n", shown)
 
 
+@pytest.mark.medium
 def test_same_seed_same_figures() -> None:
     """The seed decides model and environment."""
     first, second, other = (
@@ -156,6 +158,7 @@ def test_same_seed_same_figures() -> None:
     assert first.evaluation == second.evaluation
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("algorithm", ["SAC", "DDPG", "PPO"])
 def test_weights_that_become_nan_are_a_result(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -181,6 +184,7 @@ def test_weights_that_become_nan_are_a_result(
     assert "nan" not in line
 
 
+@pytest.mark.medium
 def test_saturated_sac_raises_its_entropy_coefficient_without_end() -> None:
     """Its logarithm grows by one learning rate an update on rewards of −10⁶ a step, which ends in NaN."""
     model = SAC("MlpPolicy", gymnasium.make(COPPER.id), seed=0, learning_starts=20).learn(120)
@@ -388,6 +392,7 @@ def test_results_that_answer_another_question_are_outdated() -> None:
     )
 
 
+@pytest.mark.medium
 def test_every_kept_row_is_of_the_definitions_of_today() -> None:
     """Those on record are those of today, as all are but in 16 early rows, and the document shows all rows."""
     root = Path(__file__).parent.parent
@@ -410,6 +415,7 @@ def test_results_need_a_directory(
     assert f"{tmp_path / 'file'}: results need a directory" in capsys.readouterr().err
 
 
+@pytest.mark.medium
 def test_goal_task_learns_with_hindsight(toy: PaperEnvironment) -> None:
     """Successes count when they come, in the number of episodes asked for."""
     del toy
@@ -432,6 +438,7 @@ def recipe(algorithm: str, environment: dict[str, Any] | None = None, **paramete
     )
 
 
+@pytest.mark.medium
 def test_tuned_network_counts_steps_and_episodes_over_the_copies() -> None:
     """As many environment steps as asked for, the returns of all copies, the paper's reward."""
     row = Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=800)
@@ -465,6 +472,7 @@ def test_tuned_policy_is_measured_behind_its_normaliser(monkeypatch: pytest.Monk
     assert not np.array_equal(chosen, trainee.model.predict(seen, deterministic=True)[0])
 
 
+@pytest.mark.medium
 def test_final_policies_play_their_quota_on_episodes_of_their_own() -> None:
     """23 episodes in 20 copies: one each and a second one for the last three, from the seed given on."""
     id_, first = ENVIRONMENTS["CO2MicroalgaeMonod"].id, 2**31 + 7
@@ -484,6 +492,7 @@ def test_final_policies_play_their_quota_on_episodes_of_their_own() -> None:
     assert found.deviation == pytest.approx(np.std(returns), abs=1e-6)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("episodes", "window"), [(300, 100), (150, 75), (3, 1), (1, 1)])
 def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """r_s and r_e are means over 100 episodes each, or over half of those that there were."""
@@ -505,6 +514,7 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
     assert found.end_return == pytest.approx(np.mean(returns[-window:]))
 
 
+@pytest.mark.medium
 def test_tuned_robot_trains_in_copies(toy: PaperEnvironment) -> None:
     """A goal task gets hindsight and as many steps as asked for."""
     row = Row(environment="Toy", algorithm="SAC", recipe="tuned", steps=120)
@@ -512,6 +522,7 @@ def test_tuned_robot_trains_in_copies(toy: PaperEnvironment) -> None:
     assert (trained.steps, trained.returns) == (120, [-10.0] * 12)
 
 
+@pytest.mark.medium
 def test_rows_of_other_seeds_have_starts_of_their_own(toy: PaperEnvironment, monkeypatch: pytest.MonkeyPatch) -> None:
     """The copies of a row begin from seeds that no copy of another row has."""
     given: dict[int, list[int]] = {0: [], 1: []}

@@ -123,6 +123,7 @@ def burn(env: VectorEnv) -> Floats:
     return best
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("name", "best", "within"),
     [

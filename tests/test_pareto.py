@@ -17,6 +17,8 @@ from cirl_marl.network import Network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.report.sweep import FILES, write_sweep
 
+pytestmark = pytest.mark.medium
+
 
 def swept(network: Network, directory: Path, **options: object) -> Sweep:
     """Sweep with three weights and a short training."""

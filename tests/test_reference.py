@@ -105,6 +105,7 @@ def test_the_papers_scenario_of_an_agent() -> None:
         single_agent_env("net_zero", agent="digester", scenario="paper")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("network", "agent"),
     [(name, agent) for name in ("net_zero", "solids_net") for agent in load_network(name).agents],

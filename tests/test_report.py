@@ -76,6 +76,7 @@ def _settings_untouched() -> Iterator[None]:
     assert pyplot is None or not pyplot.get_fignums()
 
 
+@pytest.mark.medium
 def test_package_needs_no_matplotlib() -> None:
     """Importing the library and stepping an environment leave this package, and pyplot with it, unloaded."""
     code = (
@@ -106,6 +107,7 @@ def test_catalogue_is_readable(name: str) -> None:
             assert (np.abs(curve[:, None] - others) > layout.box / 2).any(axis=-1).all()
 
 
+@pytest.mark.medium
 @pytest.mark.sample(3)
 @pytest.mark.parametrize("size", [(2, 1), (3, 2), (9, 16), (20, 40), (50, 90), (2000, 4000)])
 def test_networks_of_any_size(tmp_path: Path, size: tuple[int, int]) -> None:
@@ -118,6 +120,7 @@ def test_networks_of_any_size(tmp_path: Path, size: tuple[int, int]) -> None:
     assert [found.name for found in path.parent.iterdir()] == ["network.png"]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("nodes", [7, 300])
 def test_long_chain_and_ring(tmp_path: Path, nodes: int) -> None:
     """A ring without sources and a chain are drawn too."""
@@ -145,6 +148,7 @@ def test_opposite_arcs_keep_apart() -> None:
     assert np.hypot(*(there[:, None] - back).T).min() > 1.5
 
 
+@pytest.mark.medium
 def test_before_and_after(tmp_path: Path) -> None:
     """Two states stand side by side, with the wider arrow where the flow is larger."""
     network = cirl_marl.load_network("carbo_net")
@@ -243,6 +247,7 @@ def test_frames_share_no_memory() -> None:
 
 
 # pygame imports pkg_resources, which is deprecated.
+@pytest.mark.medium
 @pytest.mark.filterwarnings("ignore:pkg_resources is deprecated:UserWarning")
 @pytest.mark.filterwarnings("ignore:pkg_resources is deprecated:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:Deprecated call to `pkg_resources:DeprecationWarning")
@@ -267,6 +272,7 @@ def test_window_needs_pygame(monkeypatch: pytest.MonkeyPatch) -> None:
         env.reset(seed=0)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("episodes", [0, 1, 12])
 def test_circularity_curves(tmp_path: Path, episodes: int) -> None:
     """λ and service are drawn for any number of episodes, and for a single step."""
@@ -279,6 +285,7 @@ def test_circularity_curves(tmp_path: Path, episodes: int) -> None:
     read(save_circularity(tmp_path / "none.png", network, np.arange(3.0), {}, {}))
 
 
+@pytest.mark.medium
 @pytest.mark.sample(3)
 @pytest.mark.parametrize("agents", [0, 1, 2, 7, 20, 33])
 def test_learning_curves(tmp_path: Path, agents: int) -> None:
@@ -293,6 +300,7 @@ def test_learning_curves(tmp_path: Path, agents: int) -> None:
             read(path)
 
 
+@pytest.mark.medium
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("network", [lambda: cirl_marl.load_network("copper_net"), lambda: random_network(40, 90)])
 @pytest.mark.parametrize("steps", [1, 60])
@@ -305,6 +313,7 @@ def test_trajectory(tmp_path: Path, network: Callable[[], Network], steps: int) 
     read(save_trajectory(tmp_path / "path.png", shown, time, stock, flow, shown.circularity(flow)))
 
 
+@pytest.mark.medium
 def test_stocks_are_drawn_from_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A large reserve is drawn by its change since the start of the episode, not since the end of the first step."""
     lines: dict[str, tuple[Floats, Floats]] = {}

@@ -17,6 +17,8 @@ from cirl_marl.learners import Progress, Recipe, RunDirectory, resume, train
 from cirl_marl.learners.learner import load_model
 from cirl_marl.learners.recipe import Demonstrations, Learner, Run
 
+pytestmark = pytest.mark.medium
+
 
 class FailsAt(BaseCallback):
     """Fails at a step of its learner."""

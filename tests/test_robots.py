@@ -194,6 +194,7 @@ class TestTasks:
         inputs[:, 0], inputs[0, 3], inputs[1, 4], inputs[:, 5] = (below[1], -below[1]), 0.005, -0.005, 0.0
         np.testing.assert_array_equal(Reacher().success(state, inputs), [True, False, False, False, False, True])
 
+    @pytest.mark.medium
     def test_random_torques_succeed_only_where_signed(self) -> None:
         """Torques as of an untrained policy: had they to be below 0.005 with their signs, a quarter would do."""
         robot, rng = Reacher(), np.random.default_rng(0)
@@ -227,6 +228,7 @@ class TestTasks:
             found.append(expected)
         assert 0.01 < np.mean(found) < 0.99
 
+    @pytest.mark.medium
     @pytest.mark.parametrize(("robot", "script", "copies"), [(Fetch(), fetch, 100), (Reacher(), reacher, 100)])
     def test_scripts_do_the_task(self, robot: Robot, script: Callable[[Seen], Floats], copies: int) -> None:
         """Within 50 steps, in at least 95 of 100 attempts."""
@@ -237,6 +239,7 @@ class TestTasks:
             done |= robot.success(state, inputs)
         assert done.mean() >= 0.95
 
+    @pytest.mark.medium
     def test_the_fetch_script_is_fast(self) -> None:
         """It earns about as much as the best learner of the paper, −11.45, which may have met another target."""
         state, earned = starts(Fetch(), 60, 3000), np.zeros(60)
@@ -377,6 +380,7 @@ class TestSortingStation:
 class TestThreads:
     """Environments in threads are those of a single thread: each has a simulator of its own."""
 
+    @pytest.mark.medium
     @pytest.mark.parametrize("id_", ["cirl_marl/Reacher-v0", "cirl_marl/FetchWasteSorting-v0"])
     def test_threads_do_not_meet(self, id_: str) -> None:
         """MuJoCo lets other threads run while it steps; no state is lost to them."""
@@ -403,6 +407,7 @@ class TestRegistry:
         with pytest.raises(CirlError, match="Did you mean 'reacher'"):
             model_class("reachers")
 
+    @pytest.mark.medium
     def test_light_kinds_do_not_load_mujoco(self) -> None:
         """Only asking for a robot imports MuJoCo; the station's class alone makes no engine."""
         code = (
@@ -413,6 +418,7 @@ class TestRegistry:
         assert done.stdout.split() == ["False", "True"]
         assert done.stderr == ""
 
+    @pytest.mark.medium
     def test_catalogue_does_not_load_mujoco_or_torch(self) -> None:
         """Loading a network without a robot, and stepping it, stays light."""
         code = (

@@ -22,6 +22,8 @@ from cirl_marl.learners.trained import Trained
 from cirl_marl.records import files as files_module
 from cirl_marl.records.files import write_atomically
 
+pytestmark = pytest.mark.medium
+
 
 def test_run_directory_holds_what_is_needed(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """Saved policies, with their normalisers, act exactly like those in memory."""

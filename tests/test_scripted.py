@@ -163,6 +163,7 @@ def test_truck_and_incinerator_pull_the_right_way() -> None:
     assert (np.diff(heat) > 0.0).all()
 
 
+@pytest.mark.medium
 def test_the_incinerator_s_script_knows_its_set_point() -> None:
     """It holds what its model asks for, to some degrees."""
     base = load_network("solids_net", scenario="reacher")
@@ -181,6 +182,7 @@ def inside(run_of: VectorEnv, name: str, run: Any) -> Floats:
     return values
 
 
+@pytest.mark.medium
 def test_scripts_are_worth_having() -> None:
     """The truck brings 3 items in 4 s and rests at home; from half-way the freeboard is nearer to 1000 °C."""
     env = VectorEnv("solids_net", num_envs=1, scenario="reacher")

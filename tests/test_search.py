@@ -20,6 +20,7 @@ from cirl_marl.optimum.population import Population, starting_states
 EVERYWHERE = [(name, scenario) for name in networks() for scenario in (None, *load_network(name).scenarios)]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("name", "scenario"), EVERYWHERE)
 def test_plan_achieves_what_it_says_and_no_less_than_its_candidates(name: str, scenario: str | None) -> None:
     """In each network a lone copy that replays the plan earns the figures that it was chosen for."""
@@ -39,6 +40,7 @@ def test_plan_achieves_what_it_says_and_no_less_than_its_candidates(name: str, s
     assert "no certificate" in str(found)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("name", "gap"), [("copper_net", 0.1), ("carbo_net", 0.02)])
 def test_comes_close_to_the_bound(name: str, gap: float) -> None:
     """Ten days: where there is a bound the plan stays below it, and not far."""
@@ -83,6 +85,7 @@ def test_same_seed_finds_the_same_plan() -> None:
     assert (first.actions != other.actions).any()
 
 
+@pytest.mark.medium
 def test_starts_are_searched_side_by_side_as_they_are_alone() -> None:
     """Plans from three starts, inner states included, equal those found one by one, and each copy follows its own."""
     env = VectorEnv("net_zero", num_envs=3, horizon=4)

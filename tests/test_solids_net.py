@@ -232,6 +232,8 @@ AGAIN = """
 import pickle, sys
 import numpy as np
 from cirl_marl import VectorEnv
+
+pytestmark = pytest.mark.medium
 network, snapshot, actions, states = pickle.load(open(sys.argv[1], "rb"))
 env = VectorEnv(network, num_envs=2)
 env.restore(snapshot)

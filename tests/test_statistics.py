@@ -42,6 +42,7 @@ def test_interval_of_two_seeds_is_their_range() -> None:
     assert (found.value, found.low, found.high) == (2.0, 1.0, 3.0)
 
 
+@pytest.mark.medium
 def test_interval_against_all_resamples() -> None:
     """With five seeds every one of the 5⁵ resamples can be listed; their percentiles are the interval's."""
     scores = np.array([0.0, 1.0, 3.0, 4.0, 10.0])
@@ -59,6 +60,7 @@ def test_seeds_are_resampled_within_each_network() -> None:
     assert (found.value, found.low, found.high) == (5.0, 5.0, 5.0)
 
 
+@pytest.mark.medium
 @pytest.mark.sample(1)
 @pytest.mark.parametrize(
     ("networks", "seeds", "least", "most"), [(4, 10, 0.915, 0.945), (1, 10, 0.92, 0.95), (1, 5, 0.89, 0.92)]

@@ -27,6 +27,8 @@ from cirl_marl.network.elements import Episode, Law
 from cirl_marl.paper.results import Row
 from cirl_marl.paper.running import run_row
 
+pytestmark = pytest.mark.medium
+
 OFF_POLICY = {
     "buffer_size": 1000,
     "learning_starts": 10,
