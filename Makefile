@@ -4,13 +4,17 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test lint types wheel unit study speed clean
+.PHONY: demo check test test-all lint types wheel fast unit every study speed clean
 
 demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
 	rm -rf runs/demo
 	$(BIN)/cirl train copper_net --agents independent_ppo --seed 0 --out runs/demo
 
-test: lint types wheel unit  ## everything that continuous integration needs
+check: lint types fast  ## lint, types and the fast tests, in under 2 minutes on 2 cores
+
+test: lint types wheel unit  ## everything that continuous integration needs: what roams over the catalogue is sampled
+
+test-all: lint types wheel every  ## every test with every parameter, and three times the random examples
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -19,8 +23,14 @@ lint: $(VENV)/.dev
 types: $(VENV)/.dev
 	$(BIN)/mypy
 
+fast: $(VENV)/.dev
+	$(BIN)/python -m pytest -q -n 2 -m 'not slow and not medium' tests
+
 unit: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 -m 'not slow'
+
+every: $(VENV)/.dev
+	$(BIN)/python -m pytest -q -n 2 --hypothesis-profile=all
 
 wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clean environment
 	rm -rf dist build/clean

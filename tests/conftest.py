@@ -32,6 +32,7 @@ settings.register_profile(
     derandomize="CI" in os.environ,
     suppress_health_check=[HealthCheck.too_slow],
 )
+settings.register_profile("all", settings.get_profile("cirl_marl"), max_examples=75)
 settings.register_profile("thorough", settings.get_profile("cirl_marl"), max_examples=1000, derandomize=False)
 settings.load_profile("cirl_marl")
 

@@ -15,6 +15,7 @@ from cirl_marl.compartments import model_class
 from cirl_marl.network import Floats
 
 KG_PER_MMOL = 44.01e-6
+pytestmark = pytest.mark.medium
 SCENARIOS = ("default", "droop")
 
 
@@ -85,7 +86,6 @@ def uptake_after(days: float, light: float, form: str) -> tuple[float, float]:
     return float(per_biovolume), float(per_biovolume * end[0, 0] / 1000.0)
 
 
-@pytest.mark.medium
 def test_volume_ratios_of_net_zero() -> None:
     """248 with the misprint corrected, 648 with it (625 rounded), 4960, the definition's, with the units kept."""
     digester, none = model_class("digester")(), np.zeros((6, 1))
@@ -151,7 +151,6 @@ def episodes(scenario: str) -> dict[str, Episode]:
     return {name: Episode(*each) for name, each in zip(POLICIES, zip(*columns, strict=True), strict=True)}
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_net_zero_is_reached(scenario: str) -> None:
     """At neutral dilution, with light, the network ends within 1 % of net zero; 248 m³ would remove a twentieth."""
@@ -194,7 +193,6 @@ def exact_day(network: Network, state: Floats) -> Floats:
     return state
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_against_scipy(scenario: str) -> None:
     """A day of jumping controls at the definition's step: what moved to 1e-5 kg, of 3 and 2 to 6 kg.
@@ -211,7 +209,6 @@ def test_against_scipy(scenario: str) -> None:
     assert found[-1] == pytest.approx(exact[-1], rel=1e-3)
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_convergence_with_the_solver_step(scenario: str) -> None:
     """The emission, by Runge-Kutta, converges with order 4, the biomass, by a step of its own, with order 2."""

@@ -26,6 +26,7 @@ from cirl_marl.network.elements import REWARDS, Law
 from cirl_marl.network.staged import staged_circularity, time_window_circularity
 from cirl_marl.testing.nested import same_or_raise
 
+pytestmark = pytest.mark.medium
 BATCH_KG, ITEMS = 300.0, 3
 both = pytest.mark.parametrize("scenario", ["default", "reacher"])
 
@@ -232,8 +233,6 @@ AGAIN = """
 import pickle, sys
 import numpy as np
 from cirl_marl import VectorEnv
-
-pytestmark = pytest.mark.medium
 network, snapshot, actions, states = pickle.load(open(sys.argv[1], "rb"))
 env = VectorEnv(network, num_envs=2)
 env.restore(snapshot)
