@@ -143,6 +143,9 @@ ArcTable = table_of(
     Arc, title=TITLE, series=(Series | None, Field(None, description="time series of the exogenous law"))
 )
 ServiceTable = table_of(Service, title=TITLE)
+EpisodeTable = table_of(Episode)
+ObjectiveTable = table_of(Objective)
+ObservationTable = table_of(Observation)
 
 
 class UnitsTable(Table):
@@ -167,10 +170,10 @@ class NetworkTable(Table):
     material: str
     references: list[str] = []
     units: UnitsTable
-    episode: table_of(Episode)  # type: ignore[valid-type]
+    episode: EpisodeTable  # type: ignore[valid-type]
     scales: ScalesTable
-    objective: table_of(Objective)  # type: ignore[valid-type]
-    observation: table_of(Observation)  # type: ignore[valid-type]
+    objective: ObjectiveTable  # type: ignore[valid-type]
+    observation: ObservationTable  # type: ignore[valid-type]
     agents: list[str] = Field([], description="who acts; default: every compartment with a control")
     nodes: dict[Identifier, NodeTable]  # type: ignore[valid-type]
     arcs: dict[Identifier, ArcTable]  # type: ignore[valid-type]
