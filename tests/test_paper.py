@@ -21,7 +21,7 @@ from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
 from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.learners.algorithms import build
-from cirl_marl.paper import evaluation, published, session, training, tuned
+from cirl_marl.paper import evaluation, published, running, session, training, tuned
 from cirl_marl.paper.document import markdown
 from cirl_marl.paper.evaluation import evaluate
 from cirl_marl.paper.plan import planned, study
@@ -507,7 +507,7 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
         settings={},
         options={},
     )
-    monkeypatch.setattr("cirl_marl.paper.running.train_published", lambda *_: done)
+    monkeypatch.setattr(running, "train_published", lambda *_: done)
     monkeypatch.setattr(evaluation, "EVALUATION_EPISODES", 20)
     found = run_row(Row(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
     assert found.start_return == pytest.approx(np.mean(returns[:window]))

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from cirl_marl.compartments import CompartmentModel, model_class
 from cirl_marl.definitions.mistakes import parameter_mistakes
-from cirl_marl.definitions.schema import (
-    ArcTable,
-    Batches,
-    ControlTable,
-    ModelTable,
-    NetworkTable,
-    NodeTable,
-    Quantity,
-    ServiceTable,
-)
+from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable, QuantityTable, Range
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network import Network
+from cirl_marl.network.declared import Declared, Names, Numbers, Quantity, declarations
 from cirl_marl.network.elements import (
+    TAKEN,
     Arc,
     Control,
     ControlKind,
@@ -34,15 +26,7 @@ from cirl_marl.network.elements import (
 from cirl_marl.network.units import factor
 
 GIVEN = ("rate", "flow", "series", "batches")
-NEEDED = {
-    Law.DONOR: ("rate",),
-    Law.RECIPIENT: ("rate",),
-    Law.CONTROLLED: ("",),
-    Law.EXOGENOUS: ("flow", "series"),
-    Law.COMPARTMENT: ("rate",),
-    Law.BATCH: ("rate", "batches"),
-}
-"""What each law needs, one of the given."""
+"""Keys of which a law needs one, if it takes any of them: an exogenous flow or its series, a rate or batches."""
 
 HINTS = {
     "rate": "a rate, 1/time, is the flow divided by the stock of its donor (law 'recipient': of its recipient); "
@@ -76,33 +60,19 @@ class Converter:
                 factor(unit, base)
             except CirlError as error:
                 raise NetworkError(table.name, [f"units.{key}: {error}"]) from None
-        episode, objective = table.episode, table.objective
         for key, kind, scale in (("stock", "mass", table.scales.stock), ("flow", "flow", table.scales.flow)):
             self.scales[kind] = self._value(scale, kind, f"scales.{key}")
             if self.scales[kind] <= 0:
                 self.mistakes.append(f"scales.{key}: {scale.value} must be positive")
-        nodes = tuple(self._node(id_, node) for id_, node in table.nodes.items())
-        arcs = tuple(self._arc(id_, arc) for id_, arc in table.arcs.items())
-        services = tuple(self._service(id_, service) for id_, service in table.services.items())
-        horizon = self._value(episode.horizon, "steps", "episode.horizon")
-        if horizon != int(horizon):
-            self.mistakes.append(f"episode.horizon: {horizon} must be a whole number of control intervals")
-        settings: dict[str, Any] = {
-            "episode": Episode(
-                control_interval=self._value(episode.control_interval, "time", "episode.control_interval"),
-                horizon=int(horizon),
-                solver=episode.solver,
-                solver_step=self._optional(episode.solver_step, "time", "episode.solver_step"),
+        parts: dict[str, Any] = {
+            "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
+            "arcs": tuple(self._compartment(Arc, id_, arc, f"arcs.{id_}") for id_, arc in table.arcs.items()),
+            "services": tuple(
+                self._part(Service, service, f"services.{id_}", id=id_) for id_, service in table.services.items()
             ),
-            "objective": Objective(
-                reference_interval=self._value(objective.reference_interval, "time", "objective.reference_interval"),
-                net_zero=objective.net_zero,
-                reward=objective.reward,
-                circularity_scale=self._value(objective.circularity_scale, "mass", "objective.circularity_scale"),
-                circularity_weight=self._value(objective.circularity_weight, "1", "objective.circularity_weight"),
-                tracked=tuple(objective.tracked),
-                criticality=self._optional(objective.criticality, "1", "objective.criticality"),
-            ),
+            "episode": self._part(Episode, table.episode, "episode"),
+            "objective": self._part(Objective, table.objective, "objective"),
+            "observation": self._part(Observation, table.observation, "observation"),
         }
         if self.mistakes:
             raise NetworkError(table.name, self.mistakes)
@@ -112,69 +82,66 @@ class Converter:
             mass_unit=table.units.mass,
             time_unit=table.units.time,
             scenario_name=scenario,
-            nodes=nodes,
-            arcs=arcs,
-            services=services,
             acting=tuple(table.agents),
-            observation=Observation(mode=table.observation.mode, nodes=tuple(table.observation.nodes)),
-            **settings,
+            **parts,
         )
 
-    def _node(self, id_: str, node: NodeTable) -> Node:
-        where = f"nodes.{id_}"
-        scale = self._factor(node.initial.unit, "mass", f"{where}.initial")
-        model = self._model(node.model, f"{where}.model")
-        return Node(
-            id=id_,
-            role=node.role,
-            initial=(node.initial.low * scale, node.initial.high * scale),
-            set_point=self._optional(node.set_point, "mass", f"{where}.set_point"),
-            scale=self._scale(node.scale, "mass", where),
-            control=self._control(node.control, model.get("model"), f"{where}.control"),
-            **model,
-        )
+    def _part(self, made: type[Any], table: Any, where: str, **known: Any) -> Any:
+        """Return a part of the network: ``known`` fields, those that its table gives, and defaults for the others."""
+        for name, declared in declarations(made).items():
+            given = getattr(table, name, None)
+            if name not in known and given is not None:
+                known[name] = self._read(declared, given, table, f"{where}.{declared.key or name}")
+        return made(**known)
 
-    def _arc(self, id_: str, arc: ArcTable) -> Arc:
-        where = f"arcs.{id_}"
-        self._check_law(arc, where)
-        flow: tuple[float, ...] = (0.0,)
-        times: tuple[float, ...] = ()
-        if arc.flow is not None:
-            flow = (self._value(arc.flow, "flow", f"{where}.flow"),)
-        elif arc.series is not None:
-            unit = self._factor(arc.series.unit, "flow", f"{where}.series")
-            clock = self._factor(arc.series.time_unit, "time", f"{where}.series.time_unit")
-            flow = tuple(value * unit for value in arc.series.values)
-            times = tuple(time * clock for time in arc.series.times)
-        batches: tuple[tuple[float, float], ...] = ()
-        if arc.batches is not None:
-            batches = self._batches(arc.batches, f"{where}.batches")
-        model = self._model(arc.model, f"{where}.model")
-        rate_kind = {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}.get(arc.law, "rate")
-        return Arc(
-            id=id_,
-            donor=arc.from_,
-            recipient=arc.to,
-            law=arc.law,
-            rate=self._optional(arc.rate, rate_kind, f"{where}.rate") or 0.0,
-            by=arc.by,
-            port=arc.port,
-            batches=batches,
-            delay=self._optional(arc.delay, "time", f"{where}.delay") or 0.0,
-            flow=flow,
-            times=times,
-            set_point=self._optional(arc.set_point, "flow", f"{where}.set_point"),
-            scale=self._scale(arc.scale, "mass" if arc.law is Law.BATCH else "flow", where),
-            pollutant=arc.pollutant,
-            control=self._control(arc.control, model.get("model"), f"{where}.control"),
-            **model,
-        )
+    def _read(self, declared: Declared, given: Any, table: Any, where: str) -> Any:
+        """Return what a declared field is in Python."""
+        if isinstance(declared, Quantity):
+            kind = declared.kind(table)
+            value = self._value(given, kind, where)
+            if kind != "steps":
+                return value
+            if value != int(value):
+                self.mistakes.append(f"{where}: {value} must be a whole number of control intervals")
+            return int(value)
+        if isinstance(given, Range):
+            scale = self._factor(given.unit, "mass", where)
+            return given.low * scale, given.high * scale
+        if isinstance(given, Batches):
+            return self._batches(given, where)
+        if isinstance(declared, Numbers):
+            return (self._value(given, "flow", where),)
+        return tuple(given) if isinstance(declared, Names) else given
 
-    def _check_law(self, arc: ArcTable, where: str) -> None:
+    def _compartment(self, made: type[Node] | type[Arc], id_: str, table: Any, where: str) -> Any:
+        """Return a node or an arc, whose control depends on its model, with the scale of all that state none."""
+        known = {"id": id_, **self._model(table.model, f"{where}.model")}
+        known |= {"model": known.get("model"), "control": self._control(table.control, known.get("model"), where)}
+        if made is Arc:
+            self._check_law(table, where)
+            known |= self._series(table, where)
+        if table.scale is None:
+            scale = declarations(made)["scale"]
+            assert isinstance(scale, Quantity)
+            known["scale"] = self.scales[scale.kind(table)]
+        return self._part(made, table, where, **known)
+
+    def _check_law(self, arc: Any, where: str) -> None:
+        """Note an arc that lacks what its law needs, or gives what only others take."""
         given = [key for key in GIVEN if getattr(arc, key) is not None]
-        if given not in ([key] if key else [] for key in NEEDED[arc.law]):
-            needed = " or ".join(key for key in NEEDED[arc.law] if key) or f"none of {', '.join(GIVEN)}"
-            self.mistakes.append(f"{where}: law '{arc.law}' needs {needed}, got {given or 'none'}")
+        needed = [key for key in GIVEN if {"series": "times"}.get(key, key) in TAKEN[Law(arc.law)]]
+        if len(given) != min(1, len(needed)) or not set(given) <= set(needed):
+            asked = " or ".join(needed) or f"none of {', '.join(GIVEN)}"
+            self.mistakes.append(f"{where}: law '{arc.law}' needs {asked}, got {given or 'none'}")
+
+    def _series(self, arc: Any, where: str) -> dict[str, Any]:
+        """Return flow and times of an exogenous series."""
+        if arc.series is None:
+            return {}
+        unit = self._factor(arc.series.unit, "flow", f"{where}.series")
+        clock = self._factor(arc.series.time_unit, "time", f"{where}.series.time_unit")
+        values, times = arc.series.values, arc.series.times
+        return {"flow": tuple(value * unit for value in values), "times": tuple(time * clock for time in times)}
 
     def _batches(self, table: Batches, where: str) -> tuple[tuple[float, float], ...]:
         if len(table.times) != len(table.masses):
@@ -183,21 +150,6 @@ class Converter:
         clock = self._factor(table.time_unit, "time", f"{where}.time_unit")
         unit = self._factor(table.unit, "mass", f"{where}.unit")
         return tuple((time * clock, mass * unit) for time, mass in zip(table.times, table.masses, strict=True))
-
-    def _service(self, id_: str, service: ServiceTable) -> Service:
-        where = f"services.{id_}"
-        kind = {"stock": "mass", "measure": "1"}.get(service.quantity, "flow")
-        high = self._optional(service.high, kind, f"{where}.high")
-        return Service(
-            id=id_,
-            provider=service.provider,
-            quantity=service.quantity,
-            low=self._value(service.low, kind, f"{where}.low"),
-            weight=self._value(service.weight, "1", f"{where}.weight"),
-            owed_by=tuple(service.owed_by),
-            measure=service.measure,
-            high=math.inf if high is None else high,
-        )
 
     def _model(self, table: ModelTable | None, where: str) -> dict[str, Any]:
         """Return the model of a compartment and the initial ranges of its inner states, as keywords."""
@@ -228,14 +180,15 @@ class Converter:
                 told = f"'{name}' is missing" if name in ranged else unknown("inner state", name, missing)
                 self.mistakes.append(f"{where}.initial: {told}")
         ranges = [table.initial[name] for name in ranged if name in table.initial]
-        scale = self._optional(table.reward_scale, "1", f"{where}.reward_scale")
+        scale = table.reward_scale
         return {
             "model": model,
             "inner": tuple((span.low, span.high) for span in ranges),
-            "reward_scale": 1.0 if scale is None else scale,
+            "reward_scale": 1.0 if scale is None else self._value(scale, "1", f"{where}.reward_scale"),
         }
 
-    def _control(self, control: ControlTable | None, model: CompartmentModel | None, where: str) -> Control | None:
+    def _control(self, control: Any, model: CompartmentModel | None, where: str) -> Control | None:
+        where = f"{where}.control"
         if control is None:
             return None
         target = {
@@ -250,22 +203,11 @@ class Converter:
             )
             return None
         unit = self._factor(control.unit, target or "1", where)
-        return Control(
-            kind=control.kind,
-            low=control.low * unit,
-            high=control.high * unit,
-            neutral=control.neutral * unit,
-        )
+        low, neutral, high = (value * unit for value in (control.low, control.neutral, control.high))
+        return Control(kind=control.kind, low=low, neutral=neutral, high=high)
 
-    def _scale(self, own: Quantity | None, kind: str, where: str) -> float:
-        """Return a compartment's own reference value, or that of all that state none."""
-        return self.scales[kind] if own is None else self._value(own, kind, f"{where}.scale")
-
-    def _value(self, quantity: Quantity, kind: str, where: str) -> float:
+    def _value(self, quantity: QuantityTable, kind: str, where: str) -> float:
         return quantity.value * self._factor(quantity.unit, kind, where)
-
-    def _optional(self, quantity: Quantity | None, kind: str, where: str) -> float | None:
-        return None if quantity is None else self._value(quantity, kind, where)
 
     def _factor(self, unit: str, kind: str, where: str) -> float:
         """Return what converts ``unit`` to the network's unit of a kind, or to the unit ``kind`` if it is none."""

@@ -1,17 +1,36 @@
-"""The shape of a definition file: strict, typed tables in which each number has a value, a unit and a source."""
+"""The shape of a definition file: strict, typed tables in which each number has a value, a unit and a source.
+
+The tables of nodes, arcs, controls, services and settings follow from the declarations in ``network.elements``; only
+what files spell otherwise than Python is written out here.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, create_model
 
-from cirl_marl.network.elements import ControlKind, Law, NetZero, Observe, Reward, Role, ServiceQuantity, Solver
+from cirl_marl.network.declared import (
+    Amount,
+    Declared,
+    Flag,
+    Names,
+    Nested,
+    Numbers,
+    Quantity,
+    Word,
+    declarations,
+    default_of,
+    is_required,
+)
+from cirl_marl.network.elements import Arc, Control, Episode, Node, Objective, Observation, Service
 from cirl_marl.network.validate import IDENTIFIER
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Source = Annotated[str, Field(min_length=1, description="where the number comes from")]
 Identifier = Annotated[str, Field(pattern=IDENTIFIER)]
+IN_MODEL = ("inner", "reward_scale")
+"""Fields of compartments that stand in the table of their model."""
 
 
 class Table(BaseModel):
@@ -20,7 +39,7 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class Quantity(Table):
+class QuantityTable(Table):
     """A number with its unit and source."""
 
     value: Number
@@ -57,19 +76,6 @@ class Batches(Table):
     source: Source
 
 
-class ControlTable(Table):
-    """What the agent of this compartment sets."""
-
-    kind: ControlKind = Field(
-        description="'rate': a factor on the flow(s); 'flow': the flow itself; 'input': of the model"
-    )
-    low: Number = Field(description="value at action -1")
-    neutral: Number = Field(description="value while nobody acts")
-    high: Number = Field(description="value at action +1")
-    unit: str
-    source: Source
-
-
 class InnerRange(Table):
     """Initial range of an inner state, in the unit that its name carries."""
 
@@ -90,59 +96,56 @@ class ModelTable(Table):
     initial: dict[str, InnerRange] = Field(
         {}, description="initial range of each inner state that the model does not draw"
     )
-    reward_scale: Quantity | None = Field(None, description="the model's reward is divided by it, unit '1'; default 1")
-
-
-class NodeTable(Table):
-    """A compartment that stores material."""
-
-    title: str = ""
-    model: ModelTable | None = None
-    role: Role
-    initial: Range
-    set_point: Quantity | None = None
-    scale: Quantity | None = Field(None, description="reference stock; default: scales.stock")
-    control: ControlTable | None = None
-
-
-class ArcTable(Table):
-    """A compartment that moves material."""
-
-    title: str = ""
-    model: ModelTable | None = None
-    by: str = Field("", description="compartment whose model gives the flow or releases the batches")
-    port: str = Field("", description="port of that model (batch law)")
-    batches: Batches | None = Field(None, description="schedule of the batch law; instead of 'by'")
-    delay: Quantity | None = Field(None, description="transit time of batches, if no vehicle's model decides")
-    from_: str = Field(alias="from", description="id of the node that gives")
-    to: str = Field(description="id of the node that receives")
-    law: Law
-    rate: Quantity | None = Field(
-        None, description="a, 1/time (donor, recipient), mass/time per unit of output, mass per unit released (batch)"
+    reward_scale: QuantityTable | None = Field(
+        None, description="the model's reward is divided by it, unit '1'; default 1"
     )
-    flow: Quantity | None = Field(None, description="constant flow of the exogenous law")
-    series: Series | None = Field(None, description="time series of the exogenous law")
-    set_point: Quantity | None = None
-    scale: Quantity | None = Field(
-        None, description="reference flow, default: scales.flow; of a batch arc reference mass, default: scales.stock"
+
+
+def table_of(made: type[Any], **more: Any) -> Any:
+    """Return the table of a part: a key for each declared field, with ``more`` that Python has otherwise."""
+    told = {name: declared for name, declared in declarations(made).items() if name not in IN_MODEL}
+    keys = {name: _key(made, name, declared) for name, declared in told.items() if _spelled(declared) is not None}
+    if any(isinstance(declared, Amount) for declared in told.values()):
+        more |= {"unit": (str, ...), "source": (Source, ...)}
+    summary = str(made.__doc__).partition("\n")[0]
+    return create_model(f"{made.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
+
+
+def _key(made: type[Any], name: str, declared: Declared) -> tuple[Any, Any]:
+    """Return type and pydantic field of a declared field; what is left out is None, or its default if that is plain."""
+    kind, alias = _spelled(declared), declared.key or None
+    if is_required(made, name):
+        return kind, Field(description=declared.meaning, alias=alias)
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return kind | None, Field(None, description=declared.meaning, alias=alias)
+    default = default_of(made, name)
+    return kind, Field(
+        list(default) if isinstance(default, tuple) else default, description=declared.meaning, alias=alias
     )
-    pollutant: StrictBool = Field(True, description="whether what enters an environment here is a pollutant")
-    control: ControlTable | None = None
 
 
-class ServiceTable(Table):
-    """A stock or flow to be kept within a band."""
+def _spelled(declared: Declared) -> Any:
+    """Return the type of a declared field in a file; None if it stands in the table of another."""
+    if isinstance(declared, Word):
+        return declared.of if isinstance(declared.of, type) else Literal[declared.of]
+    if isinstance(declared, Numbers):
+        return {"range": Range, "batches": Batches, "flow": QuantityTable}.get(declared.spelled)
+    if isinstance(declared, Nested):
+        return ControlTable if declared.of == "control" else ModelTable
+    plain = {Names: list[str], Flag: StrictBool, Quantity: QuantityTable, Amount: Number}
+    return plain.get(type(declared), str)
 
-    title: str = ""
-    provider: str = Field(description="compartment at which the service is measured")
-    quantity: ServiceQuantity
-    measure: str = Field("", description="what the provider's model measures, for quantity 'measure'")
-    low: Quantity
-    high: Quantity | None = None
-    weight: Quantity = Field(description="factor of the shortfall in the local rewards")
-    owed_by: list[str] = Field(
-        [], description="compartments whose local reward bears the shortfall; default: the provider"
-    )
+
+TITLE: Any = (str, "")
+ControlTable = table_of(Control)
+NodeTable = table_of(Node, title=TITLE)
+ArcTable = table_of(
+    Arc, title=TITLE, series=(Series | None, Field(None, description="time series of the exogenous law"))
+)
+ServiceTable = table_of(Service, title=TITLE)
+EpisodeTable = table_of(Episode)
+ObjectiveTable = table_of(Objective)
+ObservationTable = table_of(Observation)
 
 
 class UnitsTable(Table):
@@ -152,43 +155,11 @@ class UnitsTable(Table):
     time: str
 
 
-class EpisodeTable(Table):
-    """Time and solver."""
-
-    control_interval: Quantity
-    horizon: Quantity = Field(description="decisions per episode, unit '1'")
-    solver: Solver = "exact"
-    solver_step: Quantity | None = None
-
-
 class ScalesTable(Table):
     """Reference stock and flow of compartments that state none of their own."""
 
-    stock: Quantity
-    flow: Quantity
-
-
-class ObjectiveTable(Table):
-    """Circularity and rewards."""
-
-    reference_interval: Quantity = Field(description="the interval Δ of λ = -(m_fb + Δ·ṁ_fc)")
-    net_zero: NetZero
-    reward: Reward
-    circularity_scale: Quantity
-    circularity_weight: Quantity
-    tracked: list[str] = Field(
-        [], description="compartments whose set-point counts in local rewards; default: all that have one"
-    )
-    criticality: Quantity | None = Field(
-        None, description="criticality of the material, unit '1', for its weighted KPI"
-    )
-
-
-class ObservationTable(Table):
-    """What agents see by default."""
-
-    mode: Observe
-    nodes: list[str] = Field([], description="observed nodes of mode 'stocks', in order")
+    stock: QuantityTable
+    flow: QuantityTable
 
 
 class NetworkTable(Table):
@@ -199,14 +170,14 @@ class NetworkTable(Table):
     material: str
     references: list[str] = []
     units: UnitsTable
-    episode: EpisodeTable
+    episode: EpisodeTable  # type: ignore[valid-type]
     scales: ScalesTable
-    objective: ObjectiveTable
-    observation: ObservationTable
+    objective: ObjectiveTable  # type: ignore[valid-type]
+    observation: ObservationTable  # type: ignore[valid-type]
     agents: list[str] = Field([], description="who acts; default: every compartment with a control")
-    nodes: dict[Identifier, NodeTable]
-    arcs: dict[Identifier, ArcTable]
-    services: dict[Identifier, ServiceTable] = {}
+    nodes: dict[Identifier, NodeTable]  # type: ignore[valid-type]
+    arcs: dict[Identifier, ArcTable]  # type: ignore[valid-type]
+    services: dict[Identifier, ServiceTable] = {}  # type: ignore[valid-type]
     scenarios: dict[Identifier, dict[str, Any]] = Field(
         {},
         description="tables that replace those of the default scenario, key by key, after those named in 'without', "

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
-from collections.abc import Iterator
 from typing import Any
+
+import tomlkit
 
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
-from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node, ranged_states
+from cirl_marl.network.declared import Flag, Names, Nested, Numbers, Quantity, declarations, default_of, is_required
+from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law, ranged_states
 
 SOURCE = "network built in Python"
 
@@ -20,160 +21,145 @@ SOURCE = "network built in Python"
 def definition_of(network: Network) -> str:
     """Return a TOML definition that reads back as ``network``, its numbers equal to the last bit.
 
+    What is as it is by default is left out, so that fields yet to come change no text.
+
     Raises:
         NetworkError: if a model has parameters other than numbers and its form.
     """
-    return "\n".join(_lines(network)) + "\n"
+    return tomlkit.dumps(_laid_out(_Writer(network).document()))
 
 
 def fingerprint(network: Network) -> str:
-    """Return a hash of the network under its scenario, of its definition with every default, its name as the title."""
-    return hashlib.sha256(definition_of(dataclasses.replace(network, title=network.name)).encode()).hexdigest()
+    """Return a hash of the network under its scenario, of its definition, with its name as the title."""
+    document = _Writer(dataclasses.replace(network, title=network.name)).document()
+    return hashlib.sha256(json.dumps(document).encode()).hexdigest()
 
 
-def _lines(network: Network) -> Iterator[str]:
-    mass, time = network.mass_unit, network.time_unit
-    episode, objective = network.episode, network.objective
-    yield f"name = {_text(network.name)}"
-    yield f"title = {_text(network.title)}"
-    yield 'material = "not stated"'
-    yield f"agents = {_list(network.acting)}"
-    if not network.arcs:
-        yield "arcs = {}"
-    yield f"[units]\nmass = {_text(mass)}\ntime = {_text(time)}"
-    yield f"[scales]\nstock = {_quantity(1.0, mass)}\nflow = {_quantity(1.0, _flow(network))}"
-    yield f"[episode]\nsolver = {_text(episode.solver)}"
-    yield f"control_interval = {_quantity(episode.control_interval, time)}"
-    yield f"horizon = {_quantity(episode.horizon, '1')}"
-    if episode.solver_step is not None:
-        yield f"solver_step = {_quantity(episode.solver_step, time)}"
-    yield f"[objective]\nnet_zero = {_text(objective.net_zero)}\nreward = {_text(objective.reward)}"
-    yield f"reference_interval = {_quantity(objective.reference_interval, time)}"
-    yield f"circularity_scale = {_quantity(objective.circularity_scale, mass)}"
-    yield f"circularity_weight = {_quantity(objective.circularity_weight, '1')}"
-    yield f"tracked = {_list(objective.tracked)}"
-    if objective.criticality is not None:
-        yield f"criticality = {_quantity(objective.criticality, '1')}"
-    yield f"[observation]\nmode = {_text(network.observation.mode)}\nnodes = {_list(network.observation.nodes)}"
-    for node in network.nodes:
-        yield from _node(network, node)
-    for arc in network.arcs:
-        yield from _arc(network, arc)
-    for service in network.services:
-        unit = {"stock": mass, "measure": "1"}.get(service.quantity, _flow(network))
-        yield f"[services.{service.id}]\nprovider = {_text(service.provider)}\nquantity = {_text(service.quantity)}"
-        yield f"owed_by = {_list(service.owed_by)}\nmeasure = {_text(service.measure)}"
-        yield f"low = {_quantity(service.low, unit)}\nweight = {_quantity(service.weight, '1')}"
-        if math.isfinite(service.high):
-            yield f"high = {_quantity(service.high, unit)}"
+def _laid_out(document: dict[str, Any]) -> tomlkit.TOMLDocument:
+    """Lay settings and compartments out as tables with a line for each key."""
+    laid = tomlkit.document()
+    for key, value in document.items():
+        if key in ("nodes", "arcs", "services") and value:
+            laid[key] = tomlkit.table(is_super_table=True)
+            for id_, part in value.items():
+                laid[key][id_] = _table(part)
+        else:
+            laid[key] = _table(value) if isinstance(value, dict) and value else value
+    return laid
 
 
-def _node(network: Network, node: Node) -> Iterator[str]:
-    low, high = node.initial
-    unit = _text(network.mass_unit)
-    yield f"[nodes.{node.id}]\nrole = {_text(node.role.value)}"
-    yield f"initial = {{ low = {float(low)!r}, high = {float(high)!r}, unit = {unit}, source = {_text(SOURCE)} }}"
-    yield from _common(network, node, network.mass_unit)
+def _table(part: dict[str, Any]) -> tomlkit.items.Table:
+    table = tomlkit.table()
+    for key, value in part.items():
+        table[key] = _inline(value) if isinstance(value, dict) else value
+    return table
 
 
-def _arc(network: Network, arc: Arc) -> Iterator[str]:
-    flow = _flow(network)
-    yield f"[arcs.{arc.id}]\nfrom = {_text(arc.donor)}\nto = {_text(arc.recipient)}\nlaw = {_text(arc.law.value)}"
-    yield f"pollutant = {json.dumps(arc.pollutant)}"
-    if arc.law is Law.COMPARTMENT:
-        yield f"by = {_text(arc.by)}\nrate = {_quantity(arc.rate, _flow(network))}"
-    elif arc.law is Law.BATCH:
-        yield from _batch(network, arc)
-    elif arc.law in (Law.DONOR, Law.RECIPIENT):
-        yield f"rate = {_quantity(arc.rate, f'1/({network.time_unit})')}"
-    elif arc.law is Law.EXOGENOUS and not arc.times:
-        yield f"flow = {_quantity(arc.flow[0], flow)}"
-    elif arc.law is Law.EXOGENOUS:
-        times, values = list(map(float, arc.times)), list(map(float, arc.flow))
-        yield (
-            f"series = {{ times = {times!r}, time_unit = {_text(network.time_unit)}, values = {values!r}, "
-            f"unit = {_text(flow)}, source = {_text(SOURCE)} }}"
-        )
-    yield from _common(network, arc, network.mass_unit if arc.law is Law.BATCH else flow)
+def _inline(value: dict[str, Any]) -> tomlkit.items.InlineTable:
+    table = tomlkit.inline_table()
+    table.update({key: _inline(each) if isinstance(each, dict) else each for key, each in value.items()})
+    return table
 
 
-def _batch(network: Network, arc: Arc) -> Iterator[str]:
-    if arc.by:
-        yield f"by = {_text(arc.by)}\nport = {_text(arc.port)}\nrate = {_quantity(arc.rate, network.mass_unit)}"
-    else:
-        times, masses = [float(time) for time, _ in arc.batches], [float(mass) for _, mass in arc.batches]
-        yield (
-            f"batches = {{ times = {times!r}, time_unit = {_text(network.time_unit)}, masses = {masses!r}, "
-            f"unit = {_text(network.mass_unit)}, source = {_text(SOURCE)} }}"
-        )
-    if arc.delay:
-        yield f"delay = {_quantity(arc.delay, network.time_unit)}"
+class _Writer:
+    """Writes the parts of a network as tables, in the units of the network."""
+
+    def __init__(self, network: Network) -> None:
+        mass, time = network.mass_unit, network.time_unit
+        self._network = network
+        self._units = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})"}
+
+    def document(self) -> dict[str, Any]:
+        network = self._network
+        return {
+            "name": network.name,
+            "title": network.title,
+            "material": "not stated",
+            "agents": list(network.acting),
+            "units": {"mass": network.mass_unit, "time": network.time_unit},
+            "scales": {"stock": self._quantity(1.0, "mass"), "flow": self._quantity(1.0, "flow")},
+            "episode": self._part(network.episode),
+            "objective": self._part(network.objective),
+            "observation": self._part(network.observation),
+            "nodes": {node.id: self._part(node) for node in network.nodes},
+            "arcs": {arc.id: self._part(arc) for arc in network.arcs},
+            "services": {service.id: self._part(service) for service in network.services},
+        }
+
+    def _part(self, part: Any) -> dict[str, Any]:
+        """Return the table of a part, without what is as it is by default."""
+        table: dict[str, Any] = {}
+        for name, declared in declarations(type(part)).items():
+            value, key = getattr(part, name), declared.key or name
+            needed = is_required(type(part), name) or name == _needed(part)
+            if not needed and value == default_of(type(part), name):
+                continue
+            if isinstance(declared, Quantity):
+                table[key] = self._quantity(value, declared.kind(part))
+            elif isinstance(declared, Numbers):
+                table |= self._numbers(part, declared, key)
+            elif isinstance(declared, Nested):
+                table[key] = self._control(part) if declared.of == "control" else self._model(part)
+            else:
+                table[key] = (
+                    list(value)
+                    if isinstance(declared, Names)
+                    else bool(value)
+                    if isinstance(declared, Flag)
+                    else str(value)
+                )
+        table.pop("reward_scale", None)  # it stands in the table of the model
+        return table
+
+    def _numbers(self, part: Any, declared: Numbers, key: str) -> dict[str, Any]:
+        units = {"unit": self._units.get(declared.of[0] if declared.of else ""), "source": SOURCE}
+        if declared.spelled == "range":
+            low, high = map(float, part.initial)
+            return {key: {"low": low, "high": high, **units}}
+        if declared.spelled == "batches":
+            times, masses = ([float(pair[column]) for pair in part.batches] for column in (0, 1))
+            units = {"time_unit": self._units["time"], "unit": self._units["mass"], "source": SOURCE}
+            return {key: {"times": times, "masses": masses, **units}}
+        if declared.spelled == "flow" and part.times:
+            columns = {"times": list(map(float, part.times)), "values": list(map(float, part.flow))}
+            return {"series": {**columns, "time_unit": self._units["time"], **units}}
+        return {key: self._quantity(part.flow[0], "flow")} if declared.spelled == "flow" else {}
+
+    def _control(self, part: Compartment) -> dict[str, Any]:
+        control = part.control
+        assert isinstance(control, Control)
+        unit = self._units["flow"] if control.kind is ControlKind.FLOW else "1"
+        if control.kind is ControlKind.INPUT:
+            unit = getattr(part.model, "input_unit", "1")
+        bounds = {name: float(getattr(control, name)) for name in ("low", "neutral", "high")}
+        return {"kind": control.kind.value, **bounds, "unit": unit, "source": SOURCE}
+
+    def _model(self, part: Compartment) -> dict[str, Any]:
+        model: Any = part.model
+        table: dict[str, Any] = {"kind": kind_of(model), "source": SOURCE, "parameters": {}}
+        for each in dataclasses.fields(model):
+            value = getattr(model, each.name)
+            if each.name == "form":
+                table["form"] = value
+            elif isinstance(value, int | float):
+                table["parameters"][each.name] = value if isinstance(value, bool) else float(value)
+            elif value != (each.default if each.default_factory is dataclasses.MISSING else each.default_factory()):
+                problem = (
+                    f"parameter '{each.name}' of its model '{model.kind}' is no number, which a definition cannot say"
+                )
+                raise NetworkError(f"compartment '{part.id}'", [problem])
+        spans = zip(ranged_states(model), part.inner, strict=True)
+        table["initial"] = {name: {"low": float(a), "high": float(b), "source": SOURCE} for name, (a, b) in spans}
+        table["reward_scale"] = self._quantity(part.reward_scale, "1")
+        return table
+
+    def _quantity(self, value: float, kind: str) -> dict[str, Any]:
+        return {"value": float(value), "unit": self._units.get(kind, "1"), "source": SOURCE}
 
 
-def _common(network: Network, compartment: Compartment, unit: str) -> Iterator[str]:
-    yield f"scale = {_quantity(compartment.scale, unit)}"
-    if compartment.set_point is not None:
-        yield f"set_point = {_quantity(compartment.set_point, unit)}"
-    if compartment.model is not None:
-        yield f"model = {_model(compartment)}"
-    if compartment.control is not None:
-        yield f"control = {_control(network, compartment)}"
-
-
-def _control(network: Network, compartment: Compartment) -> str:
-    control = compartment.control
-    assert control is not None
-    unit = _flow(network) if control.kind is ControlKind.FLOW else "1"
-    if control.kind is ControlKind.INPUT:
-        unit = getattr(compartment.model, "input_unit", "1")
-    return (
-        f"{{ kind = {_text(control.kind.value)}, low = {float(control.low)!r}, neutral = {float(control.neutral)!r}, "
-        f"high = {float(control.high)!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
-    )
-
-
-def _model(compartment: Compartment) -> str:
-    model: Any = compartment.model
-    values = {each.name: getattr(model, each.name) for each in dataclasses.fields(model)}
-    same = [each.name for each in dataclasses.fields(model) if _is_default(each, values[each.name])]
-    form = f"form = {_text(values.pop('form'))}, " if "form" in values else ""
-    for name, value in values.items():
-        if not isinstance(value, int | float) and name not in same:
-            problem = f"parameter '{name}' of its model '{model.kind}' is no number, which a definition cannot say"
-            raise NetworkError(f"compartment '{compartment.id}'", [problem])
-    numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
-    parameters = ", ".join(
-        f"{name} = {str(value).lower() if isinstance(value, bool) else repr(float(value))}"
-        for name, value in numbers.items()
-    )
-    initial = ", ".join(
-        f"{name} = {{ low = {float(low)!r}, high = {float(high)!r}, source = {_text(SOURCE)} }}"
-        for name, (low, high) in zip(ranged_states(model), compartment.inner, strict=True)
-    )
-    scale = _quantity(compartment.reward_scale, "1")
-    return (
-        f"{{ kind = {_text(kind_of(model))}, {form}parameters = {{ {parameters} }}, source = {_text(SOURCE)}, "
-        f"initial = {{ {initial} }}, reward_scale = {scale} }}"
-    )
-
-
-def _is_default(field: dataclasses.Field[Any], value: object) -> bool:
-    if field.default_factory is not dataclasses.MISSING:
-        return bool(field.default_factory() == value)
-    return bool(field.default == value)
-
-
-def _flow(network: Network) -> str:
-    return f"({network.mass_unit})/({network.time_unit})"
-
-
-def _quantity(value: float, unit: str) -> str:
-    return f"{{ value = {float(value)!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
-
-
-def _list(names: tuple[str, ...]) -> str:
-    return json.dumps(list(names))
-
-
-def _text(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
+def _needed(part: Any) -> str:
+    """Return the field that the law of an arc needs even where it is as by default."""
+    if not isinstance(part, Arc):
+        return ""
+    scheduled = part.law is Law.BATCH and not part.by
+    return "flow" if part.law is Law.EXOGENOUS else "batches" if scheduled else ""

@@ -10,6 +10,9 @@ segment sum treat each column alike, so a column's bits do not depend on the bat
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
 import numpy as np
 
 from cirl_marl.dynamics.rows import Rows
@@ -17,7 +20,82 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Arc, ControlKind, Law
 from cirl_marl.network.rowsum import RowSum
 
-SCHEDULED = (Law.CONTROLLED, Law.EXOGENOUS)
+
+class FlowLaw(ABC):
+    """One law: which row drives an arc, and with which coefficient, f = r·y[driver].
+
+    Attributes:
+        scheduled: whether it asks for a flow, which is cut to what the donor can deliver.
+    """
+
+    scheduled = False
+
+    @abstractmethod
+    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
+        """Return the row whose value the flow is proportional to."""
+
+    def coefficient(self, arc: Arc) -> float:
+        """Return r with every control at 1, 1/time or mass/time per unit of the driver."""
+        return arc.rate
+
+
+class _Donor(FlowLaw):
+    """f = a·x_donor."""
+
+    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
+        return network.node_index[arc.donor]
+
+
+class _Recipient(FlowLaw):
+    """f = a·x_recipient."""
+
+    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
+        return network.node_index[arc.recipient]
+
+
+class _Compartment(FlowLaw):
+    """f = a·y, y the output of a model."""
+
+    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
+        return rows.outputs[arc.by]
+
+
+class _Controlled(FlowLaw):
+    """f = u, which the control sets."""
+
+    scheduled = True
+
+    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
+        return rows.unit
+
+    def coefficient(self, arc: Arc) -> float:
+        return 1.0
+
+
+class _Exogenous(_Controlled):
+    """f = e(t); of a series the coefficient is the mean over the interval, which ``FlowLaws.rate`` multiplies in."""
+
+    def coefficient(self, arc: Arc) -> float:
+        return 1.0 if arc.times else arc.flow[0]
+
+
+class _Batch(_Controlled):
+    """Nothing flows: what moves in batches moves at once."""
+
+    scheduled = False
+
+    def coefficient(self, arc: Arc) -> float:
+        return 0.0
+
+
+LAWS: Mapping[Law, FlowLaw] = {
+    Law.DONOR: _Donor(),
+    Law.RECIPIENT: _Recipient(),
+    Law.CONTROLLED: _Controlled(),
+    Law.EXOGENOUS: _Exogenous(),
+    Law.COMPARTMENT: _Compartment(),
+    Law.BATCH: _Batch(),
+}
 
 
 class FlowLaws:
@@ -40,20 +118,18 @@ class FlowLaws:
         self.network = network
         arcs = len(network.arcs)
         self.rows = rows = Rows(network)
-        donors, recipients = network.donors, network.recipients
-        columns = np.arange(arcs)
         self.incidence = RowSum(
-            np.concatenate([donors, recipients]),
-            np.tile(columns, 2),
+            np.concatenate([network.donors, network.recipients]),
+            np.tile(np.arange(arcs), 2),
             np.repeat([-1.0, 1.0], arcs),
             (rows.masses, arcs),
         )
-        laws = np.array([arc.law for arc in network.arcs])
-        self.scheduled = np.isin(laws, SCHEDULED)
-        constant = self.scheduled | (laws == Law.BATCH)
-        self.driver: Integers = np.where(constant, rows.unit, np.where(laws == Law.RECIPIENT, recipients, donors))
-        for k in np.flatnonzero(laws == Law.COMPARTMENT):
-            self.driver[k] = rows.outputs[network.arcs[k].by]
+        laws = [LAWS[arc.law] for arc in network.arcs]
+        self.scheduled = np.array([law.scheduled for law in laws], dtype=bool)
+        drivers = [law.driver(arc, network, rows) for law, arc in zip(laws, network.arcs, strict=True)]
+        self.driver: Integers = np.array(drivers, dtype=np.intp)
+        base = [law.coefficient(arc) for law, arc in zip(laws, network.arcs, strict=True)]
+        self._base: Floats = np.array(base, dtype=float).reshape(-1, 1)
         self._compile_controls()
         self._series_arcs: Integers = np.flatnonzero([bool(arc.times) for arc in network.arcs])
         self._series = np.array([_interval_means(network.arcs[k], network) for k in self._series_arcs])
@@ -119,17 +195,6 @@ class FlowLaws:
         rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
         self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
         self._partial = bool((rows == none).any())
-        self._base: Floats = np.array([_base_rate(arc) for arc in network.arcs]).reshape(-1, 1)
-
-
-def _base_rate(arc: Arc) -> float:
-    if arc.law is Law.BATCH:
-        return 0.0
-    if arc.law not in SCHEDULED:
-        return arc.rate
-    if arc.law is Law.EXOGENOUS and not arc.times:
-        return arc.flow[0]
-    return 1.0
 
 
 def _interval_means(arc: Arc, network: Network) -> Floats:

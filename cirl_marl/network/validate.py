@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields
 from itertools import pairwise
 
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.network.elements import MAX_STEPS, Arc, Compartment, ControlKind, Law, Node, ranged_states
+from cirl_marl.network.declared import bound_problems, default_of
+from cirl_marl.network.elements import MAX_STEPS, TAKEN, Arc, Compartment, ControlKind, Law, Node, ranged_states
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.units import factor
 from cirl_marl.network.validate_services import service_problems
@@ -18,18 +18,8 @@ from cirl_marl.network.validate_settings import is_whole, repeated, setting_prob
 IDENTIFIER = r"^[a-z][a-z0-9_]*$"
 """How compartments and services may be called; their names are keys of definition files and names of files."""
 
-FIELDS = {
-    Law.DONOR: ("rate",),
-    Law.RECIPIENT: ("rate",),
-    Law.CONTROLLED: (),
-    Law.EXOGENOUS: ("flow", "times"),
-    Law.COMPARTMENT: ("rate", "by"),
-    Law.BATCH: ("rate", "by", "port", "batches", "delay"),
-}
-"""What each law takes, of the fields that only some laws take."""
-
-OWN = {f.name: f.default for f in fields(Arc) if any(f.name in taken for taken in FIELDS.values())}
-"""Those fields, with their defaults."""
+OWN = tuple(dict.fromkeys(name for taken in TAKEN.values() for name in taken))
+"""Fields of arcs that only some laws take."""
 
 
 def problems(network: Parts) -> Iterator[str]:
@@ -130,13 +120,11 @@ def _arc_problems(
             yield f"{where}: {end}: {unknown('node', node, nodes)}"
     if arc.donor == arc.recipient:
         yield f"{where}: a cycle of zero delay: it returns to its own donor '{arc.donor}' without passing a stock"
-    for name, default in OWN.items():
+    for name in OWN:
         given = getattr(arc, name)
-        if name not in FIELDS[arc.law] and given != default:
-            taken = ", ".join(FIELDS[arc.law]) or "none of these"
+        if name not in TAKEN[arc.law] and given != default_of(Arc, name):
+            taken = ", ".join(TAKEN[arc.law]) or "none of these"
             yield f"{where}: {name} = {given!r}: law '{arc.law}' takes {taken}"
-    if not math.isfinite(arc.rate) or arc.rate < 0:
-        yield f"{where}: rate {arc.rate} must be finite and not negative"
     if arc.law is Law.COMPARTMENT:
         yield from _model_flow_problems(where, arc, everyone)
     if arc.law is Law.BATCH:
@@ -226,13 +214,8 @@ def _rate_control(arc: Arc) -> str | None:
 
 
 def _common_problems(where: str, compartment: Compartment, network: Parts) -> Iterator[str]:
-    if not math.isfinite(compartment.scale) or compartment.scale <= 0:
-        yield f"{where}: scale {compartment.scale} must be positive and finite"
-    if compartment.set_point is not None and not math.isfinite(compartment.set_point):
-        yield f"{where}: set_point {compartment.set_point} must be finite"
+    yield from bound_problems(compartment, f"{where}: ")
     states = ranged_states(compartment.model) if compartment.model is not None else ()
-    if not math.isfinite(compartment.reward_scale) or compartment.reward_scale <= 0:
-        yield f"{where}: reward_scale {compartment.reward_scale} must be positive and finite"
     if len(compartment.inner) != len(states):
         yield f"{where}: {len(compartment.inner)} initial ranges for the inner states {list(states)}"
     for low, high in compartment.inner:

@@ -6,7 +6,8 @@ import math
 from collections.abc import Iterator, Mapping
 
 from cirl_marl.errors import unknown
-from cirl_marl.network.elements import QUANTITIES, Arc, Compartment, Law, Service
+from cirl_marl.network.declared import bound_problems
+from cirl_marl.network.elements import Arc, Compartment, Law, Service
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.validate_settings import repeated
 
@@ -36,8 +37,7 @@ def _service_problems(
     service: Service, everyone: Mapping[str, Compartment], providers: Mapping[str, Mapping[str, None]]
 ) -> Iterator[str]:
     where = f"service '{service.id}'"
-    if service.quantity not in QUANTITIES:
-        yield f"{where}: {unknown('quantity', service.quantity, QUANTITIES)}"
+    yield from bound_problems(service, f"{where}: ")
     known = providers.get(service.quantity, providers["outflow"])
     if service.provider in known and service.quantity == "measure":
         names = getattr(everyone[service.provider].model, "measure_names", ())
@@ -56,8 +56,6 @@ def _service_problems(
         yield f"{where}: the band [{service.low}, {service.high}] must not be negative or empty"
     elif service.low == 0 and math.isinf(service.high):
         yield f"{where}: the band from 0 without an upper end asks for nothing"
-    if not math.isfinite(service.weight) or service.weight < 0:
-        yield f"{where}: weight {service.weight} must be finite and not negative"
 
 
 def _outflow_problems(service: Service, arcs: tuple[Arc, ...]) -> Iterator[str]:

@@ -7,7 +7,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.network.elements import MAX_STEPS, NET_ZERO, OBSERVE, REWARDS, SOLVERS, Compartment, Episode, Law
+from cirl_marl.network.declared import bound_problems
+from cirl_marl.network.elements import MAX_STEPS, Compartment, Episode, Law
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.units import factor
 
@@ -15,28 +16,8 @@ from cirl_marl.network.units import factor
 def setting_problems(network: Parts) -> Iterator[str]:
     """Yield every mistake in the settings of ``network``."""
     episode, objective = network.episode, network.objective
-    for what, value, known in (
-        ("solver", episode.solver, SOLVERS),
-        ("net_zero", objective.net_zero, NET_ZERO),
-        ("reward", objective.reward, REWARDS),
-        ("observation mode", network.observation.mode, OBSERVE),
-    ):
-        if value not in known:
-            yield unknown(what, value, known)
-    for name, number in (
-        ("control_interval", episode.control_interval),
-        ("reference_interval", objective.reference_interval),
-        ("circularity_scale", objective.circularity_scale),
-    ):
-        if not math.isfinite(number) or number <= 0:
-            yield f"{name} {number} must be positive and finite"
-    criticality = objective.criticality
-    if criticality is not None and not (math.isfinite(criticality) and criticality >= 0):
-        yield f"criticality {criticality} must be finite and not negative"
-    if episode.horizon < 1:
-        yield f"horizon {episode.horizon} must be at least 1 step"
-    if not 0 <= objective.circularity_weight <= 1:
-        yield f"circularity_weight {objective.circularity_weight} must lie in [0, 1]"
+    for part in (episode, objective, network.observation):
+        yield from bound_problems(part)
     if episode.solver != "exact":
         yield from _step_problems(episode, network.time_unit)
     else:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 from cirl_marl.optimum.program import Program
 
@@ -60,6 +61,9 @@ def verified(problem: Program, certificate: Certificate, plan: Floats) -> Verifi
         problem: the program.
         certificate: the multipliers.
         plan: v of the plan, for its objective.
+
+    Raises:
+        CirlError: for a multiplier that is not finite; names its row.
     """
     bound, rounding, reduced, columns = _proved(problem, certificate)
     small = np.abs(reduced) < 1e-6 * np.abs(problem.cost).max(initial=0.0)
@@ -79,6 +83,10 @@ def proved(problem: Program, certificate: Certificate) -> float:
 
 def _proved(problem: Program, certificate: Certificate) -> tuple[float, float, Floats, Floats]:
     """Return the bound, the allowance for rounding in it, d, and min(d_j l_j, d_j u_j)."""
+    for rows, multipliers in (("A", certificate.equal), ("G", certificate.under)):
+        if not np.isfinite(multipliers).all():
+            row = int(np.flatnonzero(~np.isfinite(multipliers))[0])
+            raise CirlError(f"certificate: the multiplier of row {row} of {rows} is {multipliers[row]}")
     y, mu = certificate.equal, np.minimum(certificate.under, 0.0)
     reduced = problem.cost - problem.equal.T @ y - problem.under.T @ mu
     size = np.abs(problem.cost) + abs(problem.equal).T @ np.abs(y) + abs(problem.under).T @ np.abs(mu)

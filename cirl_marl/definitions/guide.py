@@ -1,0 +1,58 @@
+"""The fields of the file format as a document, from their declarations: ``docs/format.md``."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from cirl_marl.definitions import schema
+
+PARTS: dict[str, tuple[Any, str]] = {
+    "network": (schema.NetworkTable, "The file itself"),
+    "units": (schema.UnitsTable, "`[units]`"),
+    "scales": (schema.ScalesTable, "`[scales]`"),
+    "episode": (schema.EpisodeTable, "`[episode]`"),
+    "objective": (schema.ObjectiveTable, "`[objective]`"),
+    "observation": (schema.ObservationTable, "`[observation]`"),
+    "node": (schema.NodeTable, "`[nodes.NAME]`"),
+    "arc": (schema.ArcTable, "`[arcs.NAME]`"),
+    "control": (schema.ControlTable, "`control` of a node or an arc"),
+    "model": (schema.ModelTable, "`model` of a node or an arc"),
+    "service": (schema.ServiceTable, "`[services.NAME]`"),
+    "quantity": (schema.QuantityTable, "Every number with a unit"),
+    "range": (schema.Range, "`initial` of a node"),
+    "series": (schema.Series, "`series` of an arc"),
+    "batches": (schema.Batches, "`batches` of an arc"),
+}
+
+
+def format_guide() -> str:
+    """Return the document: a list of keys for each table of a definition file."""
+    parts = [_part(name, table, place) for name, (table, place) in PARTS.items()]
+    return (
+        "# The format of definition files\n\n"
+        "Every key of every table, to look things up; `envs/README.md` shows how to write a network.\n"
+        "This page is made from the declarations in `cirl_marl/network/elements.py`: change them, not the page.\n"
+        + "".join(parts)
+    )
+
+
+def _part(name: str, table: type[BaseModel], place: str) -> str:
+    keys = "".join(_key(field.alias or key, field) for key, field in table.model_fields.items())
+    summary = str(table.__doc__).partition("\n")[0].replace("``", "`")
+    return f"\n## {name}\n\n{place}. {summary}\n\n{keys}"
+
+
+def _key(key: str, field: FieldInfo) -> str:
+    """Return the line of a key: what it takes, if that is a table of its own, and what it means."""
+    taken = [name for name, (table, _) in PARTS.items() if table in (field.annotation, *get_args(field.annotation))]
+    needed = "required" if field.is_required() else "may be left out"
+    about = f": {field.description.replace('``', '`')}" if field.description else ""
+    return _wrapped(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in taken), needed])}){about}.")
+
+
+def _wrapped(line: str) -> str:
+    return textwrap.fill(line, 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False) + "\n"

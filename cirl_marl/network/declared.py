@@ -1,0 +1,238 @@
+"""How a field of a network's parts is declared: once, with its kind of quantity, its bounds and its meaning.
+
+A declaration stands in the annotation of the field. Checks, docstrings, reading with units, writing, the JSON schema
+and the table of the format derive from it, so that a new field is one declaration and the physics that uses it::
+
+    rate: Annotated[float, Quantity("a, share that leaves in a unit of time", of="rate", low=0.0)] = 0.0
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, MISSING, dataclass, fields
+from enum import StrEnum
+from functools import cache
+from numbers import Real
+from types import MappingProxyType
+from typing import Any, Literal, TypeVar, get_type_hints
+
+import numpy as np
+
+from cirl_marl.errors import NetworkError, unknown
+
+Kind = Literal["mass", "time", "rate", "flow", "steps", "1"]
+"""Kinds of quantity; a rate is 1/time, a flow mass/time, steps count control intervals."""
+
+Part = TypeVar("Part")
+
+
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """What is known of a field of whatever kind.
+
+    Attributes:
+        meaning: for docstrings, schema and documents.
+        key: what definition files call it, if not by its name.
+        required: whether definition files must give it, though Python has a default.
+    """
+
+    meaning: str
+    _: KW_ONLY
+    key: str = ""
+    required: bool = False
+
+    def problem(self, value: object) -> str:
+        """Return what the field must be, and what to write instead, if ``value`` is of another kind; else nothing."""
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Text(Declared):
+    """The id of a compartment, or other text."""
+
+
+@dataclass(frozen=True, slots=True)
+class Names(Declared):
+    """Ids in a fixed order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flag(Declared):
+    """True or false."""
+
+
+@dataclass(frozen=True, slots=True)
+class Word(Declared):
+    """One of some words.
+
+    Attributes:
+        of: an enumeration, or the words.
+        called: what messages call it, if not by its name.
+    """
+
+    of: type[StrEnum] | tuple[str, ...] = ()
+    called: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity(Declared):
+    """A number with a unit.
+
+    Attributes:
+        of: kind of quantity; or, by the value of the field ``by``, the kinds that differ from ``otherwise``.
+        by: the field that decides; empty if ``of`` is the same for all.
+        otherwise: kind for values of ``by`` that ``of`` does not name.
+        low: lowest value; a ``positive`` one lies above 0.
+        high: highest value.
+        positive: whether it lies above 0.
+        joint: whether its bounds depend on other fields, so that they are checked with these.
+    """
+
+    of: Kind | Mapping[str, Kind] = "1"
+    by: str = ""
+    otherwise: Kind = "1"
+    low: float = -math.inf
+    high: float = math.inf
+    positive: bool = False
+    joint: bool = False
+
+    def kind(self, part: object) -> Kind:
+        """Return the kind of quantity in ``part``, a part of a network or its table in a definition file."""
+        return self.of if isinstance(self.of, str) else self.of.get(getattr(part, self.by), self.otherwise)
+
+    def problem(self, value: object) -> str:
+        """See ``Declared.problem``."""
+        return _problem(value, "a number", ())
+
+    def bound_problem(self, value: float) -> str:
+        """Return what a number out of its bounds must be; nothing if it is within."""
+        within = self.low <= value <= self.high and (value > 0 or not self.positive)
+        if self.joint or (math.isfinite(value) and within):
+            return ""
+        if self.positive:
+            return "must be positive and finite"
+        if math.isfinite(self.high):
+            return f"must lie in [{self.low:g}, {self.high:g}]"
+        if self.low == 0:
+            return "must be finite and not negative"
+        return f"must be at least {self.low:g}" if math.isfinite(self.low) else "must be finite"
+
+
+@dataclass(frozen=True, slots=True)
+class Amount(Declared):
+    """A number whose unit is that of the table in which it stands."""
+
+    def problem(self, value: object) -> str:
+        """See ``Declared.problem``."""
+        return _problem(value, "a number", ())
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers(Declared):
+    """Several numbers, which definition files spell in a table of their own.
+
+    Attributes:
+        of: kind of quantity of each column.
+        form: how they are given in Python.
+        shape: their shape, None being any length.
+        spelled: which table of definition files holds them; empty if that of another field does.
+    """
+
+    of: tuple[Kind, ...] = ()
+    form: str = ""
+    shape: tuple[int | None, ...] = (None,)
+    spelled: str = ""
+
+    def problem(self, value: object) -> str:
+        """See ``Declared.problem``."""
+        return _problem(value, self.form, self.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Nested(Declared):
+    """A part of its own, with a table of its own.
+
+    Attributes:
+        of: which.
+    """
+
+    of: Literal["control", "model"] = "control"
+
+
+def part(made: type[Part]) -> type[Part]:
+    """Let the docstring of a frozen dataclass list its declared fields with their meanings."""
+    lines = [
+        textwrap.fill(f"{name}: {declared.meaning}.", 120, initial_indent=" " * 8, subsequent_indent=" " * 12)
+        for name, declared in declarations(made).items()
+    ]
+    made.__doc__ = "\n".join([str(made.__doc__).rstrip(), "", "    Attributes:", *lines, "    "])
+    return made
+
+
+def declarations(made: type[Any]) -> Mapping[str, Declared]:
+    """Return the declared fields of a part by name, in their order."""
+    anything: Any = made  # mypy does not know that classes are hashable
+    return _declarations(anything)
+
+
+@cache
+def _declarations(made: Any) -> Mapping[str, Declared]:
+    hints = get_type_hints(made, include_extras=True)
+    found = {each.name: getattr(hints[each.name], "__metadata__", ()) for each in fields(made)}
+    return MappingProxyType({name: told[0] for name, told in found.items() if told})
+
+
+def default_of(made: type[Any], name: str) -> Any:
+    """Return the default of a field; ``dataclasses.MISSING`` if it has none."""
+    return made.__dataclass_fields__[name].default
+
+
+def is_required(made: type[Any], name: str) -> bool:
+    """Whether definition files must give a field."""
+    return declarations(made)[name].required or default_of(made, name) is MISSING
+
+
+def settle(owner: str, part_: Any) -> None:
+    """Take words of enumerations as definitions spell them, and refuse what is of another kind than declared.
+
+    Raises:
+        NetworkError: naming every field without its numbers, with what to write, and words with the nearest valid one.
+    """
+    faults = []
+    for name, declared in declarations(type(part_)).items():
+        value = getattr(part_, name)
+        if isinstance(declared, Word) and isinstance(declared.of, type):
+            if value not in declared.of.__members__.values():
+                raise NetworkError(owner, [unknown(declared.called or name, value, declared.of)])
+            object.__setattr__(part_, name, declared.of(value))
+        elif (value is not None or default_of(type(part_), name) is not None) and (told := declared.problem(value)):
+            faults.append(f"{name} must be {told}")
+    if faults:
+        raise NetworkError(owner, faults)
+
+
+def bound_problems(part_: Any, where: str = "") -> Iterator[str]:
+    """Yield every number out of its declared bounds, and every word that is none of its words."""
+    for name, declared in declarations(type(part_)).items():
+        value = getattr(part_, name)
+        if isinstance(declared, Word) and value not in declared.of:
+            yield f"{where}{unknown(declared.called or name, value, declared.of)}"
+        elif isinstance(declared, Quantity) and value is not None and (told := declared.bound_problem(value)):
+            yield f"{where}{name} {value} {told}"
+
+
+def _problem(value: object, form: str, shape: tuple[int | None, ...]) -> str:
+    if _fits(value, shape):
+        return ""
+    instead = (f"; write {each!r}" for each in ((value,), (value, value)) if _fits(each, shape))
+    return f"{form}, got {value!r}{next(instead, '')}"
+
+
+def _fits(value: object, shape: tuple[int | None, ...]) -> bool:
+    if not shape:
+        return isinstance(value, Real)
+    if not isinstance(value, Sequence | np.ndarray) or shape[0] not in (None, len(value)):
+        return False
+    return all(_fits(each, shape[1:]) for each in value)
