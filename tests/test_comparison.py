@@ -240,7 +240,7 @@ def test_evaluation_has_the_gap(runs: list[Path]) -> None:
 
 def test_figures_are_of_the_checkpoint_that_acted(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """A run that is trained on while it is evaluated has newer policies, which are evaluated next time."""
-    train("copper_net", ppo_recipe, directory=tmp_path, horizon=5)
+    train("copper_net", ppo_recipe, directory=tmp_path, horizon=5, agents=["mine"])
     run = RunDirectory(tmp_path)
     moved: list[Training] = []
 

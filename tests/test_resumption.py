@@ -249,7 +249,7 @@ def test_what_cannot_be_kept_is_refused_before_anything_is_written(tmp_path: Pat
         train("copper_net", recipe, directory=tmp_path / "run")
     assert not (tmp_path / "run").exists()
     assert train("copper_net", recipe).joint_steps == 40
-    train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=np.int64(5))
+    train("copper_net", ppo_recipe, agents=["mine"], directory=tmp_path / "run", horizon=np.int64(5))
     assert RunDirectory(tmp_path / "run").config.options["horizon"] == 5
 
 

@@ -50,7 +50,7 @@ def test_run_directory_holds_what_is_needed(tmp_path: Path, ppo_recipe: Recipe) 
 def test_network_built_in_python_can_be_kept(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """A run of a network without a file holds a definition that reads back as the same network."""
     network = replace(cirl_marl.load_network("copper_net"), source=None)
-    train(network, ppo_recipe, directory=tmp_path / "run")
+    train(network, ppo_recipe, agents=["mine"], directory=tmp_path / "run")
     assert RunDirectory(tmp_path / "run").make_env(1).network == network
 
 
@@ -99,7 +99,7 @@ def test_run_directory_describes_what_was_trained(tmp_path: Path, ppo_recipe: Re
     network = cirl_marl.load_network("copper_net")
     arcs = tuple(replace(arc, rate=2 * arc.rate) if arc.id == "use_to_landfill" else arc for arc in network.arcs)
     changed = replace(network, arcs=arcs).with_options(objective={"circularity_weight": 0.9})
-    train(changed, ppo_recipe, directory=tmp_path / "changed", horizon=5)
+    train(changed, ppo_recipe, agents=["mine"], directory=tmp_path / "changed", horizon=5)
     kept = RunDirectory(tmp_path / "changed").make_env(1).network
     assert (kept.arcs, kept.objective) == (changed.arcs, changed.objective)
     paper = cirl_marl.load_network("copper_net", scenario="paper")
@@ -230,7 +230,7 @@ def test_metrics_survive_a_crash(tmp_path: Path, ppo_recipe: Recipe, ctrl_c_afte
     """A row that a crash cut short is left out, and rows past the checkpoint are not repeated on resumption."""
     directory = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        train("copper_net", ppo_recipe, directory=directory, horizon=5, report=ctrl_c_after(60))
+        train("copper_net", ppo_recipe, agents=["mine"], directory=directory, horizon=5, report=ctrl_c_after(60))
     metrics = directory / "metrics.csv"
     before = RunDirectory(directory).metrics()["joint_step"]
     metrics.write_text(metrics.read_text() + "35,70,1.0,-9")
