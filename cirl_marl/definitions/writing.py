@@ -12,7 +12,7 @@ from typing import Any
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
-from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node, ranged_states
+from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
 
 SOURCE = "network built in Python"
 
@@ -124,8 +124,8 @@ def _control(network: Network, compartment: Compartment) -> str:
     control = compartment.control
     assert control is not None
     unit = _flow(network) if control.kind is ControlKind.FLOW else "1"
-    if control.kind is ControlKind.INPUT:
-        unit = getattr(compartment.model, "input_unit", "1")
+    if control.kind is ControlKind.INPUT and compartment.model is not None:
+        unit = compartment.model.input_unit or "1"
     return (
         f"{{ kind = {_text(control.kind.value)}, low = {float(control.low)!r}, neutral = {float(control.neutral)!r}, "
         f"high = {float(control.high)!r}, unit = {_text(unit)}, source = {_text(SOURCE)} }}"
@@ -148,7 +148,7 @@ def _model(compartment: Compartment) -> str:
     )
     initial = ", ".join(
         f"{name} = {{ low = {float(low)!r}, high = {float(high)!r}, source = {_text(SOURCE)} }}"
-        for name, (low, high) in zip(ranged_states(model), compartment.inner, strict=True)
+        for name, (low, high) in zip(model.ranged_states, compartment.inner, strict=True)
     )
     scale = _quantity(compartment.reward_scale, "1")
     return (

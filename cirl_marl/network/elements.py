@@ -48,11 +48,6 @@ class ControlKind(StrEnum):
     INPUT = "input"
 
 
-def ranged_states(model: CompartmentModel) -> tuple[str, ...]:
-    """Return the states whose start is drawn from a given range: all, unless the model has a ``start`` of its own."""
-    return () if hasattr(model, "start") else model.state_names
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high].
