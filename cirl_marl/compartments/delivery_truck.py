@@ -8,9 +8,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.compartments.parameters import check_positive
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import RewardState, Vehicle, check_positive
+from cirl_marl.network.model import RewardState, Vehicle
 from cirl_marl.network.rowsum import Floats
 
 

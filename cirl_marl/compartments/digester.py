@@ -9,16 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from cirl_marl.compartments.parameters import check_not_negative, check_positive, check_share
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import (
-    ContinuousModel,
-    Measuring,
-    Outflowing,
-    RewardState,
-    check_not_negative,
-    check_positive,
-    check_share,
-)
+from cirl_marl.network.model import ContinuousModel, Measuring, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 

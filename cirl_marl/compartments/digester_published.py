@@ -8,7 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState, check_positive
+from cirl_marl.compartments.parameters import check_positive
+from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 

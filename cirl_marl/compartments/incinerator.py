@@ -9,15 +9,8 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from cirl_marl.network.model import (
-    ContinuousModel,
-    Outflowing,
-    RewardState,
-    check_form,
-    check_not_negative,
-    check_positive,
-    check_share,
-)
+from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive, check_share
+from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ min. Horizon 100 and T_g(0) ~ U[900, 1100] °C are inferred: from the

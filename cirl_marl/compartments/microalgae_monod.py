@@ -11,14 +11,8 @@ import numpy as np
 
 from cirl_marl.compartments.light import light_response
 from cirl_marl.compartments.nutrient import draw_down, substeps
-from cirl_marl.network.model import (
-    ContinuousModel,
-    OwnStepModel,
-    RewardState,
-    check_form,
-    check_not_negative,
-    check_positive,
-)
+from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive
+from cirl_marl.network.model import ContinuousModel, OwnStepModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[1, 5] µmol/L is inferred: from S = 0 constant darkness

@@ -7,8 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from cirl_marl.compartments.parameters import check_not_negative, check_positive
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import ContinuousModel, RewardState, check_not_negative, check_positive
+from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 SECONDS_PER_DAY = 86400.0

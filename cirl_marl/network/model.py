@@ -10,7 +10,6 @@ A model inherits from the class that says how it moves (``MOTIONS``) and from on
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from inspect import isabstract
@@ -19,7 +18,6 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.rowsum import Floats
 
 RewardState = Literal["before", "after"]
@@ -266,30 +264,3 @@ def model_faults(found: type[Any]) -> Iterator[str]:
         given = [name for name in vars(offer) if name in offer.__abstractmethods__ and hasattr(found, name)]
         if given and not issubclass(found, offer):
             yield f"it has {', '.join(given)} and does not inherit from {offer.__name__}"
-
-
-def check_form(form: str, known: tuple[str, ...]) -> None:
-    """Raise a ``CirlError`` unless ``form`` is one of ``known``."""
-    if form not in known:
-        raise CirlError(unknown("form", form, known))
-
-
-def check_positive(kind: str, **parameters: float) -> None:
-    """Raise a ``CirlError`` that names the first parameter that is not a positive finite number."""
-    for name, value in parameters.items():
-        if not (math.isfinite(value) and value > 0.0):
-            raise CirlError(f"{kind}: {name} = {value!r}, but it must be positive and finite.")
-
-
-def check_not_negative(kind: str, **parameters: float) -> None:
-    """Raise a ``CirlError`` that names the first parameter that is negative or not finite."""
-    for name, value in parameters.items():
-        if not (math.isfinite(value) and value >= 0.0):
-            raise CirlError(f"{kind}: {name} = {value!r}, but it must be finite and not negative.")
-
-
-def check_share(kind: str, **parameters: float) -> None:
-    """Raise a ``CirlError`` that names the first parameter that is no share of a whole, in [0, 1]."""
-    for name, value in parameters.items():
-        if not 0.0 <= value <= 1.0:
-            raise CirlError(f"{kind}: {name} = {value!r}, but it must lie in [0, 1].")

@@ -8,10 +8,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.compartments.parameters import check_form, check_positive
 from cirl_marl.compartments.robots.fetch import Fetch
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import DiscreteTimeModel, Releasing, RewardState, check_form, check_positive
+from cirl_marl.network.model import DiscreteTimeModel, Releasing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 ROBOTS: dict[str, Fetch | Reacher] = {"fetch": Fetch(), "reacher": Reacher()}
