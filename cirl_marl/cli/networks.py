@@ -216,7 +216,6 @@ def plan(
     valve lets through, or an input of a model) with its unit, the resulting flows, circularity and service level.
     """
     from cirl_marl.controllers.schedule import schedule
-    from cirl_marl.optimum.controller import Optimum
 
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
@@ -229,7 +228,7 @@ def plan(
     path.parent.mkdir(parents=True, exist_ok=True)
     found.write(path)
     _say_figures(found.rollout, env.network)
-    if isinstance(controller, Optimum) and controller.note:
+    if controller.note:
         say(controller.note)
     say(f"wrote {path}")
 
