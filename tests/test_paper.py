@@ -455,14 +455,14 @@ def test_tuned_policy_is_measured_behind_its_normaliser(monkeypatch: pytest.Monk
     monkeypatch.setattr(tuned, "train", keeping)
     row = Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=200)
     trained = train_tuned(COPPER, row, lambda *_: None, recipe("PPO", n_steps=50, batch_size=100))
-    (trainee,) = kept[0].trainees.values()
-    assert isinstance(trainee.env, VecNormalize)
+    (learner,) = kept[0].learners.values()
+    assert isinstance(learner.env, VecNormalize)
     seen = np.random.default_rng(0).uniform(50, 2000, (3, 6)).astype(np.float32)
     assert trained.predict is not None
     chosen = trained.predict(seen, None, np.ones(3, dtype=bool))[0]
-    expected = trainee.model.predict(np.asarray(trainee.env.normalize_obs(seen)), deterministic=True)[0]
+    expected = learner.model.predict(np.asarray(learner.env.normalize_obs(seen)), deterministic=True)[0]
     np.testing.assert_array_equal(chosen, expected)
-    assert not np.array_equal(chosen, trainee.model.predict(seen, deterministic=True)[0])
+    assert not np.array_equal(chosen, learner.model.predict(seen, deterministic=True)[0])
 
 
 def test_final_policies_play_their_quota_on_episodes_of_their_own() -> None:

@@ -16,7 +16,7 @@ from cirl_marl import CirlError, DefinitionError, RecipeError, VectorEnv
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.learners import Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import algorithms, parameter_mistakes, parameters_of, policy_parameters_of
-from cirl_marl.learners.recipe import Learner, Match, Normalisation, Options, recipe_schema
+from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Options, recipe_schema
 
 GOOD = """
 name = "mine"
@@ -258,18 +258,18 @@ def test_options_of_training_are_matched_with_all_that_it_takes(option: str, nea
             {"environment": {"reward": "mix"}},
             "recipe 'small': environment.reward: unknown value 'mix'. Did you mean 'mix",
         ),
-        ({"learner": Learner(algorithm="PPO", parameters={"gamma": float("nan")})}, "parameters.gamma: must be a fin"),
+        ({"learner": LearnerSettings(algorithm="PPO", parameters={"gamma": float("nan")})}, "parameters.gamma: must be a fin"),
         ({"match": [Match(role="landfill", algorithm="PPP")]}, "match.0.algorithm: unknown algorithm 'PPP'"),
-        ({"learner": Learner(algorithm="SAC", policy="CentralCriticPolicy")}, "unknown policy of SAC"),
+        ({"learner": LearnerSettings(algorithm="SAC", policy="CentralCriticPolicy")}, "unknown policy of SAC"),
         (
             {
-                "learner": Learner(
+                "learner": LearnerSettings(
                     algorithm="PPO", policy="CentralCriticPolicy", normalise=Normalisation(observation=False)
                 )
             },
             "sees physical units",
         ),
-        ({"learner": Learner(algorithm="PPP")}, "unknown algorithm 'PPP'"),
+        ({"learner": LearnerSettings(algorithm="PPP")}, "unknown algorithm 'PPP'"),
     ],
 )
 def test_recipes_of_python_are_checked_like_files(changes: dict[str, Any], message: str, ppo_recipe: Recipe) -> None:

@@ -40,6 +40,11 @@ def plain(error: BaseException) -> str:
     return str(error).replace("[", r"\[")
 
 
+def listed(text: str) -> list[str]:
+    """Return what a comma-separated option names."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
 def say(line: str) -> None:
     """Print a line as it is, whatever its length."""
     console.print(line.replace("[", r"\["), soft_wrap=True, highlight=False)

@@ -56,7 +56,7 @@ def train(
             override the recipe's.
 
     Returns:
-        The finished training; ``trainees[name].model`` is the Stable-Baselines3 model.
+        The finished training; ``learners[name].model`` is the Stable-Baselines3 model.
 
     Raises:
         CirlError: for input that cannot be used, before anything is written.

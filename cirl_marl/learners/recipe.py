@@ -75,7 +75,7 @@ class Demonstrations(_Table):
     )
 
 
-class Learner(_Table):
+class LearnerSettings(_Table):
     """One algorithm with its parameters."""
 
     algorithm: str
@@ -100,7 +100,7 @@ class Learner(_Table):
     def steps_of(self, steps: int) -> int:
         """Return during how many of the ``steps`` of a run it learns, rounded up.
 
-        >>> Learner(algorithm="PPO", share_of_steps=0.55).steps_of(100)
+        >>> LearnerSettings(algorithm="PPO", share_of_steps=0.55).steps_of(100)
         55
         """
         return math.ceil(round(steps * self.share_of_steps, 6))
@@ -129,7 +129,7 @@ class Learner(_Table):
             yield f"demonstrations.steps: {self.demonstrations.steps} is more than the {steps} steps of the run{share}"
 
 
-class Match(Learner):
+class Match(LearnerSettings):
     """A learner for some agents only; of several matches the first applies."""
 
     kind: Literal["node", "arc"] | None = None
@@ -167,7 +167,7 @@ class Group:
 
     name: str
     agents: tuple[str, ...]
-    spec: Learner
+    spec: LearnerSettings
 
     def view(self, env: VectorEnv) -> View:
         """Return how the learner sees ``env``."""
@@ -190,7 +190,7 @@ class Recipe(_Table):
     title: str
     run: Run = Run()
     environment: Annotated[dict[str, Any], WithJsonSchema(Options.model_json_schema())] = {}
-    learner: Learner
+    learner: LearnerSettings
     match: list[Match] = []
 
     @field_validator("match", mode="before")
@@ -200,7 +200,7 @@ class Recipe(_Table):
             raise PydanticCustomError("one_bracket", "write [[match]], with two brackets")
         return match
 
-    def learner_of(self, agent: str, network: Network) -> Learner:
+    def learner_of(self, agent: str, network: Network) -> LearnerSettings:
         """Return the learner of ``agent``: that of the first match that fits, else the common one."""
         return next((match for match in self.match if match.fits(agent, network)), self.learner)
 
@@ -270,7 +270,7 @@ class Recipe(_Table):
         for where, learner in self.learners():
             yield from (f"{where}.{mistake}" for mistake in learner.demonstration_mistakes(steps))
 
-    def learners(self) -> tuple[tuple[str, Learner], ...]:
+    def learners(self) -> tuple[tuple[str, LearnerSettings], ...]:
         """Return every learner and what messages call its table."""
         return ("learner", self.learner), *((f"match.{i}", match) for i, match in enumerate(self.match))
 
@@ -280,7 +280,7 @@ def recipe_schema() -> dict[str, Any]:
     from cirl_marl.learners.algorithms import algorithms
 
     schema = Recipe.model_json_schema()
-    for table in ("Learner", "Match"):
+    for table in ("LearnerSettings", "Match"):
         schema["$defs"][table]["properties"]["algorithm"]["enum"] = list(algorithms())
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return schema

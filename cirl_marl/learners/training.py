@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -19,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
-from cirl_marl.learners.learner import Trainee, derived_seed
+from cirl_marl.learners.learner import Learner, derived_seed
 from cirl_marl.learners.lockstep import Interrupted, Lockstep
 from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
 
@@ -54,7 +55,7 @@ class Training:
     Attributes:
         config: what it was asked to do.
         env: the joint environment.
-        trainees: the learners by name; an independent learner has its agent's.
+        learners: the learners by name; an independent learner has its agent's.
         run: where it is kept; None if it is not.
     """
 
@@ -72,10 +73,10 @@ class Training:
         seeds = [derived_seed(config.seed, "copies", i, self.done) for i in range(config.envs)]
         groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
         self.lockstep = Lockstep(env, seeds, {name: group.view(env) for name, group in groups.items()}, done=self.done)
-        self.trainees: dict[str, Trainee] = {}
+        self.learners: dict[str, Learner] = {}
         for name, seat in self.lockstep.seats.items():
-            trainee = Trainee(seat, groups[name].spec, config.seed, done=self.done)
-            self.trainees[name] = trainee.load(checkpoint) if checkpoint else trainee.build()
+            learner = Learner(seat, groups[name].spec, config.seed, done=self.done)
+            self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
         self._appoint_demonstrators()
         self._log()
 
@@ -88,17 +89,17 @@ class Training:
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
         known: dict[str, Demonstrator] = {}
-        for trainee in self.trainees.values():
-            asked = trainee.spec.demonstrations
-            if asked is not None and trainee.demonstrations:
+        for learner in self.learners.values():
+            asked = learner.spec.demonstrations
+            if asked is not None and learner.demonstrations:
                 seed = derived_seed(self.config.seed, "demonstrations", asked.controller, self.done)
                 known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
-                trainee.follow(known[asked.controller])
+                learner.follow(known[asked.controller])
 
     def _log(self) -> None:
         if self.run is not None:
-            for trainee in self.trainees.values():
-                trainee.log_to(self.run.path / "tensorboard")
+            for learner in self.learners.values():
+                learner.log_to(self.run.path / "tensorboard")
 
     def start(
         self,
@@ -124,10 +125,10 @@ class Training:
         try:
             with one_torch_thread(), self._interruptible():
                 self.lockstep.run(
-                    learners={a: _learner(t, steps, callbacks.get(a)) for a, t in self.trainees.items()},
-                    actors={a: t.act for a, t in self.trainees.items()},
-                    streams={a: t.streams for a, t in self.trainees.items()},
-                    budgets={a: t.budget(steps) for a, t in self.trainees.items()},
+                    learners={a: partial(each.learn, steps, callbacks.get(a)) for a, each in self.learners.items()},
+                    actors={a: each.act for a, each in self.learners.items()},
+                    streams={a: each.streams for a, each in self.learners.items()},
+                    budgets={a: each.budget(steps) for a, each in self.learners.items()},
                     hook=_Hook(self, report),
                 )
         except Interrupted:
@@ -141,14 +142,14 @@ class Training:
         finally:
             if self._metrics is not None:
                 self._metrics.close()
-            for trainee in self.trainees.values():
-                trainee.close()
+            for learner in self.learners.values():
+                learner.close()
 
     def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
         """Raise a ``CirlError`` for callbacks of learners that there are not."""
         for name in callbacks:
-            if name not in self.trainees:
-                raise CirlError(f"callbacks: {unknown('learner', name, self.trainees)}")
+            if name not in self.learners:
+                raise CirlError(f"callbacks: {unknown('learner', name, self.learners)}")
 
     @property
     def joint_steps(self) -> int:
@@ -181,8 +182,8 @@ class Training:
             return
 
         def write(folder: Path) -> None:
-            for trainee in self.trainees.values():
-                trainee.save(folder, replay=state != "complete")
+            for learner in self.learners.values():
+                learner.save(folder, replay=state != "complete")
 
         self.run.save_checkpoint(self.joint_steps, write, state, reason)
 
@@ -233,10 +234,6 @@ class _Hook:
                 )
             )
         training.after_step(seconds, infos, ended)
-
-
-def _learner(trainee: Trainee, steps: int, callback: BaseCallback | None) -> Callable[[], None]:
-    return lambda: trainee.learn(steps, callback)
 
 
 @contextmanager

@@ -35,7 +35,7 @@ def planned(
         CirlError: for a name that does not exist, or a combination that the paper did not run.
     """
     if recipe is not None and recipe not in RECIPES:
-        raise CirlError(f"--recipe: {unknown('recipe', recipe, RECIPES)}")
+        raise CirlError(f"--settings: {unknown('settings', recipe, RECIPES)}")
     if environment in ALGORITHMS:
         raise CirlError(f"{environment} is an algorithm, which comes after an environment: {', '.join(ENVIRONMENTS)}")
     if algorithm is not None and algorithm not in ALGORITHMS:

@@ -19,7 +19,7 @@ from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
 from cirl_marl.learners.learner import derived_seed
-from cirl_marl.learners.recipe import Learner
+from cirl_marl.learners.recipe import LearnerSettings
 from cirl_marl.paper.evaluation import Report, predictor
 from cirl_marl.paper.plan import tuned_recipe
 from cirl_marl.paper.published import PaperEnvironment
@@ -94,13 +94,13 @@ def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, repo
         assert training.run is not None
         metrics = training.run.metrics()
     agent = training.env.agents[0]
-    trainee, copies = training.trainees[agent], training.env.num_envs
+    learner, copies = training.learners[agent], training.env.num_envs
     # the copies of a network end together, and a row of the metrics is the mean over them
     returns = np.repeat(metrics[f"return:{agent}"], copies).tolist()
     ends = np.repeat(np.asarray(metrics["env_steps"], dtype=int), copies).tolist()
-    normalise = trainee.env.normalize_obs if isinstance(trainee.env, VecNormalize) else _unchanged
+    normalise = learner.env.normalize_obs if isinstance(learner.env, VecNormalize) else _unchanged
     return Trained(
-        predict=predictor(trainee.model, normalise),
+        predict=predictor(learner.model, normalise),
         ends=ends,
         returns=returns,
         steps=training.joint_steps * copies,
@@ -114,7 +114,7 @@ def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, repo
 def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, report: Report) -> Trained:
     """Train in copies of the Gymnasium environment; a goal task gets hindsight, as in the paper."""
     learner, copies = recipe.learner, recipe.run.envs
-    plain = Learner(algorithm=learner.algorithm)
+    plain = LearnerSettings(algorithm=learner.algorithm)
     unused = [key for key in ("scheme", "share_of_steps", "bootstrap") if getattr(learner, key) != getattr(plain, key)]
     if recipe.environment or unused:
         left_out = ", ".join([*(["environment"] if recipe.environment else []), *unused])
