@@ -456,7 +456,7 @@ def test_plan_shows_how_far_the_search_is(monkeypatch: pytest.MonkeyPatch) -> No
         yield shares.append
 
     monkeypatch.setattr("cirl_marl.cli.networks.bar", bar)
-    monkeypatch.setattr("cirl_marl.controllers.optimum.search_each", partial(search_each, population=8, iterations=2))
+    monkeypatch.setattr("cirl_marl.optimum.controller.search_each", partial(search_each, population=8, iterations=2))
     assert run(monkeypatch, "plan", "net_zero", "--control", "optimum", "--out", "p.csv") == 0
     searching = [share for share in shares if share < 0.99]
     assert len(searching) > 3 * 100 and shares == sorted(shares) and shares[-1] == 1.0

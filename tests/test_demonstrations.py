@@ -25,7 +25,7 @@ from cirl_marl.learners.recipe import Demonstrations
 from cirl_marl.learners.views import View
 from cirl_marl.optimum.named import CONTROLLERS, named_controller
 from cirl_marl.paper.published import ENVIRONMENTS
-from cirl_marl.paper.results import Row
+from cirl_marl.paper.results import PaperRow
 from cirl_marl.paper.tuned import train_tuned
 
 HORIZON, COPIES, SEED = 4, 2, 5
@@ -214,7 +214,7 @@ def test_tuned_row_counts_its_demonstrations(monkeypatch: pytest.MonkeyPatch) ->
             normalisers.append(self)
 
     monkeypatch.setattr("cirl_marl.paper.tuned.VecNormalize", Kept)
-    row = Row(environment="FetchWasteSorting", algorithm="TQC", recipe="tuned", steps=300)
+    row = PaperRow(environment="FetchWasteSorting", algorithm="TQC", settings="tuned", steps=300)
     found = train_tuned(ENVIRONMENTS["FetchWasteSorting"], row, lambda *_: None, small)
     statistics: Any = normalisers[0].obs_rms
     assert list(statistics) == ["observation"]
@@ -222,7 +222,7 @@ def test_tuned_row_counts_its_demonstrations(monkeypatch: pytest.MonkeyPatch) ->
     assert max(found.returns[:4]) < -5.0 and min(found.returns[:4]) > -30.0
     assert found.settings["recipe"]["learner"]["demonstrations"] == {"controller": "scripted", "steps": 200}
     with pytest.raises(RecipeError, match=r"learner\.demonstrations\.steps: 200 is more than the 100 steps of the run"):
-        short = Row(environment="FetchWasteSorting", algorithm="TQC", recipe="tuned", steps=100)
+        short = PaperRow(environment="FetchWasteSorting", algorithm="TQC", settings="tuned", steps=100)
         train_tuned(ENVIRONMENTS["FetchWasteSorting"], short, lambda *_: None, small)
 
 

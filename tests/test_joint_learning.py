@@ -229,11 +229,11 @@ def test_trained_actors_need_no_state(tmp_path: Path) -> None:
     controller = Trained(tmp_path / "run")
     controller.start(env, 9)
     got = controller.act(observations)
-    learner = training.learners["shared-learner"]
+    learnt = training.learners["shared-learner"]
     view = WithState(env, SharedPolicy(env, env.agents))
     rows = view.observe(observations, env.state)
-    normalised: Any = learner.env.normalize_obs(rows)  # type: ignore[attr-defined]
-    expected = view.act(learner.model.predict(normalised, deterministic=True)[0])
+    normalised: Any = learnt.env.normalize_obs(rows)  # type: ignore[attr-defined]
+    expected = view.act(learnt.model.predict(normalised, deterministic=True)[0])
     for agent in env.agents:
         np.testing.assert_array_equal(got[agent], expected[agent])
     unseen: Any = view.observe(observations, unseen_state(env))

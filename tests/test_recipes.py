@@ -258,7 +258,10 @@ def test_options_of_training_are_matched_with_all_that_it_takes(option: str, nea
             {"environment": {"reward": "mix"}},
             "recipe 'small': environment.reward: unknown value 'mix'. Did you mean 'mix",
         ),
-        ({"learner": LearnerSettings(algorithm="PPO", parameters={"gamma": float("nan")})}, "parameters.gamma: must be a fin"),
+        (
+            {"learner": LearnerSettings(algorithm="PPO", parameters={"gamma": float("nan")})},
+            "parameters.gamma: must be a fin",
+        ),
         ({"match": [Match(role="landfill", algorithm="PPP")]}, "match.0.algorithm: unknown algorithm 'PPP'"),
         ({"learner": LearnerSettings(algorithm="SAC", policy="CentralCriticPolicy")}, "unknown policy of SAC"),
         (

@@ -169,9 +169,9 @@ def test_an_interrupted_rollout_is_begun_anew(tmp_path: Path, ppo_recipe: Recipe
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
             resume(tmp_path, report=ctrl_c_after(60))
-    for learner in resume(tmp_path).learners.values():
-        assert learner.model.num_timesteps == 160
-        assert learner.model._n_updates == 2 * 2  # rollouts and epochs
+    for each in resume(tmp_path).learners.values():
+        assert each.model.num_timesteps == 160
+        assert each.model._n_updates == 2 * 2  # rollouts and epochs
     assert RunDirectory(tmp_path).status["joint_steps"] == 50 + 3 * 30 + 40
 
 
@@ -222,7 +222,10 @@ def test_a_policy_that_breaks_is_a_failure(algorithm: str, tmp_path: Path) -> No
     """Learners whose weights overflow end the run as failed, with a reason of one line."""
     parameters = {"learning_starts": 2, "buffer_size": 100, "batch_size": 4, "learning_rate": 1e30}
     recipe = Recipe(
-        name="x", title="x", run=Run(steps=40, envs=1), learner=LearnerSettings(algorithm=algorithm, parameters=parameters)
+        name="x",
+        title="x",
+        run=Run(steps=40, envs=1),
+        learner=LearnerSettings(algorithm=algorithm, parameters=parameters),
     )
     with pytest.raises(LearnerError, match="failed at joint step"):
         train("copper_net", recipe, agents=["use"], directory=tmp_path)

@@ -155,7 +155,9 @@ def test_recurrent_policies_remember_within_an_episode_and_forget_after_it(tmp_p
     """A run's LSTM is fed its state from step to step, from nothing at each start."""
     parameters = {"n_steps": 10, "batch_size": 10, "n_epochs": 1, "policy_kwargs": {"lstm_hidden_size": 8}}
     normalise = Normalisation(observation=False, reward=False)
-    learner = LearnerSettings(algorithm="RecurrentPPO", policy="MlpLstmPolicy", parameters=parameters, normalise=normalise)
+    learner = LearnerSettings(
+        algorithm="RecurrentPPO", policy="MlpLstmPolicy", parameters=parameters, normalise=normalise
+    )
     recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=2), learner=learner)
     training = train("copper_net", recipe, agents=["use"], directory=tmp_path / "run", horizon=5)
     env = RunDirectory(tmp_path / "run").make_env(2)

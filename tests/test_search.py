@@ -114,7 +114,7 @@ def test_starts_by_name() -> None:
 
 def test_optimum_control_searches_where_nothing_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each copy of net_zero follows the plan found from its own start, and the controller says that it is no more."""
-    monkeypatch.setattr("cirl_marl.controllers.optimum.search_each", partial(search_each, population=8, iterations=2))
+    monkeypatch.setattr("cirl_marl.optimum.controller.search_each", partial(search_each, population=8, iterations=2))
     controller = Optimum(service_weight=1.0)
     run = rollout(VectorEnv("net_zero", num_envs=2, horizon=3), controller)
     assert controller.note.startswith("best plan found, no certificate: network 'net_zero'")

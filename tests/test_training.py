@@ -24,7 +24,7 @@ from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.trained import Trained
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network.elements import Episode, Law
-from cirl_marl.paper.results import Row
+from cirl_marl.paper.results import PaperRow
 from cirl_marl.paper.running import run_row
 
 OFF_POLICY = {
@@ -347,7 +347,7 @@ def test_no_temporary_folders_are_left(
     train("copper_net", mixed_recipe, horizon=5)
     train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
     resume(tmp_path / "run", steps=1000)
-    run_row(Row(environment="CopperNet", algorithm="A2C", steps=100))
+    run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=100))
     assert list(scratch.iterdir()) == []
 
 

@@ -28,7 +28,7 @@ NetworkName = Annotated[str, typer.Argument(metavar="NETWORK", help="Name in the
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a training run.")]
 Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]
-Episodes = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
+EpisodeCount = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
 MinService = Annotated[
     float | None,
     typer.Option(min=0.0, max=1.0, help="Mean service level that mpc and optimum plan for; default: all there is."),

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cirl_marl.cli.common import (
-    Episodes,
+    EpisodeCount,
     MinService,
     NetworkName,
     Scenario,
@@ -36,7 +36,7 @@ def compare(
         str | None, typer.Option(help="Catalogue name or .toml file; default: the network of the runs.")
     ] = None,
     scenario: Scenario = None,
-    episodes: Episodes = 16,
+    episodes: EpisodeCount = 16,
     seed: Seed = 0,
     min_service: MinService = None,
     out: Annotated[
@@ -86,7 +86,7 @@ def pareto(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Environment steps of each training; default: the recipe's.")
     ] = None,
-    episodes: Episodes = 16,
+    episodes: EpisodeCount = 16,
     scenario: Scenario = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK.")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cirl_marl.cli.common import Episodes, RunPath, Scenario, Seed, app, console, listed, say, shares, training_bar
+from cirl_marl.cli.common import EpisodeCount, RunPath, Scenario, Seed, app, console, listed, say, shares, training_bar
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network.elements import OBSERVE, REWARDS
@@ -33,7 +33,7 @@ def train(
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run; with --steps, to so many.")
     ] = None,
-    episodes: Episodes = 64,
+    episodes: EpisodeCount = 64,
 ) -> None:
     """Train one learner per compartment, all at once, then evaluate them and draw what changed."""
     from cirl_marl import learners
@@ -73,7 +73,7 @@ def train(
 
 
 @app.command()
-def evaluate(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
+def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     """Compare the trained policies with neutral and random control on fresh seeds, and with the best possible.
 
     The gap to the bound is to the highest circularity of any episode from the same start that serves at least as well.
@@ -91,7 +91,7 @@ def evaluate(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
 
 
 @app.command()
-def report(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
+def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     """Evaluate a run and draw its pictures anew."""
     _evaluate_and_draw(run, episodes, seed)
 
@@ -111,8 +111,8 @@ def paper(
     ),
 ) -> None:
     """Repeat the CiRL paper's training runs, half a day in all, and show their figures beside the published ones."""
-    from cirl_marl.paper.plan import planned
     from cirl_marl.paper.results import Results
+    from cirl_marl.paper.selection import planned
     from cirl_marl.paper.session import run_session
 
     rows = planned(environment, algorithm, steps=steps, seeds=seeds, settings=settings)

@@ -19,7 +19,7 @@ LINE_LETTERS = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class Arrangement:
     """Where everything of one network goes, in em.
 
     Attributes:
@@ -52,7 +52,7 @@ class Layout:
         return points.min(axis=0), points.max(axis=0)
 
 
-def layout_of(network: Network, aspect: float) -> Layout:
+def arrangement_of(network: Network, aspect: float) -> Arrangement:
     """Return the layout of ``network`` for pictures of about this width over height."""
     return _layout(_Structure(network), round(2 * aspect) / 2 or 0.5)
 
@@ -75,7 +75,7 @@ class _Structure:
 
 
 @lru_cache(maxsize=16)
-def _layout(structure: _Structure, aspect: float) -> Layout:
+def _layout(structure: _Structure, aspect: float) -> Arrangement:
     network = structure.network
     names = tuple(_lines(node.id) for node in network.nodes)
     letters = max(len(line) for name in names for line in name)
@@ -83,7 +83,7 @@ def _layout(structure: _Structure, aspect: float) -> Layout:
     positions = place(network, Pitch(box[0] + 4.8, box[1] + 3.7), aspect)
     labelled = len(network.nodes) <= LABELLED_NODES and len(network.arcs) <= LABELLED_ARCS
     routes = route(positions, network.donors, network.recipients, box) if labelled else None
-    return Layout(positions, routes, box, names)
+    return Arrangement(positions, routes, box, names)
 
 
 def _lines(identifier: str) -> tuple[str, ...]:

@@ -14,8 +14,9 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.comparison import ProgressReport
 from cirl_marl.evaluation.contenders import differences
-from cirl_marl.evaluation.yardstick import FRONT
+from cirl_marl.evaluation.yardsticks import FRONT
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
@@ -23,7 +24,6 @@ from cirl_marl.optimum.mpc import SERVICE_FIRST
 
 WEIGHED = ("mixed", "mixed_difference", "team")
 """Reward modes in which the circularity weight has a part."""
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +80,7 @@ def pareto(
     seeds: int = 1,
     steps: int | None = None,
     episodes: int = 16,
-    progress: Progress = lambda what, share: None,
+    progress: ProgressReport = lambda what, share: None,
 ) -> Sweep:
     """Sweep the weight between circularity and service.
 
@@ -197,7 +197,7 @@ def _check_fit(network: Network, recipe: Recipe) -> None:
         )
 
 
-def _possible(network: Network, points: int, progress: Progress) -> tuple[tuple[Point, ...], Floats]:
+def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[tuple[Point, ...], Floats]:
     """Return bounds by demanded service, what their improved plans do in the simulator, and the front they prove."""
     found: list[Point] = []
     bounds: list[Bound] = []
@@ -215,7 +215,7 @@ def _possible(network: Network, points: int, progress: Progress) -> tuple[tuple[
     return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels)], axis=1)
 
 
-def _planned(progress: Progress, done: float, each: float) -> Callable[[float], None]:
+def _planned(progress: ProgressReport, done: float, each: float) -> Callable[[float], None]:
     return lambda share: progress("bounds and plans", done + each * share)
 
 
@@ -237,5 +237,5 @@ def _learnt(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
         )
 
 
-def _part(progress: Progress, what: str, done: float, each: float, place: int) -> Callable[[float], None]:
+def _part(progress: ProgressReport, what: str, done: float, each: float, place: int) -> Callable[[float], None]:
     return lambda share: progress(what, done + each * (place + min(1.0, share)))

@@ -37,7 +37,7 @@ exact where more service costs less than that; a steeper one lets the draws hug 
 KNOTS = 16
 """Stretches of an episode with deviations of their own, unless another number is asked for."""
 
-Progress = Callable[[float, Floats], None]
+SearchReport = Callable[[float, Floats], None]
 """Takes the share of all episodes that is simulated and the best merit from each start so far, shape (starts,)."""
 
 
@@ -89,7 +89,7 @@ def search(
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
-    progress: Progress = lambda share, merit: None,
+    progress: SearchReport = lambda share, merit: None,
 ) -> Incumbent:
     """Look for the actions that do best over one episode, for any network; nothing is proved about the result.
 
@@ -151,7 +151,7 @@ def search_each(
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
-    progress: Progress = lambda share, merit: None,
+    progress: SearchReport = lambda share, merit: None,
 ) -> list[Incumbent]:
     """Look for the best actions from several starts at once, which costs less than one after the other.
 

@@ -20,14 +20,16 @@ from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
 from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import LearnerSettings
-from cirl_marl.paper.evaluation import Report, predictor
-from cirl_marl.paper.plan import tuned_recipe
+from cirl_marl.paper.final_policy import Report, predictor
 from cirl_marl.paper.published import PaperEnvironment
-from cirl_marl.paper.results import Row
-from cirl_marl.paper.training import Trained, Watch, check_registered, described, episodes_of, stopwatch
+from cirl_marl.paper.results import PaperRow
+from cirl_marl.paper.selection import tuned_recipe
+from cirl_marl.paper.untuned import PaperTraining, Watch, check_registered, described, episodes_of, stopwatch
 
 
-def train_tuned(environment: PaperEnvironment, row: Row, report: Report, recipe: Recipe | None = None) -> Trained:
+def train_tuned(
+    environment: PaperEnvironment, row: PaperRow, report: Report, recipe: Recipe | None = None
+) -> PaperTraining:
     """Train by the environment's recipe: networks with batched physics, goal tasks and others in a batch of copies.
 
     Args:
@@ -70,7 +72,7 @@ def _check_comparable(recipe: Recipe) -> None:
         raise RecipeError(f"recipe '{recipe.name}': one agent learns, so [[match]] has no place")
 
 
-def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, report: Report) -> Trained:
+def _train_network(environment: PaperEnvironment, recipe: Recipe, row: PaperRow, report: Report) -> PaperTraining:
     """Train the one agent of a network in its paper scenario."""
     arguments = check_registered(environment).kwargs
     agent = arguments.get("agent")
@@ -99,7 +101,7 @@ def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, repo
     returns = np.repeat(metrics[f"return:{agent}"], copies).tolist()
     ends = np.repeat(np.asarray(metrics["env_steps"], dtype=int), copies).tolist()
     normalise = learner.env.normalize_obs if isinstance(learner.env, VecNormalize) else _unchanged
-    return Trained(
+    return PaperTraining(
         predict=predictor(learner.model, normalise),
         ends=ends,
         returns=returns,
@@ -111,7 +113,7 @@ def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, repo
     )
 
 
-def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, report: Report) -> Trained:
+def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: PaperRow, report: Report) -> PaperTraining:
     """Train in copies of the Gymnasium environment; a goal task gets hindsight, as in the paper."""
     learner, copies = recipe.learner, recipe.run.envs
     plain = LearnerSettings(algorithm=learner.algorithm)
@@ -153,7 +155,7 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, repor
     seconds, cpu_seconds = elapsed()
     ends, returns = episodes_of(monitors)
     settings = _settings(environment, recipe, copies)
-    return Trained(
+    return PaperTraining(
         predict=predictor(model, env.normalize_obs if isinstance(env, VecNormalize) else _unchanged),
         ends=ends,
         returns=returns,

@@ -21,7 +21,7 @@ MARKERS = "osD^vP*X"
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class PointSeries:
     """Points of one kind in the plane of service and circularity.
 
     Attributes:
@@ -37,7 +37,9 @@ class Series:
     joined: bool = False
 
 
-def save_fronts(path: str | Path, network: Network, series: Sequence[Series], bound: Floats, *, title: str) -> Path:
+def save_fronts(
+    path: str | Path, network: Network, series: Sequence[PointSeries], bound: Floats, *, title: str
+) -> Path:
     """Save λ̄ against the service level as a PNG.
 
     Args:
