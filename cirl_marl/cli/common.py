@@ -64,11 +64,8 @@ def folder_for(path: Path, option: str) -> Path:
 @contextmanager
 def bar(what: str) -> Iterator[Callable[[float], None]]:
     """Progress bar; the yielded function takes the share that is done."""
-    with Progress(
-        TextColumn(what), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=console, transient=True
-    ) as progress:
-        task = progress.add_task(what, total=1.0)
-        yield lambda share: progress.update(task, completed=share)
+    with shares() as told:
+        yield lambda share: told(what, share)
 
 
 @contextmanager

@@ -68,8 +68,7 @@ def show(
 @app.command()
 def check(
     sources: Annotated[
-        list[str],
-        typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue."),
+        list[str], typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue.")
     ],
     network: Annotated[
         str | None, typer.Option(help="Check that recipes fit this network too: scenario, agents, matches, algorithms.")

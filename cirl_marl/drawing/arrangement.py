@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +11,7 @@ from cirl_marl.drawing.places import Pitch, place
 from cirl_marl.drawing.routing import LABEL, Routes, route
 from cirl_marl.drawing.style import spoken
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Role
 
 LABELLED_NODES = 60
 """Largest network drawn with boxes and labels."""
@@ -41,37 +42,25 @@ class Arrangement:
             margin = 0.04 * np.ptp(places, axis=0) + 1
             return places.min(axis=0) - margin, places.max(axis=0) + margin
         labels = self.routes.labels
-        corners = [
-            places - half,
-            places + half,
-            self.routes.curves.reshape(-1, 2),
-            labels - label,
-            labels + label,
-        ]
+        corners = [places - half, places + half, self.routes.curves.reshape(-1, 2), labels - label, labels + label]
         points = np.concatenate(corners)
         return points.min(axis=0), points.max(axis=0)
 
 
 def arrangement_of(network: Network, aspect: float) -> Arrangement:
     """Return the layout of ``network`` for pictures of about this width over height."""
-    return _layout(_Structure(network), round(2 * aspect) / 2 or 0.5)
+    nodes = tuple((node.id, node.role) for node in network.nodes)
+    arcs = tuple((arc.donor, arc.recipient) for arc in network.arcs)
+    return _layout(_Structure(nodes, arcs, network), round(2 * aspect) / 2 or 0.5)
 
 
+@dataclass(frozen=True, slots=True)
 class _Structure:
     """A network that equals every other with the same nodes, arcs and roles, whatever its numbers."""
 
-    def __init__(self, network: Network) -> None:
-        self.network = network
-        self._key = (
-            tuple((node.id, node.role) for node in network.nodes),
-            tuple((arc.donor, arc.recipient) for arc in network.arcs),
-        )
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Structure) and self._key == other._key
+    nodes: tuple[tuple[str, Role], ...]
+    arcs: tuple[tuple[str, str], ...]
+    network: Network = field(compare=False)
 
 
 @lru_cache(maxsize=16)

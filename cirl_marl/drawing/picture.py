@@ -140,8 +140,7 @@ def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, sha
         for curve, value, size in zip(routes.curves, flow, share, strict=True)
     ]
     axes.add_collection(
-        PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.4, zorder=2),
-        autolim=False,
+        PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.4, zorder=2), autolim=False
     )
     halo = [withStroke(linewidth=0.25 * em, foreground="white")]
     ends = Counter((arc.donor, arc.recipient) for arc in network.arcs)

@@ -182,7 +182,7 @@ def compare(
     for place, contender in enumerate(entered):
         controller = contender.controller()
         checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
-        watched = Watched(controller, _told(progress, contender.name, place * share, share))
+        watched = Watched(controller, part_of(progress, contender.name, place * share, share))
         rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.acted))
     measure, proved = _unproved(len(entered), "")
     if bounds:
@@ -211,11 +211,7 @@ def starting_stocks(env: VectorEnv, seed: int) -> Floats:
 
 
 def _measured(
-    env: VectorEnv,
-    starts: Floats,
-    names: Sequence[str],
-    rollouts: Sequence[Rollout],
-    progress: Callable[[float], None],
+    env: VectorEnv, starts: Floats, names: Sequence[str], rollouts: Sequence[Rollout], progress: Callable[[float], None]
 ) -> tuple[Yardstick, list[Floats | None]]:
     """Return the yardstick of all rows, and the bounds of the episodes of each rollout."""
     services: dict[str, list[Floats]] = {}
@@ -240,6 +236,7 @@ def _unproved(entries: int, reason: str) -> tuple[Yardstick, list[Floats | None]
     return Yardstick(None, np.empty((0, 2)), reason), [None] * entries
 
 
-def _told(progress: ProgressReport, what: str, done: float, each: float) -> Callable[[float], None]:
+def part_of(progress: ProgressReport, what: str, done: float, share: float) -> Callable[[float], None]:
+    """Return what takes the part that is done of something that makes up a ``share`` of all and follows on ``done``."""
     progress(what, done)
-    return lambda share: progress(what, done + each * share)
+    return lambda part: progress(what, done + share * min(1.0, part))

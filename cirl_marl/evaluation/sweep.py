@@ -14,7 +14,7 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
-from cirl_marl.evaluation.comparison import ProgressReport
+from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.evaluation.contenders import differences
 from cirl_marl.evaluation.yardsticks import FRONT
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
@@ -125,7 +125,8 @@ def pareto(
     runs = []
     for place in range(points * seeds):
         asked = _Asked(found, chosen, place // seeds / (points - 1), place % seeds, steps)
-        told = _part(progress, f"training {asked}", share, (1 - share) / (points * seeds), place)
+        each = (1 - share) / (points * seeds)
+        told = part_of(progress, f"training {asked}", share + each * place, each)
         runs.append(asked.run(directory / "runs", told))
     groups = [runs[first : first + seeds] for first in range(0, len(runs), seeds)]
     learnt = tuple(point for group in groups for point in _learnt(group, episodes))
@@ -207,16 +208,12 @@ def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[
         solved = bound(network, min_service=level, near=bounds[-1] if bounds else None)
         bounds.append(solved)
         found.append(Point(kind="bound", service=level, circularity=solved.objective))
-        episode = achieved(improved(solved, progress=_planned(progress, place / points, 1 / points)))
+        episode = achieved(improved(solved, progress=part_of(progress, "bounds and plans", place / points, 1 / points)))
         service, circularity = float(episode.episode_service[0]), float(episode.episode_circularity[0])
         found.append(Point(kind="plan", service=service, circularity=circularity))
         progress("bounds and plans", (place + 1) / points)
     levels = np.linspace(least, most, FRONT)
     return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels)], axis=1)
-
-
-def _planned(progress: ProgressReport, done: float, each: float) -> Callable[[float], None]:
-    return lambda share: progress("bounds and plans", done + each * share)
 
 
 def _levels(least: float, most: float, points: int) -> list[float]:
@@ -235,7 +232,3 @@ def _learnt(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
             weight=None if entry.run is None else entry.run.config.options["circularity_weight"],
             seed=entry.seed,
         )
-
-
-def _part(progress: ProgressReport, what: str, done: float, each: float, place: int) -> Callable[[float], None]:
-    return lambda share: progress(what, done + each * (place + min(1.0, share)))

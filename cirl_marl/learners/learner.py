@@ -87,7 +87,7 @@ class Learner:
             RecipeError: naming the learner, if the algorithm refuses its parameters.
         """
         spec = self.spec
-        self.env = self._normalised(spec)
+        self.env = normalised(self.seat, spec)
         parameters = dict(spec.parameters)
         if issubclass(algorithm_class(spec.algorithm), ARS):
             parameters.setdefault("n_eval_episodes", self.seat.num_envs)
@@ -208,22 +208,25 @@ class Learner:
         """Close the log files."""
         self.model.logger.close()
 
-    def _normalised(self, spec: LearnerSettings) -> VecEnv:
-        normalise = spec.normalise
-        if not normalise.any:
-            return self.seat
-        return VecNormalize(
-            self.seat,
-            norm_obs=normalise.observation,
-            norm_reward=normalise.reward,
-            clip_obs=normalise.clip_observation,
-            clip_reward=normalise.clip_reward,
-            gamma=spec.parameters.get("gamma", 0.99),
-        )
-
     def log_to(self, log: Path) -> None:
         """Write TensorBoard events below the folder ``log``."""
         self.model.set_logger(configure(str(log / self.name), ["tensorboard"]))
+
+
+def normalised(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:
+    """Return ``env`` behind the normaliser that the settings ask for, if they do; of a dict ``keys`` are normalised."""
+    normalise = spec.normalise
+    if not normalise.any:
+        return env
+    return VecNormalize(
+        env,
+        norm_obs=normalise.observation,
+        norm_reward=normalise.reward,
+        clip_obs=normalise.clip_observation,
+        clip_reward=normalise.clip_reward,
+        gamma=spec.parameters.get("gamma", 0.99),
+        norm_obs_keys=keys,
+    )
 
 
 def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = None) -> BaseAlgorithm:

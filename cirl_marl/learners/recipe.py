@@ -34,11 +34,13 @@ Count = Annotated[int, Field(strict=True, gt=0)]
 Limit = Annotated[Number, Field(gt=0)]
 
 
-class _Table(BaseModel):
+class Settings(BaseModel):
+    """Named values, none of them unknown, that do not change."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Options(_Table):
+class Options(Settings):
     """What a recipe may say of the environment; None takes the definition's."""
 
     reward: Reward | None = None
@@ -52,7 +54,7 @@ class Options(_Table):
 OPTIONS = tuple(Options.model_fields)
 
 
-class Normalisation(_Table):
+class Normalisation(Settings):
     """Running normalisation by Stable-Baselines3's ``VecNormalize``, one per agent, saved with its policy."""
 
     observation: StrictBool = True
@@ -66,7 +68,7 @@ class Normalisation(_Table):
         return self.observation or self.reward
 
 
-class Demonstrations(_Table):
+class Demonstrations(Settings):
     """A controller that acts in the learner's place at first, while the learner keeps what it sees."""
 
     controller: Literal["neutral", "random", "scripted", "lqr", "mpc", "optimum"]
@@ -75,7 +77,7 @@ class Demonstrations(_Table):
     )
 
 
-class LearnerSettings(_Table):
+class LearnerSettings(Settings):
     """One algorithm with its parameters."""
 
     algorithm: str
@@ -105,21 +107,14 @@ class LearnerSettings(_Table):
         """
         return math.ceil(round(steps * self.share_of_steps, 6))
 
-    def mistakes(self) -> Iterator[str]:
-        """Yield what is wrong whatever the network and the number of steps: key, value and what would do."""
-        from cirl_marl.learners.algorithms import algorithm_mistakes
+    def mistakes(self, steps: int) -> Iterator[str]:
+        """Yield what is wrong whatever the network, in a run of ``steps``: key, value and what would do."""
+        from cirl_marl.learners.algorithms import algorithm_mistakes, algorithms, has_replay_buffer
 
         yield from algorithm_mistakes(self.algorithm, self.policy, self.parameters)
         if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
             yield f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true"
-
-    def demonstration_mistakes(self, steps: int) -> Iterator[str]:
-        """Yield why the algorithm cannot keep its demonstrations, or why a run of ``steps`` has no room for them."""
-        if self.demonstrations is None:
-            return
-        from cirl_marl.learners.algorithms import algorithms, has_replay_buffer
-
-        if self.algorithm not in algorithms():
+        if self.demonstrations is None or self.algorithm not in algorithms():
             return
         if not has_replay_buffer(self.algorithm):
             fit = ", ".join(filter(has_replay_buffer, algorithms()))
@@ -147,7 +142,7 @@ class Match(LearnerSettings):
         )
 
 
-class Run(_Table):
+class Run(Settings):
     """How long and in how many copies; the command line overrides it."""
 
     steps: Count = Field(200_000, description="environment steps, summed over the copies")
@@ -174,7 +169,7 @@ class Group:
         return view_of(env, self.agents, self.spec.scheme, with_state=self.spec.policy == CENTRAL_CRITIC)
 
 
-class Recipe(_Table):
+class Recipe(Settings):
     """A learner for each agent of a network.
 
     Attributes:
@@ -219,13 +214,13 @@ class Recipe(_Table):
             found[name] = Group(name, (*members, agent), spec)
         return tuple(found.values())
 
-    def check(self) -> None:
-        """Refuse what is wrong whatever the network and the number of steps.
+    def check(self, steps: int) -> None:
+        """Refuse what is wrong whatever the network, in a run of ``steps``.
 
         Raises:
             RecipeError: naming every mistake.
         """
-        self._refuse(self.mistakes())
+        self._refuse(self.mistakes(steps))
 
     def check_agents(self, agents: Sequence[str]) -> None:
         """Refuse matches that name agents which do not act.
@@ -240,21 +235,13 @@ class Recipe(_Table):
             if agent not in agents
         )
 
-    def check_demonstrations(self, steps: int) -> None:
-        """Refuse demonstrations that an algorithm cannot keep, or that a run of ``steps`` has no room for.
-
-        Raises:
-            RecipeError: naming the learner and the key.
-        """
-        self._refuse(self.demonstration_mistakes(steps))
-
     def _refuse(self, mistakes: Iterable[str]) -> None:
         found = "; ".join(mistakes)
         if found:
             raise RecipeError(f"recipe '{self.name}': {found}")
 
-    def mistakes(self) -> Iterator[str]:
-        """Yield what is wrong whatever the network and the number of steps: key, value and what would do."""
+    def mistakes(self, steps: int) -> Iterator[str]:
+        """Yield what is wrong whatever the network, in a run of ``steps``: key, value and what would do."""
         try:
             Options.model_validate(self.environment)
         except ValidationError as error:
@@ -263,12 +250,7 @@ class Recipe(_Table):
             if match.kind is None and match.role is None and match.agents is None:
                 yield f"match.{i}: fits every agent; give kind, role or agents"
         for where, learner in self.learners():
-            yield from (f"{where}.{mistake}" for mistake in learner.mistakes())
-
-    def demonstration_mistakes(self, steps: int) -> Iterator[str]:
-        """Yield what is wrong with demonstrations in a run of ``steps``: learner, key and value."""
-        for where, learner in self.learners():
-            yield from (f"{where}.{mistake}" for mistake in learner.demonstration_mistakes(steps))
+            yield from (f"{where}.{mistake}" for mistake in learner.mistakes(steps))
 
     def learners(self) -> tuple[tuple[str, LearnerSettings], ...]:
         """Return every learner and what messages call its table."""
@@ -300,7 +282,7 @@ def load_recipe(name: str | Path) -> Recipe:
     except ValidationError as error:
         mistakes += mistakes_of(error, Recipe)
         recipe = _sound_part(document, {str(item["loc"][0]) for item in error.errors()})
-    mistakes += [*recipe.mistakes(), *recipe.demonstration_mistakes(recipe.run.steps)]
+    mistakes += recipe.mistakes(recipe.run.steps)
     if mistakes:
         raise DefinitionError(str(path), mistakes)
     return recipe

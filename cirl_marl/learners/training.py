@@ -102,10 +102,7 @@ class Training:
                 learner.log_to(self.run.path / "tensorboard")
 
     def start(
-        self,
-        *,
-        callbacks: Mapping[str, BaseCallback] | None = None,
-        report: Callable[[Progress], None] | None = None,
+        self, *, callbacks: Mapping[str, BaseCallback] | None = None, report: Callable[[Progress], None] | None = None
     ) -> None:
         """Train to the end of the budget.
 
@@ -129,7 +126,7 @@ class Training:
                     actors={a: each.act for a, each in self.learners.items()},
                     streams={a: each.streams for a, each in self.learners.items()},
                     budgets={a: each.budget(steps) for a, each in self.learners.items()},
-                    hook=_Hook(self, report),
+                    hook=partial(self._after_step, time.perf_counter(), report),
                 )
         except Interrupted:
             self._save("interrupted", "stopped by the user")
@@ -156,26 +153,36 @@ class Training:
         """Joint steps done, those before a resumption included."""
         return self.lockstep.joint_steps
 
-    def after_step(self, seconds: float, infos: Infos, ended: NDArray[np.bool_]) -> None:
-        """Record finished episodes, save checkpoints, heed Ctrl-C."""
-        if ended.any() and self._metrics is not None:
-            first = infos[self.env.agents[0]]
-            returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
-            self._metrics.append(
-                [
-                    self.joint_steps,
-                    self.joint_steps * self.env.num_envs,
-                    self._metrics.seconds + seconds,
-                    float(first["episode_circularity"][ended].mean()),
-                    float(first["episode_service_level"][ended].mean()),
-                    *returns,
-                ]
-            )
+    def _after_step(
+        self, began: float, report: Callable[[Progress], None] | None, infos: Infos, ended: NDArray[np.bool_]
+    ) -> None:
+        """Report, record finished episodes, save checkpoints, heed Ctrl-C."""
+        finished = bool(ended.any())
+        if finished or report is not None:
+            self._tell(time.perf_counter() - began, report, infos, ended if finished else None)
         every = max(1, self.config.steps // self.env.num_envs // CHECKPOINTS)
         if self.joint_steps % every == 0:
             self._save("running")
         if self._interrupted:
             raise Interrupted
+
+    def _tell(
+        self, seconds: float, report: Callable[[Progress], None] | None, infos: Infos, ended: NDArray[np.bool_] | None
+    ) -> None:
+        """Report how far the training is, and keep the figures of episodes that ended, if some did."""
+        first, copies, steps = infos[self.env.agents[0]], self.env.num_envs, self.joint_steps
+        names = ("circularity", "service_level")
+        if ended is None:
+            circularity, service = (float(first[name].mean()) for name in names)
+        else:
+            circularity, service = (float(first[f"episode_{name}"][ended].mean()) for name in names)
+        if report is not None:
+            total = max(self.config.steps, steps * copies) - self.done * copies
+            report(Progress((steps - self.done) * copies, total, seconds, circularity, service, ended is not None))
+        if ended is not None and self._metrics is not None:
+            returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
+            spent = self._metrics.seconds + seconds
+            self._metrics.append([steps, steps * copies, spent, circularity, service, *returns])
 
     def _save(self, state: str, reason: str = "") -> None:
         if self.run is None:
@@ -204,36 +211,6 @@ class Training:
             yield
         finally:
             signal.signal(signal.SIGINT, before)
-
-
-class _Hook:
-    """Runs after each joint step."""
-
-    def __init__(self, training: Training, report: Callable[[Progress], None] | None) -> None:
-        self._training = training
-        self._report = report
-        self._began = time.perf_counter()
-
-    def __call__(self, infos: Infos, ended: NDArray[np.bool_]) -> None:
-        training = self._training
-        seconds = time.perf_counter() - self._began
-        if self._report is not None:
-            copies = training.env.num_envs
-            first = infos[training.env.agents[0]]
-            episode = bool(ended.any())
-            circularity = first["episode_circularity"][ended] if episode else first["circularity"]
-            service = first["episode_service_level"][ended] if episode else first["service_level"]
-            self._report(
-                Progress(
-                    (training.joint_steps - training.done) * copies,
-                    max(training.config.steps, training.joint_steps * copies) - training.done * copies,
-                    seconds,
-                    float(circularity.mean()),
-                    float(service.mean()),
-                    episode,
-                )
-            )
-        training.after_step(seconds, infos, ended)
 
 
 @contextmanager

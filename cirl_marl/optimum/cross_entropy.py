@@ -155,23 +155,9 @@ def search_each(
 ) -> list[Incumbent]:
     """Look for the best actions from several starts at once, which costs less than one after the other.
 
-    All starts share the draws, so each plan is the one that ``search`` finds from that start alone.
-
-    Args:
-        network: under its scenario and horizon.
-        initial: stocks and inner states, the first of ``VectorEnv.state_names``, shape (starts, rows).
-        service_weight: see ``search``.
-        min_service: see ``search``.
-        agents: see ``search``.
-        candidates: see ``search``.
-        knots: see ``search``.
-        population: plans tried from each start in an iteration.
-        iterations: see ``search``.
-        seed: see ``search``.
-        progress: see ``search``.
-
-    Raises:
-        CirlError: see ``search``.
+    All starts share the draws, so each plan is the one that ``search`` finds from that start alone. Arguments and
+    errors are those of ``search``, but for ``network``, under its scenario and horizon, and ``initial``, stocks and
+    inner states, the first of ``VectorEnv.state_names``, shape (starts, rows).
     """
     check_options(service_weight, min_service, DEGREE)
     for name, value, least in (("population", population, 8), ("iterations", iterations, 0), ("knots", knots, 1)):

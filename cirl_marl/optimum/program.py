@@ -51,8 +51,7 @@ class Program:
 
     def interval_of_rows(self, matrix: Any) -> Integers:
         """Return the last interval whose variables each row of A or G is about, shape (rows,)."""
-        intervals: Integers = np.maximum.reduceat(matrix.indices, matrix.indptr[:-1]) // self.layout.size
-        return intervals
+        return np.maximum.reduceat(matrix.indices, matrix.indptr[:-1]) // self.layout.size
 
 
 class Programs:

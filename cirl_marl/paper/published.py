@@ -219,29 +219,13 @@ def environment_of(name: str) -> PaperEnvironment:
     return ENVIRONMENTS[name]
 
 
-def check_algorithm(environment: PaperEnvironment, algorithm: str) -> None:
-    """Refuse an algorithm that the paper did not run on ``environment``.
-
-    Raises:
-        CirlError: naming those that it did run.
-    """
-    if algorithm not in environment.runs:
-        raise CirlError(
-            f"the paper did not run {algorithm} on {environment.name}; it ran {', '.join(environment.runs)}"
-        )
-
-
 def chosen(environment: str | None, algorithm: str | None) -> Iterator[tuple[PaperEnvironment, str]]:
     """Yield the runs of the paper that the names choose; None chooses all.
 
     Raises:
-        CirlError: for a name that the paper does not have.
+        CirlError: for a name that the paper does not have, or an algorithm that it did not run on ``environment``.
     """
-    if environment is None:
-        for found in ENVIRONMENTS.values():
-            yield from ((found, name) for name in found.runs if algorithm in (None, name))
-        return
-    found = environment_of(environment)
-    if algorithm is not None:
-        check_algorithm(found, algorithm)
-    yield from ((found, name) for name in found.runs if algorithm in (None, name))
+    for found in ENVIRONMENTS.values() if environment is None else [environment_of(environment)]:
+        if environment is not None and algorithm not in (None, *found.runs):
+            raise CirlError(f"the paper did not run {algorithm} on {found.name}; it ran {', '.join(found.runs)}")
+        yield from ((found, name) for name in found.runs if algorithm in (None, name))

@@ -18,7 +18,7 @@ from cirl_marl.errors import CirlError, RecipeError
 from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
-from cirl_marl.learners.learner import derived_seed
+from cirl_marl.learners.learner import derived_seed, normalised
 from cirl_marl.learners.recipe import LearnerSettings
 from cirl_marl.paper.final_policy import Report, predictor
 from cirl_marl.paper.published import PaperEnvironment
@@ -50,7 +50,7 @@ def train_tuned(
     if recipe.learner.algorithm != row.algorithm.removesuffix("-HER"):
         raise RecipeError(f"recipe '{recipe.name}' uses {recipe.learner.algorithm}, but the row says {row.algorithm}")
     _check_comparable(recipe)
-    recipe.check_demonstrations(row.steps)
+    recipe.check(row.steps)
     run = _train_network if _is_plain_network(environment) else _train_copies
     return run(environment, recipe, row, report)
 
@@ -124,17 +124,7 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: PaperRow, 
     monitors: list[Monitor[Any, Any]] = [Monitor(gymnasium.make(environment.id)) for _ in range(copies)]
     env: VecEnv = DummyVecEnv([lambda monitor=monitor: monitor for monitor in monitors])  # type: ignore[misc]
     goal = isinstance(env.observation_space, gymnasium.spaces.Dict)
-    normalise = learner.normalise
-    if normalise.any:
-        env = VecNormalize(
-            env,
-            norm_obs=normalise.observation,
-            norm_reward=normalise.reward,
-            clip_obs=normalise.clip_observation,
-            clip_reward=normalise.clip_reward,
-            gamma=learner.parameters.get("gamma", 0.99),
-            norm_obs_keys=["observation"] if goal else None,  # hindsight swaps goals, so they keep one scale
-        )
+    env = normalised(env, learner, ["observation"] if goal else None)  # hindsight swaps goals, which keep one scale
     parameters = learner.parameters | ({"replay_buffer_class": HerReplayBuffer} if goal else {})
     policy = learner.policy.replace("Mlp", "MultiInput") if goal else learner.policy
     model = build(learner.algorithm, policy, env, parameters, seed=row.seed, device="cpu")

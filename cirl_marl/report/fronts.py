@@ -40,7 +40,7 @@ class PointSeries:
 def save_fronts(
     path: str | Path, network: Network, series: Sequence[PointSeries], bound: Floats, *, title: str
 ) -> Path:
-    """Save λ̄ against the service level as a PNG.
+    """Save λ̄ against the service level as a PNG and return its path.
 
     Args:
         path: file to write; its folder is made.
@@ -48,9 +48,6 @@ def save_fronts(
         series: policies, plans or controllers.
         bound: service level and bound on λ̄, shape (points, 2), by service; what lies above is shaded. Empty for none.
         title: of the picture.
-
-    Returns:
-        The path.
     """
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
