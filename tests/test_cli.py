@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import shutil
 import sys
@@ -416,7 +417,8 @@ def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     """A run of another network, a plan of a run under a controller, a recipe of other agents: nothing is written."""
     bottles()
     options = ("--recipe", "independent_a2c", "--steps", "320", "--envs", "8", "--episodes", "2", "--out", "run")
-    assert run(monkeypatch, "train", "bottles.toml", *options) == 0
+    assert run(monkeypatch, "train", "bottles.toml", "--agents", "quarry", *options) == 0
+    assert json.loads(Path("run/config.json").read_text())["agents"] == ["quarry"]
     assert run(monkeypatch, "plan", "run", "--out", "plan.csv") == 0
     assert Path("plan.csv").read_text().startswith("from (day),to (day),quarry: valve factor (1),")
     assert run(monkeypatch, "compare", "run", "--episodes", "2", "--out", "compared") == 0
@@ -556,6 +558,7 @@ def test_simulate_with_inner_physics(
         (["show", "coper_net"], "unknown network 'coper_net'. Did you mean 'copper_net'?"),
         (["show", "copper_net", "--scenario", "papr"], "unknown scenario 'papr'. Did you mean 'paper'?"),
         (["train", "copper_net", "--recipe", "independent_pp"], "Did you mean 'independent_ppo'?"),
+        (["train", "copper_net", "--agents", "mine, ues"], "Did you mean 'use'?"),
         (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
         (["train"], "train needs NETWORK, or --resume RUN"),
         (["train", "--resume", "nowhere"], "no run in nowhere (it has no config.json)"),

@@ -23,7 +23,7 @@ from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
 from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.learners.algorithms import build
-from cirl_marl.paper import final_policy, published, session, tuned, untuned
+from cirl_marl.paper import final_policy, published, running, session, tuned, untuned
 from cirl_marl.paper.final_policy import evaluate
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
 from cirl_marl.paper.results import Evaluation, PaperRow, Result, Results, thinned
@@ -126,7 +126,7 @@ def test_row_is_trained_kept_and_not_run_again(
     assert kept["row"] == {
         "environment": "CopperNet",
         "algorithm": algorithm,
-        "recipe": "published",
+        "settings": "published",
         "steps": steps,
         "seed": 0,
     }
@@ -503,7 +503,7 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
         settings={},
         options={},
     )
-    monkeypatch.setattr(untuned, "train_published", lambda *_: done)
+    monkeypatch.setattr(running, "train_published", lambda *_: done)
     monkeypatch.setattr(final_policy, "EVALUATION_EPISODES", 20)
     found = run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
     assert found.start_return == pytest.approx(np.mean(returns[:window]))

@@ -225,7 +225,8 @@ def test_checkpoints_are_on_the_disk_before_they_count(
         sync(path)
         synced.append(path)
 
-    monkeypatch.setattr(learners_run, "sync", recorded)
+    for module in (learners_run, files_module):
+        monkeypatch.setattr(module, "sync", recorded)
     train("copper_net", ppo_recipe, directory=tmp_path, agents=["mine"])
     names = [path.name for path in synced]
     end = names.index("000000040-complete.partial")

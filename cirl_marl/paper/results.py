@@ -124,8 +124,9 @@ class Result:
     def from_dict(cls, plain: dict[str, Any]) -> Result:
         """Read what ``asdict`` returned, after a detour through JSON."""
         given = {key: value for key, value in plain.items() if key not in ("gain", "gain_per_step")}
-        names = {"recipe": "settings"}  # what files of 0.1 call it
-        given["row"] = PaperRow(**{names.get(key, key): value for key, value in given["row"].items()})
+        row = dict(given["row"])
+        row.setdefault("settings", row.pop("recipe", "published"))  # what files of 0.1 call it
+        given["row"] = PaperRow(**row)
         for key in ("evaluation", "published_ends"):
             given[key] = Evaluation(**given[key]) if given.get(key) is not None else None
         given["curve"] = [(int(step), float(value)) for step, value in given["curve"]]
