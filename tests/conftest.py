@@ -69,10 +69,10 @@ def ctrl_c_after() -> Callable[[int], Callable[[Progress], None]]:
 @pytest.fixture
 def ppo_recipe() -> Recipe:
     """Return a recipe for a few rollouts of PPO in two copies."""
-    from cirl_marl.learners.recipe import Learner, Recipe, Run
+    from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 
     parameters = {"n_steps": 10, "batch_size": 20, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
-    learner = Learner(algorithm="PPO", parameters=parameters)
+    learner = LearnerSettings(algorithm="PPO", parameters=parameters)
     return Recipe(name="small", title="small", run=Run(steps=80, envs=2), learner=learner)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import shutil
 import sys
@@ -405,7 +406,7 @@ def guide(changes: Mapping[str, str] | None = None, days: int = 7) -> str:
 def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Both fronts are printed, tabulated and drawn in one picture; the runs stay."""
     bottles()
-    asked = ("--agents", "independent_a2c", "--points", "2", "--steps", "320", "--episodes", "2", "--out", "out")
+    asked = ("--recipe", "independent_a2c", "--points", "2", "--steps", "320", "--episodes", "2", "--out", "out")
     assert run(monkeypatch, "pareto", "bottles.toml", *asked) == 0
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("bound    service", "plan     service", "(weight 1, seed 0)"))
@@ -415,8 +416,9 @@ def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
 def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A run of another network, a plan of a run under a controller, a recipe of other agents: nothing is written."""
     bottles()
-    options = ("--agents", "independent_a2c", "--steps", "320", "--envs", "8", "--episodes", "2", "--out", "run")
-    assert run(monkeypatch, "train", "bottles.toml", *options) == 0
+    options = ("--recipe", "independent_a2c", "--steps", "320", "--envs", "8", "--episodes", "2", "--out", "run")
+    assert run(monkeypatch, "train", "bottles.toml", "--agents", "quarry", *options) == 0
+    assert json.loads(Path("run/config.json").read_text())["agents"] == ["quarry"]
     assert run(monkeypatch, "plan", "run", "--out", "plan.csv") == 0
     assert Path("plan.csv").read_text().startswith("from (day),to (day),quarry: valve factor (1),")
     assert run(monkeypatch, "compare", "run", "--episodes", "2", "--out", "compared") == 0
@@ -429,8 +431,8 @@ def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["compare", "run", "run", "--out", "new"], "the same recipe and seed 0"),
         (["plan", "run", "--control", "mpc", "--out", "new.csv"], "leave out --control"),
         (["plan", "run", "--scenario", "crisis", "--out", "new.csv"], "a run has its own scenario"),
-        (["pareto", "bottles.toml", "--agents", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
-        (["train", "bottles.toml", "--agents", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
+        (["pareto", "bottles.toml", "--recipe", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
+        (["train", "bottles.toml", "--recipe", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
         (["compare", "run", "--out", "recipe.toml"], "is a file, not a folder"),
     ):
         assert run(monkeypatch, *arguments) == 2
@@ -497,7 +499,7 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
             "the program of MPC for decisions 16 to 59",
         ),
         (["pareto", "bottles.toml", "--out", "new"], 4, "the program of the bound with a mean service level of"),
-        (["pareto", "bottles.toml", "--agents", "independent_a2c", "--out", "new"], 0, "with a service weight of"),
+        (["pareto", "bottles.toml", "--recipe", "independent_a2c", "--out", "new"], 0, "with a service weight of"),
     ],
 )
 def test_solver_that_fails(
@@ -555,7 +557,8 @@ def test_simulate_with_inner_physics(
     [
         (["show", "coper_net"], "unknown network 'coper_net'. Did you mean 'copper_net'?"),
         (["show", "copper_net", "--scenario", "papr"], "unknown scenario 'papr'. Did you mean 'paper'?"),
-        (["train", "copper_net", "--agents", "independent_pp"], "Did you mean 'independent_ppo'?"),
+        (["train", "copper_net", "--recipe", "independent_pp"], "Did you mean 'independent_ppo'?"),
+        (["train", "copper_net", "--agents", "mine, ues"], "Did you mean 'use'?"),
         (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
         (["train"], "train needs NETWORK, or --resume RUN"),
         (["train", "--resume", "nowhere"], "no run in nowhere (it has no config.json)"),
@@ -590,7 +593,7 @@ def test_simulate_with_inner_physics(
         (["paper", "CoperNet"], "unknown environment of the paper 'CoperNet'. Did you mean 'CopperNet'?"),
         (["paper", "CopperNet", "A2"], "unknown algorithm of the paper 'A2'. Did you mean 'A2C'?"),
         (["paper", "CopperNet", "SAC-HER"], "did not run SAC-HER on CopperNet; it ran A2C, ARS, DDPG, PPO, SAC"),
-        (["paper", "CopperNet", "--recipe", "tund"], "unknown recipe 'tund'. Did you mean 'tuned'?"),
+        (["paper", "CopperNet", "--settings", "tund"], "unknown settings 'tund'. Did you mean 'tuned'?"),
     ],
 )
 def test_bad_input_ends_with_code_2(

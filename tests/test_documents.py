@@ -60,7 +60,7 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     exec(compile(code, "README.md", "exec"), names)
-    assert "PPO" in type(names["training"].trainees["mine"].model).__name__  # type: ignore[attr-defined]
+    assert "PPO" in type(names["training"].learners["mine"].model).__name__  # type: ignore[attr-defined]
     assert (tmp_path / "runs" / "mine" / "status.json").is_file()
 
 
@@ -103,7 +103,7 @@ def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
     )
     path.write_text(whole)
     training = train("copper_net", path, steps=1280)
-    assert type(training.trainees["mine"].model).__name__ == "SAC"
+    assert type(training.learners["mine"].model).__name__ == "SAC"
     path.write_text(whole + addition)
     assert load_recipe(path).match[1].algorithm == "TQC"
 

@@ -30,7 +30,7 @@ def list_networks() -> None:
     from cirl_marl.report.tables import networks_table
 
     console.print(networks_table({name: load_network(name) for name in networks()}))
-    console.print(f"recipes for --agents: {', '.join(recipes())}")
+    console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
 
 @app.command()
@@ -68,8 +68,7 @@ def show(
 @app.command()
 def check(
     sources: Annotated[
-        list[str],
-        typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue."),
+        list[str], typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue.")
     ],
     network: Annotated[
         str | None, typer.Option(help="Check that recipes fit this network too: scenario, agents, matches, algorithms.")
@@ -121,10 +120,10 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
     from cirl_marl.learners.launch import prepared
 
     try:
-        trainees = prepared(network, recipe).trainees.values()
+        learners = prepared(network, recipe).learners.values()
     except CirlError as error:
         raise CirlError(f"{source} in {network.name}: {error}") from error
-    busy = {id(trainee.spec) for trainee in trainees}
+    busy = {id(learner.spec) for learner in learners}
     return [where for where, learner in recipe.learners()[1:] if id(learner) not in busy]
 
 

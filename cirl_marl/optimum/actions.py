@@ -69,5 +69,4 @@ def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
 
 
 def _ratio(amount: Floats, unit: Floats, otherwise: Floats) -> Floats:
-    ratio: Floats = np.divide(amount, unit, out=otherwise.copy(), where=unit > 1e-12 * np.abs(amount))
-    return ratio
+    return np.divide(amount, unit, out=otherwise.copy(), where=unit > 1e-12 * np.abs(amount))

@@ -65,8 +65,7 @@ class _Plan:
         """Return the planned mean service level of each interval, shape (intervals,)."""
         layout = self.problem.layout
         levels = self.solution.plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
-        mean: Floats = levels.mean(axis=1) if levels.size else np.ones(len(levels))
-        return mean
+        return levels.mean(axis=1) if levels.size else np.ones(len(levels))
 
     def prices(self) -> Floats:
         """Return what the rows of the next interval charge for the stocks at the end of each, shape (intervals, nodes).

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from cirl_marl.network import Floats
-from cirl_marl.optimum.layout import Layout, Row
+from cirl_marl.optimum.layout import Layout, MatrixRow
 
 
-def measures(layout: Layout) -> Iterator[Row]:
+def measures(layout: Layout) -> Iterator[MatrixRow]:
     """Yield low·level − q ≤ 0 for each service, and ±Δ·σ_env·f̄ − imbalance ≤ 0.
 
     The level is at most min(1, q/low): a finite upper end of the band could only lower it further.

@@ -16,10 +16,10 @@ from scipy import sparse
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout, Link, Row, matrix_of, start_of
+from cirl_marl.optimum.layout import Layout, Link, MatrixRow, matrix_of, start_of
 from cirl_marl.optimum.monotone import falls
 from cirl_marl.optimum.objective import measures, objective
-from cirl_marl.optimum.reach import Comparison, Reach
+from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.scheduled import deliveries, openings
 
 
@@ -51,8 +51,7 @@ class Program:
 
     def interval_of_rows(self, matrix: Any) -> Integers:
         """Return the last interval whose variables each row of A or G is about, shape (rows,)."""
-        intervals: Integers = np.maximum.reduceat(matrix.indices, matrix.indptr[:-1]) // self.layout.size
-        return intervals
+        return np.maximum.reduceat(matrix.indices, matrix.indptr[:-1]) // self.layout.size
 
 
 class Programs:
@@ -76,8 +75,8 @@ class Programs:
                 and bounds nothing.
         """
         self.admissible = admissible
-        self._comparison = Comparison(admissible)
-        self.layout = layout = _layout(admissible, self._comparison.substeps, degree)
+        self._system = ComparisonSystem(admissible)
+        self.layout = layout = _layout(admissible, self._system.substeps, degree)
         equal, under = _laws(admissible, layout)
         if held:
             equal += _held(admissible, layout)
@@ -100,7 +99,7 @@ class Programs:
         layout, network = self.layout, self.admissible.network
         when = range(network.episode.horizon) if intervals is None else intervals
         steps = len(when)
-        reached = self._comparison.reach(initial, when)
+        reached = self._system.reach(initial, when)
         equal, equal_to = self._equal.over(steps, initial)
         under, under_to = self._under.over(steps, initial)
         opened, opened_to = openings(self.admissible, reached, layout, when)
@@ -138,7 +137,7 @@ def _layout(admissible: Admissible, pieces: int, degree: int) -> Layout:
 class _Chained:
     """Rows that are repeated in every interval, some of which link it to the interval before."""
 
-    def __init__(self, linked: Sequence[Link], alone: Sequence[Row], layout: Layout) -> None:
+    def __init__(self, linked: Sequence[Link], alone: Sequence[MatrixRow], layout: Layout) -> None:
         """Take the rows of an interval.
 
         Args:
@@ -178,7 +177,7 @@ def _balances(layout: Layout) -> list[Link]:
         piece, i = divmod(j, d + 1)
         for node in range(len(network.nodes)):
             row = _lower_degree(layout, j, node, 1.0)
-            before: Row = []
+            before: MatrixRow = []
             if i > 0:
                 row += _lower_degree(layout, j - 1, node, -1.0)
             else:
@@ -201,12 +200,12 @@ def _lower_degree(layout: Layout, moment: int, node: int, sign: float) -> list[t
     ]
 
 
-def _laws(admissible: Admissible, layout: Layout) -> tuple[list[Row], list[Row]]:
+def _laws(admissible: Admissible, layout: Layout) -> tuple[list[MatrixRow], list[MatrixRow]]:
     """Return the rows of the flow laws: those equal to 0 and those at most 0."""
     network = admissible.network
     position = {int(node): z for z, node in enumerate(layout.valves)}
-    equal: list[Row] = []
-    under: list[Row] = []
+    equal: list[MatrixRow] = []
+    under: list[MatrixRow] = []
 
     def hold(column: int, driver: int, low: float, high: float) -> None:
         """Hold low·driver ≤ column ≤ high·driver."""
@@ -231,7 +230,7 @@ def _laws(admissible: Admissible, layout: Layout) -> tuple[list[Row], list[Row]]
     return equal, under
 
 
-def _held(admissible: Admissible, layout: Layout) -> list[Row]:
+def _held(admissible: Admissible, layout: Layout) -> list[MatrixRow]:
     """Return F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z.
 
     For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.

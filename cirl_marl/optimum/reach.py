@@ -37,7 +37,7 @@ class Reach:
     uncut: NDArray[np.bool_]
 
 
-class Comparison:
+class ComparisonSystem:
     """The comparison system, advanced by the substeps of the simulator, in which scheduled flows are constant.
 
     Attributes:

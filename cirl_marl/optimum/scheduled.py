@@ -9,7 +9,7 @@ from scipy import sparse
 
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout, Link, Row, matrix_of, start_of
+from cirl_marl.optimum.layout import Layout, Link, MatrixRow, matrix_of, start_of
 from cirl_marl.optimum.reach import Reach
 
 
@@ -41,11 +41,11 @@ def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: 
     (v − v̲)(x̄ − X) ≥ 0 gives Z − v̲ X − x̄ v ≤ −v̲ x̄ (McCormick 1976).
     """
     network, steps = admissible.network, len(intervals)
-    fixed: list[Row] = []
+    fixed: list[MatrixRow] = []
     columns: list[int] = []
     weights, limits = [np.zeros((steps, 0))], [np.zeros((steps, 0))]
 
-    def hold(row: Row, opening: int, weight: Floats, to: Floats) -> None:
+    def hold(row: MatrixRow, opening: int, weight: Floats, to: Floats) -> None:
         """Hold row + weight_t·v ≤ to_t in each interval t."""
         fixed.append(row)
         columns.append(opening)

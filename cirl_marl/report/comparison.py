@@ -14,7 +14,7 @@ from cirl_marl.evaluation.comparison import FIGURES, Comparison, Entry
 from cirl_marl.evaluation.provenance import provenance
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, defined
 from cirl_marl.records.files import published, write_json, write_table
-from cirl_marl.report.fronts import Series, save_fronts
+from cirl_marl.report.fronts import PointSeries, save_fronts
 
 FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
 
@@ -75,7 +75,7 @@ def _aggregate(found: Aggregate | None, form: str) -> str:
 def save_comparison(path: str | Path, comparison: Comparison) -> Path:
     """Save where each policy and controller of a comparison is, training seed by training seed."""
     series = [
-        Series(
+        PointSeries(
             row.name,
             np.array([entry.service.mean() for entry in row.entries]),
             np.array([entry.circularity.mean() for entry in row.entries]),
