@@ -64,6 +64,14 @@ def test_links_lead_somewhere(document: Path) -> None:
             assert heading in {anchor(line) for line in re.findall(r"^#+ (.*)$", found.read_text(), re.M)}, target
 
 
+def test_pictures_are_shown_and_small() -> None:
+    """Each picture stands in a document and loads at once."""
+    shown = {target for path in DOCUMENTS for target in re.findall(r"pictures/([\w.]+)\)", path.read_text())}
+    pictures = list((ROOT / "docs" / "pictures").iterdir())
+    assert {picture.name for picture in pictures} == shown
+    assert [picture.name for picture in pictures if picture.stat().st_size > 150_000] == []
+
+
 @each_document
 def test_measured_sections_have_content(document: Path) -> None:
     """Every mark ``<!-- name -->`` has its end, and between them stands what was measured."""
