@@ -593,7 +593,7 @@ def test_simulate_with_inner_physics(
         (["paper", "CoperNet"], "unknown environment of the paper 'CoperNet'. Did you mean 'CopperNet'?"),
         (["paper", "CopperNet", "A2"], "unknown algorithm of the paper 'A2'. Did you mean 'A2C'?"),
         (["paper", "CopperNet", "SAC-HER"], "did not run SAC-HER on CopperNet; it ran A2C, ARS, DDPG, PPO, SAC"),
-        (["paper", "CopperNet", "--settings", "tund"], "unknown settings 'tund'. Did you mean 'tuned'?"),
+        (["paper", "CopperNet", "--recipe", "tund"], "unknown settings 'tund'. Did you mean 'tuned'?"),
     ],
 )
 def test_bad_input_ends_with_code_2(

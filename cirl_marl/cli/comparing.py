@@ -46,7 +46,7 @@ def compare(
     """Compare trained runs and controllers on the same fresh episodes, and with the best possible.
 
     Runs of one recipe with different seeds share a row: the interquartile mean over seeds with its bootstrap interval.
-    The gap to the bound is to the highest circularity of any episode from the same start that serves at least as well.
+    The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     mpc and optimum solve linear programs for every episode: minutes for each on the larger networks.
     Where nothing bounds a network, optimum is the best plan that a search by simulation finds, without certificate.
     """

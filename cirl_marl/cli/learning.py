@@ -76,7 +76,7 @@ def train(
 def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     """Compare the trained policies with neutral and random control on fresh seeds, and with the best possible.
 
-    The gap to the bound is to the highest circularity of any episode from the same start that serves at least as well.
+    The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     """
     from cirl_marl.learners.run import RunDirectory
     from cirl_marl.report.run import evaluate_run
@@ -102,7 +102,9 @@ def paper(
     algorithm: Annotated[str | None, typer.Argument(metavar="ALGORITHM", help="Such as A2C; default: all.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; default: the paper's.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="How many seeds: 0, 1, …")] = 1,
-    settings: Annotated[str, typer.Option(help="published: the paper's; tuned: our recipes.")] = "published",
+    settings: Annotated[
+        str, typer.Option("--recipe", help="published: the paper's settings; tuned: our recipes.")
+    ] = "published",
     episodes: Annotated[
         int | None, typer.Option(min=1, help="Evaluation episodes; default: 100, where successes count the paper's.")
     ] = None,

@@ -42,7 +42,7 @@ class Entry:
         checkpoint: name of the checkpoint that acted; empty if nothing was trained.
         rollout: its episodes.
         gain: circularity gain over neutral control from the same start, shape (episodes,).
-        bound: the highest λ̄ of any episode from the same start with at least the same mean service level, shape
+        bound: what no λ̄ of an episode from the same start with at least the same mean service level exceeds, shape
             (episodes,), mass; None if nothing is proved.
     """
 

@@ -33,7 +33,7 @@ def planned(
         CirlError: for a name that does not exist, or a combination that the paper did not run.
     """
     if settings is not None and settings not in SETTINGS:
-        raise CirlError(f"--settings: {unknown('settings', settings, SETTINGS)}")
+        raise CirlError(f"--recipe: {unknown('settings', settings, SETTINGS)}")
     if environment in ALGORITHMS:
         raise CirlError(f"{environment} is an algorithm, which comes after an environment: {', '.join(ENVIRONMENTS)}")
     if algorithm is not None and algorithm not in ALGORITHMS:

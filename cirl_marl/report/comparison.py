@@ -55,7 +55,7 @@ def comparison_notes(comparison: Comparison) -> list[str]:
     if any(row.few for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
     if comparison.yardstick.envelope is not None:
-        notes.append("bound: the highest λ̄ of any episode from the same start with at least the same service")
+        notes.append("bound: no episode from the same start with at least the same service has a higher λ̄")
     elif comparison.yardstick.reason:
         notes.append(f"gap to bound: {comparison.yardstick.reason}")
         if any(row.name == "optimum" for row in comparison.rows):
