@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from cirl_marl import Network, load_network
+from cirl_marl import CirlError, Network, load_network
 from cirl_marl.optimum import Certificate, achieved, bound
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verified
@@ -69,3 +69,14 @@ def _if_signs_were_trusted(problem: Program, multipliers: Certificate) -> float:
     reduced = problem.cost - problem.equal.T @ y - problem.under.T @ mu
     charged = np.minimum(reduced * problem.low, reduced * problem.high)
     return problem.constant - float(problem.equal_to @ y + problem.under_to @ mu + charged.sum())
+
+
+@pytest.mark.parametrize(("rows", "row"), [("equal", 3), ("under", 5)])
+def test_a_multiplier_that_is_no_number_is_refused(rows: str, row: int) -> None:
+    """NaN would make the bound NaN, which is not exceeded by any number either; the error names its row."""
+    best = bound("carbo_net", degree=1, horizon=2)
+    multipliers = getattr(best.certificate, rows).copy()
+    multipliers[row] = np.nan
+    broken = replace(best, certificate=replace(best.certificate, **{rows: multipliers}))
+    with pytest.raises(CirlError, match=rf"row {row}\b"):
+        broken.verify()
