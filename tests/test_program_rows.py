@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, VectorEnv
-from cirl_marl.optimum import NoCertificate
+from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.program import Program, Programs
@@ -378,6 +378,24 @@ def test_pulls_are_bounded_with_the_most_that_may_pull() -> None:
     network = Network(name="pulled", nodes=nodes, arcs=arcs, episode=Episode(control_interval=0.5, horizon=1))
     with pytest.raises(NoCertificate, match="more from node 'reserve' than it holds"):
         Programs(Admissible.of(network), 1, None).program(np.array([5.0, 1.0, 500.0]))
+
+
+@pytest.mark.parametrize(("agents", "least"), [(["mine"], 0.3), (["mining"], 0.6), (["mine", "mining"], 0.2)])
+def test_who_does_not_act_is_neutral(agents: list[str], least: float) -> None:
+    """The least that can be mined is v·w·a·x with the neutral factor of whoever does not act, not with its least."""
+    mine = Control(kind=ControlKind.RATE, low=0.25, neutral=0.75, high=1.0)
+    mining = Control(kind=ControlKind.RATE, low=0.8, neutral=1.2, high=2.0)
+    network = Network(
+        name="mine",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0), control=mine),
+            Node(id="use"),
+        ),
+        arcs=(Arc(id="mining", donor="mine", recipient="use", rate=1.0, control=mining),),
+        episode=Episode(control_interval=0.5, horizon=3),
+    )
+    found = bound(network, agents=agents, degree=4).objective
+    assert found == pytest.approx(100 * math.expm1(-1.5 * least) / 1.5, rel=1e-6)
 
 
 def test_the_most_that_is_delivered() -> None:
