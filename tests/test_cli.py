@@ -73,30 +73,36 @@ def test_check_has_nothing_to_say_of_the_catalogue(
 
 
 def test_check_names_every_mistake(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Mistakes of different kinds in one file are all named, with key and nearest name; the exit code is 2."""
-    good = (folder("envs") / "copper_net.toml").read_text()
-    bad = good.replace('law = "controlled"', 'law = "controled"').replace(
-        'unit = "kt/day", source = "neutral', 'unit = "kg", source = "neutral'
+    """Mistakes of different kinds in one file are all named, with key and nearest name; the exit code is 2.
+
+    Units are read once all keys are known, and how the compartments fit together once every value can be read; each
+    time all that is wrong is named.
+    """
+    bad = (folder("envs") / "copper_net.toml").read_text()
+    planted = (
+        ("reference_interval", "reference_intervall", "'reference_intervall'. Did you mean 'reference_interval'?"),
+        ('law = "controlled"', 'law = "controled"', "'controled'. Did you mean 'controlled'?"),
+        ('unit = "kt/day", source = "neutral', 'unit = "kg", source = "neutral', "control: unit 'kg' is inconsistent"),
+        (
+            'to = "landfill"',
+            'to = "landfil"',
+            "to: unknown node 'landfil'. Did you mean 'landfill'?",
+        ),
+        ('provider = "use"', 'provider = "us"', "provider: unknown node 'us'. Did you mean 'use'?"),
     )
-    bad = bad.replace('to = "landfill"', 'to = "landfil"').replace("reference_interval", "reference_intervall")
-    bad = bad.replace(
-        "[nodes.mine]", "reference_interval = { value = 1, unit = 'day', source = 's' }\n\n[nodes.mine]", 0
-    )
-    Path("bad.toml").write_text(bad)
-    assert run(monkeypatch, "check", "bad.toml", str(folder("envs") / "carbo_net.toml")) == 2
-    captured = capsys.readouterr()
-    assert "no mistakes" in captured.out
-    for part in (
-        "bad.toml",
-        "'controled'. Did you mean 'controlled'?",
-        "'reference_intervall'. Did you mean 'reference_interval'?",
-    ):
-        assert part in captured.err
-    Path("bad.toml").write_text(bad.replace("reference_intervall", "reference_interval"))
-    assert run(monkeypatch, "check", "bad.toml") == 2
-    found = capsys.readouterr().err
-    assert "'controled'. Did you mean 'controlled'?" in found
-    assert "arcs.use_to_collection.control: unit 'kg' is inconsistent" in found
+    for right, wrong, _ in planted:
+        assert right in bad
+        bad = bad.replace(right, wrong)
+    for corrected, named in (((), {0, 1}), ((0,), {1, 2}), ((1, 2), {3, 4})):
+        for place in corrected:
+            right, wrong, _ = planted[place]
+            bad = bad.replace(wrong, right)
+        Path("bad.toml").write_text(bad)
+        assert run(monkeypatch, "check", "bad.toml", str(folder("envs") / "carbo_net.toml")) == 2
+        captured = capsys.readouterr()
+        assert "no mistakes" in captured.out
+        assert "bad.toml" in captured.err
+        assert {place for place, (_, _, said) in enumerate(planted) if said in captured.err} == named, captured.err
     assert run(monkeypatch, "check", "missing.toml") == 2
     assert "missing.toml: no such file" in capsys.readouterr().err
 
