@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from cirl_marl import Arc, Episode, Law, Network, Node, VectorEnv
-from cirl_marl.compartments import RewardState
+from cirl_marl.compartments import ContinuousModel, Outflowing, OwnStepModel, RewardState
 from cirl_marl.network import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Decay:
+class _Decay(Outflowing):
     """ż = −k z, k = 0.1/h; z is given off."""
 
     kind: ClassVar[str] = "decay"
@@ -35,19 +35,21 @@ class _Decay:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Continuous(_Decay):
+class _Continuous(_Decay, ContinuousModel):
     """Its derivative is integrated."""
 
-    def derivative(self, state: Floats, inputs: Floats) -> Floats:
+    def derivative(self, state: Floats, inputs: Floats, *_: Any, **context: Any) -> Floats:
         """Return −k z, per hour."""
         return -0.1 * state
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _OwnStep(_Decay):
+class _OwnStep(_Decay, OwnStepModel):
     """It moves by itself."""
 
-    def advance(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
+    def integrate(
+        self, state: Floats, inputs: Floats, interval: float, *_: Any, **context: Any
+    ) -> tuple[Floats, Floats]:
         """Return z e^{−kt} and its mean over t hours."""
         turned_over = 0.1 * interval
         return state * math.exp(-turned_over), -state[0] * math.expm1(-turned_over) / turned_over
