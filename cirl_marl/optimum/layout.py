@@ -61,6 +61,7 @@ class Layout:
 
     def stock(self, moment: int) -> int:
         """Return the first of the weighted mean stocks X."""
+        # each piece: d + 1 blocks of (X, F, Z), equally long, then the stocks at its end
         piece, i = divmod(moment, self.degree + 1)
         return piece * self.piece + i * ((self.piece - len(self.network.nodes)) // (self.degree + 1))
 

@@ -77,6 +77,7 @@ class _Plan:
         layout = problem.layout
         charged = np.zeros(len(problem.cost))
         for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
+            # entry (row, column): the row belongs to the last interval that it touches, the column to its own
             entries = matrix.tocoo()
             own = entries.col // layout.size
             ends = entries.col - own * layout.size

@@ -22,7 +22,7 @@ def measures(layout: Layout) -> Iterator[MatrixRow]:
         else:
             arcs = network.metered(service)
             measured = [(layout.flow(i) + int(k), -1.0 / count) for i in layout.moments for k in arcs]
-        yield [(layout.level + s, service.low), *measured]
+        yield [(layout.level + s, service.low), *measured]  # level ≤ q/low; level ≤ 1 is a box
     weights = -network.circularity_weights[1]
     counted = [(i, int(k)) for i in layout.moments for k in np.flatnonzero(weights)]
     for sign in (1.0, -1.0):

@@ -97,6 +97,7 @@ class Programs:
             NoCertificate: if recipients may pull more from a node than it holds.
         """
         layout, network = self.layout, self.admissible.network
+        # the moments are means over the interval, so a row of the mean over the episode weighs each by 1/steps
         when = range(network.episode.horizon) if intervals is None else intervals
         steps = len(when)
         reached = self._system.reach(initial, when)
@@ -154,9 +155,11 @@ class _Chained:
     def over(self, steps: int, initial: Floats) -> tuple[Any, Floats]:
         """Return the matrix over ``steps`` intervals, interval after interval, and the right-hand side."""
         if steps not in self._known:
+            # block (t, t) holds the rows of interval t, block (t, t − 1) reaches back for the stocks it starts from
             once, shifted = sparse.eye_array(steps), sparse.eye_array(steps, k=-1)
             linked = sparse.kron(once, self._now) + sparse.kron(shifted, self._before)
             self._known[steps] = sparse.vstack([linked, sparse.kron(once, self._alone)], format="csr")
+        # there is no interval before the first: its entries meet known stocks and go to the right-hand side
         layout, matrix = self._layout, self._known[steps]
         first = np.zeros(layout.size)
         first[layout.end(-1) : layout.level] = initial
@@ -176,7 +179,7 @@ def _balances(layout: Layout) -> list[Link]:
     for j in layout.moments:
         piece, i = divmod(j, d + 1)
         for node in range(len(network.nodes)):
-            row = _lower_degree(layout, j, node, 1.0)
+            row = _lower_degree(layout, j, node, 1.0)  # Y_i − Y_{i−1} = δ/(d + 1)·S F_i (theorem 1)
             before: MatrixRow = []
             if i > 0:
                 row += _lower_degree(layout, j - 1, node, -1.0)
@@ -190,6 +193,7 @@ def _balances(layout: Layout) -> list[Link]:
 
 
 def _lower_degree(layout: Layout, moment: int, node: int, sign: float) -> list[tuple[int, float]]:
+    """Return sign·Y_i, the mean weighted with B_i^{d−1} raised to degree d; Y_d is the stock at the end of the piece."""
     d = layout.degree
     piece, i = divmod(moment, d + 1)
     if i == d:
@@ -216,13 +220,14 @@ def _laws(admissible: Admissible, layout: Layout) -> tuple[list[MatrixRow], list
 
     for i in layout.moments:
         first = i - i % (layout.degree + 1)
-        if i > first:
+        if i > first:  # a scheduled flow is constant in its piece: F_i = F_0
             for k in np.flatnonzero(admissible.scheduled):
                 equal.append([(layout.flow(i) + int(k), 1.0), (layout.flow(first) + int(k), -1.0)])
         for node, z in position.items():
             hold(layout.valve(i) + z, layout.stock(i) + node, *admissible.valve[:, node])
         for k in np.flatnonzero(~admissible.scheduled):
             donor, driver = int(network.donors[k]), int(admissible.driver[k])
+            # behind a valve that several outflows share F_i = w·a·Z_i with Z_i = v·X_i; else F_i = v·w·a·X_i
             through_valve = donor == driver and donor in position
             factor = admissible.own[:, k] if through_valve else admissible.factor[:, k]
             column = layout.valve(i) + position[donor] if through_valve else layout.stock(i) + driver
@@ -257,6 +262,7 @@ def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: rang
     low, high = np.zeros((2, len(intervals), layout.size))
     scheduled = admissible.scheduled
     rates = admissible.factor[:, None] * admissible.base[intervals.start : intervals.stop]
+    # no weighted mean exceeds the supremum: F ≤ r̄·x̄_p, and U ≤ ū; U ≥ u̲ only where nothing is ever cut
     most = rates[1] * np.where(scheduled, 1.0, reached.upper[:, admissible.driver])
     least = np.where(scheduled & reached.uncut, rates[0], 0.0)
     for i in layout.moments:

@@ -23,6 +23,7 @@ def deliveries(admissible: Admissible, layout: Layout) -> list[Link]:
     by_donor = admissible.driver == network.donors
     least = np.bincount(network.donors, weights=admissible.rate(0)[0] * by_donor, minlength=len(network.nodes))
     turned_over = least * layout.length
+    # U·δ ≤ x_start·z/(e^z − 1); the factor falls with z, so the least rate of the exits gives the weakest, valid row
     share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(len(least)), where=turned_over > 1e-9)
     links: list[Link] = []
     for piece in range(layout.pieces):
@@ -65,6 +66,7 @@ def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: 
             for piece in range(layout.pieces):
                 flow = layout.flow(piece * (layout.degree + 1)) + int(k)
                 hold([(flow, 1.0)], opening, -capacity, np.zeros(steps))
+    # x̄ and ū differ from interval to interval: the entries of v are laid in one by one, row (t, r), column of v in t
     varying = np.concatenate(weights, axis=1)
     entries = layout.size * np.arange(steps)[:, None] + np.array(columns, dtype=np.intp)
     shape = (varying.size, steps * layout.size)
