@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service
-from cirl_marl.definitions.reading import read_network
+from cirl_marl.definitions.reading import Definition
 from cirl_marl.dynamics.motion import Dynamics
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def bottles(tmp_path_factory: pytest.TempPathFactory) -> Network:
     text = GUIDE.read_text().split("```toml\n")[1].split("```")[0]
     path = tmp_path_factory.mktemp("definition") / "bottles.toml"
     path.write_text(text.replace("horizon = { value = 60", "horizon = { value = 14"))
-    return read_network(path)
+    return Definition(path).network()
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from imports import arrows, modules, rooms
 
 import cirl_marl
 from cirl_marl import cli
-from cirl_marl.definitions.reading import read_network
+from cirl_marl.definitions.reading import Definition
 from cirl_marl.learners import load_recipe, train
 
 ROOT = Path(__file__).parent.parent
@@ -267,7 +267,7 @@ def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The whole network shown to newcomers reads without a mistake and can be run."""
     definition = tmp_path / "bottles.toml"
     definition.write_text(blocks((ROOT / "envs" / "README.md").read_text(), "toml")[0])
-    network = read_network(definition)
+    network = Definition(definition).network()
     env = cirl_marl.parallel_env(network)
     env.reset(seed=0)
     env.step({agent: [0.0] for agent in env.agents})

@@ -14,6 +14,7 @@ from cirl_marl.controllers import Controller
 from cirl_marl.controllers.rollout import Rollout, interval_ends, rollout
 from cirl_marl.controllers.watched import Watched
 from cirl_marl.definitions.catalogue import load_network, networks, recipes
+from cirl_marl.definitions.reading import Definition
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.figures import time_window
@@ -131,6 +132,8 @@ def _check_network(source: str) -> None:
     from cirl_marl.controllers.remarks import remarks
 
     network = load_network(source)
+    assert network.source is not None
+    Definition(network.source).check()
     for each in (network, *network.scenarios.values()):
         try:
             VectorEnv(each, num_envs=1)  # finds what only a network that is run says, as rates no solver can follow

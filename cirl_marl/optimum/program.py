@@ -97,7 +97,6 @@ class Programs:
             NoCertificate: if recipients may pull more from a node than it holds.
         """
         layout, network = self.layout, self.admissible.network
-        # the moments are means over the interval, so a row of the mean over the episode weighs each by 1/steps
         when = range(network.episode.horizon) if intervals is None else intervals
         steps = len(when)
         reached = self._system.reach(initial, when)
@@ -193,7 +192,7 @@ def _balances(layout: Layout) -> list[Link]:
 
 
 def _lower_degree(layout: Layout, moment: int, node: int, sign: float) -> list[tuple[int, float]]:
-    """Return sign·Y_i, the mean weighted with B_i^{d−1} raised to degree d; Y_d is the stock at the end of the piece."""
+    """Return sign·Y_i, the mean weighted with B_i^{d−1}, raised to degree d; Y_d is the stock at the end."""
     d = layout.degree
     piece, i = divmod(moment, d + 1)
     if i == d:
