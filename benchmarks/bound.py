@@ -23,7 +23,7 @@ from cirl_marl import VectorEnv
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.evaluation.comparison import starting_stocks
-from cirl_marl.optimum import Bound, Envelope, Incumbent, Plan, achieved, bound, envelope, improved, search
+from cirl_marl.optimum import Bound, Envelope, Incumbent, Plan, achieved, bound, envelope, gap, improved, search
 from cirl_marl.optimum.mpc import MPC
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "bound.md"
@@ -161,9 +161,9 @@ def _plan(name: str, degree: int) -> Rows:
     found = bound(name, min_service=SERVICE, degree=degree)
     seconds = time.process_time() - began
     better = improved(found)
-    gap = found.gap(achieved(better).episode_circularity)[0]
+    left = found.gap(achieved(better).episode_circularity)[0]
     shown = f"{found.objective:.6g} {found.network.mass_unit}"
-    yield _row((name, degree, shown, f"{seconds:.0f}", _achieved(found), _achieved(better), _percent(gap)))
+    yield _row((name, degree, shown, f"{seconds:.0f}", _achieved(found), _achieved(better), _percent(left)))
 
 
 def _price(name: str) -> Rows:
@@ -245,10 +245,10 @@ def _mpc(name: str, horizon: int | None) -> Rows:
         run, label = rollout(env, MPC(horizon=horizon, min_service=SERVICE)), f"MPC, horizon={horizon}"
     seconds = time.process_time() - began
     proved = envelope(name, starts, min_service=SERVICE).at(starts, np.minimum(1.0, run.episode_service))
-    gap = (proved - run.episode_circularity) / np.abs(proved)
+    gaps = gap(proved, run.episode_circularity)
     service = run.episode_service
-    gaps = f"{_percent(gap.min())} to {_percent(gap.max())}"
-    yield _row((name, label, f"{service.min():.4f}", f"{service.max():.4f}", gaps, f"{seconds:.0f}"))
+    shown = f"{_percent(gaps.min())} to {_percent(gaps.max())}"
+    yield _row((name, label, f"{service.min():.4f}", f"{service.max():.4f}", shown, f"{seconds:.0f}"))
 
 
 def _achieved(plan: Bound) -> str:

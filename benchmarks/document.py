@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import cirl_marl
@@ -25,6 +25,19 @@ def write_sections(document: Path, sections: Mapping[str, str]) -> None:
         before, rest = text.split(start, 1)
         text = f"{before}{start}\n{section}\n{end}{rest.split(end, 1)[1]}"
     write_atomically(document, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Write a table in Markdown.
+
+    >>> print(markdown_table(("a", "b"), [("1", "2")]))
+    | a | b |
+    |-|-|
+    | 1 | 2 |
+    """
+    lines = ("| " + " | ".join(cells) + " |" for cells in (columns, *rows))
+    head, *body = lines
+    return "\n".join([head, "|" + "-|" * len(columns), *body])
 
 
 def made_with() -> str:

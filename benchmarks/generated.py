@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from cirl_marl.environments.vector import Infos, VectorEnv
-from cirl_marl.learners.learner import Trainee
+from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.lockstep import Lockstep
 from cirl_marl.learners.recipe import Recipe
 from cirl_marl.learners.seat import Seat
@@ -156,36 +156,36 @@ def lone_seat(env: FreeEnv, agent: str) -> Seat:
 def learn_together(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weights]:
     """Let every agent learn for ``steps`` in lockstep; return the seconds it took, without set-up, and the weights."""
     hub = Lockstep(env, range(env.num_envs))
-    trainees = {agent: _trainee(seat, recipe, env) for agent, seat in hub.seats.items()}
+    learners = {agent: _built(seat, recipe, env) for agent, seat in hub.seats.items()}
     began = time.perf_counter()
     hub.run(
-        learners={agent: _learning(trainee, steps) for agent, trainee in trainees.items()},
-        actors={agent: trainee.act for agent, trainee in trainees.items()},
-        streams={agent: trainee.streams for agent, trainee in trainees.items()},
-        budgets={agent: trainee.budget(steps) for agent, trainee in trainees.items()},
+        learners={agent: _learning(learner, steps) for agent, learner in learners.items()},
+        actors={agent: learner.act for agent, learner in learners.items()},
+        streams={agent: learner.streams for agent, learner in learners.items()},
+        budgets={agent: learner.budget(steps) for agent, learner in learners.items()},
     )
-    return time.perf_counter() - began, _weights(trainees.values())
+    return time.perf_counter() - began, _weights(learners.values())
 
 
 def learn_alone(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weights]:
     """Call the algorithm's own ``learn()`` for one agent after another; return what ``learn_together`` does."""
-    trainees = [_trainee(lone_seat(env, agent), recipe, env) for agent in env.agents]
+    learners = [_built(lone_seat(env, agent), recipe, env) for agent in env.agents]
     seconds = 0.0
-    for trainee in trainees:
-        with trainee.streams.active():
+    for learner in learners:
+        with learner.streams.active():
             began = time.perf_counter()
-            trainee.model.learn(steps)
+            learner.model.learn(steps)
             seconds += time.perf_counter() - began
-    return seconds, _weights(trainees)
+    return seconds, _weights(learners)
 
 
-def _trainee(seat: Seat, recipe: Recipe, env: FreeEnv) -> Trainee:
-    return Trainee(seat, recipe.learner_of(seat.name, env.network), 0).build()
+def _built(seat: Seat, recipe: Recipe, env: FreeEnv) -> Learner:
+    return Learner(seat, recipe.learner_of(seat.name, env.network), 0).build()
 
 
-def _learning(trainee: Trainee, steps: int) -> Callable[[], None]:
-    return lambda: trainee.learn(steps, None)
+def _learning(learner: Learner, steps: int) -> Callable[[], None]:
+    return lambda: learner.learn(steps, None)
 
 
-def _weights(trainees: Iterable[Trainee]) -> Weights:
-    return [value.numpy().copy() for trainee in trainees for value in trainee.model.policy.state_dict().values()]
+def _weights(learners: Iterable[Learner]) -> Weights:
+    return [value.numpy().copy() for learner in learners for value in learner.model.policy.state_dict().values()]

@@ -23,11 +23,12 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from benchmarks.paper_document import markdown
 from cirl_marl.errors import CirlError
-from cirl_marl.paper.document import markdown
-from cirl_marl.paper.plan import minutes, overview, planned, study
-from cirl_marl.paper.results import Results, Row
+from cirl_marl.paper.published import BOX_ALGORITHMS, GOAL_ALGORITHMS
+from cirl_marl.paper.results import PaperRow, Results
 from cirl_marl.paper.running import outdated
+from cirl_marl.paper.selection import minutes, overview, planned
 from cirl_marl.paper.session import live_bar
 from cirl_marl.paper.table import result_line
 
@@ -35,6 +36,8 @@ console = Console(width=None if sys.stdout.isatty() else 140)
 processes = get_context("spawn")
 PHASES = ("waiting", "training", "evaluating")
 KEPT = Path(__file__).parent / "results" / "paper"
+FAST = ("ARS", "PPO", "A2C")
+"""Learners that take minutes; the others take half an hour and more."""
 COMMENT = "comment.md"
 """In OUT: what somebody has to say about the results there; it goes into the document."""
 DOCUMENT = Path(__file__).parent.parent / "docs" / "paper_tables.md"
@@ -43,7 +46,7 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "paper_tables.md"
 def main(
     out: Annotated[Path, typer.Option(help="Where results are kept; trials need a place of their own.")] = KEPT,
     only: Annotated[list[str] | None, typer.Option(help="ENV or ENV:ALGORITHM; repeatable. Default: all.")] = None,
-    recipe: Annotated[str | None, typer.Option(help="published or tuned; default: both.")] = None,
+    settings: Annotated[str | None, typer.Option(help="published or tuned; default: both.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each row; default: the paper's.")] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Seeds of each row; default: 3, of slow learners 1.")] = None,
     episodes: Annotated[
@@ -63,21 +66,23 @@ def main(
     if speed:
         _compare_speed(steps or 200_000)
         return
-    failed: list[Row] = []
+    failed: list[PaperRow] = []
     if not table:
         if only:
             choices = [_names(name) for name in only]
-            found = (row for names in choices for row in planned(*names, steps=steps, seeds=seeds or 1, recipe=recipe))
+            found = (
+                row for names in choices for row in planned(*names, steps=steps, seeds=seeds or 1, settings=settings)
+            )
             rows = list(dict.fromkeys(found))
         else:
-            rows = study(steps=steps, seeds=seeds, recipe=recipe)
+            rows = study_rows(steps=steps, seeds=seeds, settings=settings)
         try:
             failed = Study(results, rows, jobs, episodes).run()
         except KeyboardInterrupt:
             message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
             console.print(message, soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None
-    part = only or steps or seeds or episodes or recipe or out.resolve() != KEPT.resolve()
+    part = only or steps or seeds or episodes or settings or out.resolve() != KEPT.resolve()
     path = write or (out / DOCUMENT.name if part else DOCUMENT)
     path.parent.mkdir(parents=True, exist_ok=True)
     comment = out / COMMENT
@@ -88,11 +93,28 @@ def main(
         raise typer.Exit(1)
 
 
+def study_rows(*, steps: int | None = None, seeds: int | None = None, settings: str | None = None) -> list[PaperRow]:
+    """Return every row of the paper's tables: fast learners with three seeds first, then tuned, slow and goal learners.
+
+    A seed comes to its end on every environment before the next begins, so that the tables fill evenly.
+    """
+    rows = planned(None, None, steps=steps, seeds=seeds or 3, settings=settings)
+    groups = (*FAST, *(name for name in BOX_ALGORITHMS if name not in FAST), *GOAL_ALGORITHMS)
+
+    def order(row: PaperRow) -> tuple[int, int, int]:
+        slow = row.algorithm not in FAST and row.settings == "published"
+        stage = 1 if row.settings == "tuned" else 2 * slow
+        return stage, row.seed, groups.index(row.algorithm) if row.settings == "published" else 0
+
+    wanted = [row for row in rows if row.settings == "tuned" or row.algorithm in FAST or row.seed < (seeds or 1)]
+    return sorted(wanted, key=order)
+
+
 @dataclass(slots=True)
 class Job:
     """A row that runs in a process of its own."""
 
-    row: Row
+    row: PaperRow
     process: BaseProcess
     state: Any
     bar: TaskID
@@ -101,24 +123,24 @@ class Job:
 class Study:
     """Runs rows in processes, some at a time; a row that fails has a second try after all others."""
 
-    def __init__(self, results: Results, rows: list[Row], jobs: int, episodes: int | None) -> None:
+    def __init__(self, results: Results, rows: list[PaperRow], jobs: int, episodes: int | None) -> None:
         """Leave out the rows that are done."""
         self._results, self._jobs, self._episodes = results, jobs, episodes
         self._queue = deque(row for row in rows if not self._is_done(row))
-        self._failed: list[Row] = []
+        self._failed: list[PaperRow] = []
         self._again = True
         self._running: list[Job] = []
         results.prepare()
         overall = overview(rows, self._queue)
         console.print(f"{overall}; results in {results.path}", soft_wrap=True, highlight=False)
 
-    def _is_done(self, row: Row) -> bool:
+    def _is_done(self, row: PaperRow) -> bool:
         again = outdated(self._results.read(row), self._episodes) if self._results.has(row) else ""
         if again:
             console.print(f"{row}: once more, as {again}", soft_wrap=True, highlight=False)
         return self._results.has(row) and not again
 
-    def run(self) -> list[Row]:
+    def run(self) -> list[PaperRow]:
         """Run every row and return those that failed twice.
 
         Raises:
@@ -149,8 +171,8 @@ class Study:
                     job.process.join()
         return self._failed
 
-    def _start(self, row: Row, bars: Progress) -> None:
-        log = self._results.log(row)
+    def _start(self, row: PaperRow, bars: Progress) -> None:
+        log = _log(self._results, row)
         log.parent.mkdir(parents=True, exist_ok=True)
         state = processes.Array("q", [0, 0, 1], lock=False)
         arguments = (row, str(self._results.path), self._episodes, state)
@@ -166,7 +188,7 @@ class Study:
             console.print(result_line(self._results.read(job.row)), soft_wrap=True, highlight=False)
             return
         self._failed.append(job.row)
-        lines = self._results.log(job.row).read_text().splitlines() or ["no message"]
+        lines = _log(self._results, job.row).read_text().splitlines() or ["no message"]
         console.print(f"{job.row}: failed: {lines[-1]}", soft_wrap=True, markup=False)
 
     def _retry(self) -> bool:
@@ -178,12 +200,12 @@ class Study:
         return again
 
 
-def work(row: Row, folder: str, episodes: int | None, state: Any) -> None:
+def work(row: PaperRow, folder: str, episodes: int | None, state: Any) -> None:
     """Run one row in this process; what it says goes into its log."""
     parent = os.getppid()
     os.nice(10)
     results = Results(folder)
-    log = results.log(row).open("w", buffering=1)
+    log = _log(results, row).open("w", buffering=1)
     os.dup2(log.fileno(), 1)
     os.dup2(log.fileno(), 2)
     said = time.perf_counter()
@@ -207,6 +229,11 @@ def work(row: Row, folder: str, episodes: int | None, state: Any) -> None:
         raise SystemExit(1) from None
 
 
+def _log(results: Results, row: PaperRow) -> Path:
+    """Return where the process that runs a row writes what it says."""
+    return results.path / "logs" / f"{row.stem}.log"
+
+
 def _names(text: str) -> tuple[str, str | None]:
     environment, _, algorithm = text.partition(":")
     return environment, algorithm or None
@@ -217,7 +244,7 @@ def _stop(_signal: int, _frame: FrameType | None) -> None:
 
 
 def _compare_speed(steps: int) -> None:
-    from cirl_marl.paper.speed import compare, speed_table
+    from benchmarks.paper_speed import compare, speed_table
 
     with live_bar(console, "CopperNet") as report:
         found = compare(steps, report)

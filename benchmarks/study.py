@@ -35,6 +35,7 @@ from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.evaluation.statistics import Aggregate, interquartile_mean, over_episodes, over_seeds
 from cirl_marl.learners import RunDirectory, load_recipe, train
 from cirl_marl.network import Floats
+from cirl_marl.optimum import gap
 from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
 from cirl_marl.records.files import write_json
 from cirl_marl.report.comparison import write_comparison
@@ -283,10 +284,10 @@ def _lqr_table(episodes: int) -> Iterator[str]:
         for label, run in runs.items():
             proved = measure.at(starts, run.episode_service)
             assert proved is not None
-            gap = over_episodes((proved - run.episode_circularity) / np.abs(proved))
+            left = over_episodes(gap(proved, run.episode_circularity))
             cells = [_figure(over_episodes(each), "{:.4g}") for each in (run.episode_circularity, run.episode_service)]
             shown = _figure(over_episodes(proved), "{:.4g}", interval=False)
-            yield f"| {name} | {agent} | {label} | {' | '.join(cells)} | {shown} | {_figure(gap, '{:.1%}')} |"
+            yield f"| {name} | {agent} | {label} | {' | '.join(cells)} | {shown} | {_figure(left, '{:.1%}')} |"
 
 
 def _credit_table(jobs: Sequence[Job], pictures: Path) -> Iterator[str]:

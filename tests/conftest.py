@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service
-from cirl_marl.definitions.reading import read_network
+from cirl_marl.definitions.reading import Definition
 from cirl_marl.dynamics.motion import Dynamics
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def bottles(tmp_path_factory: pytest.TempPathFactory) -> Network:
     text = GUIDE.read_text().split("```toml\n")[1].split("```")[0]
     path = tmp_path_factory.mktemp("definition") / "bottles.toml"
     path.write_text(text.replace("horizon = { value = 60", "horizon = { value = 14"))
-    return read_network(path)
+    return Definition(path).network()
 
 
 @pytest.fixture
@@ -98,10 +98,10 @@ def ctrl_c_after() -> Callable[[int], Callable[[Progress], None]]:
 
 def few_rollouts() -> Recipe:
     """Return a recipe for a few rollouts of PPO in two copies."""
-    from cirl_marl.learners.recipe import Learner, Recipe, Run
+    from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 
     parameters = {"n_steps": 10, "batch_size": 20, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
-    learner = Learner(algorithm="PPO", parameters=parameters)
+    learner = LearnerSettings(algorithm="PPO", parameters=parameters)
     return Recipe(name="small", title="small", run=Run(steps=80, envs=2), learner=learner)
 
 

@@ -8,13 +8,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments import RewardState
+from cirl_marl.compartments import ContinuousModel, Outflowing, RewardState
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fermenter:
+class Fermenter(ContinuousModel, Outflowing):
     """Chemostat: Ẋ = (μ − D)X, Ṡ = D(S_in − S) − μX/Y with Monod growth μ; it gives off gas in proportion to μX."""
 
     kind: ClassVar[str] = "fermenter"
@@ -64,7 +64,7 @@ class LeakyFermenter(Fermenter):
             raise ValueError(f"leak_per_day = {self.leak_per_day}: a leak takes away")
 
 
-class Aimless:
+class Aimless(ContinuousModel):
     """A class with a reward and no physics."""
 
     kind: ClassVar[str] = "aimless"
@@ -73,3 +73,11 @@ class Aimless:
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return nothing."""
         return np.zeros(state.shape[1])
+
+
+class Stray:
+    """A class that knows nothing of the library."""
+
+    def derivative(self, state: Floats, inputs: Floats) -> Floats:
+        """Return nothing."""
+        return state

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv
-from cirl_marl.compartments import RewardState, model_class
+from cirl_marl.compartments import DiscreteTimeModel, Releasing, RewardState, model_class
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Episode, Law, Objective, Service
 
@@ -21,7 +21,7 @@ ITEM = 100.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Belt:
+class Belt(DiscreteTimeModel, Releasing):
     """A sorting belt without a robot: an item takes ``work`` steps; every ``nth`` one is missed."""
 
     kind: ClassVar[str] = "belt"
@@ -41,7 +41,7 @@ class Belt:
         """Return an idle belt."""
         return np.zeros(5)
 
-    def advance(self, state: Floats, inputs: Floats, interval: float, *, stock_kg: Floats) -> Floats:
+    def advance(self, state: Floats, inputs: Floats, *, stock_kg: Floats) -> Floats:
         """Work on an item, if there is one."""
         worked, done = state[0], state[1]
         worked = np.where(stock_kg >= ITEM * (1 - 1e-9), worked + 1, 0.0)

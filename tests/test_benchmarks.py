@@ -50,14 +50,14 @@ def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
     published = paper.DOCUMENT.read_bytes()
     only = ["CopperNet:A2C", "CopperNet:A2C"]
     with pytest.raises(typer.Exit) as ended:
-        paper.main(out=tmp_path, only=only, recipe="published", steps=20)
+        paper.main(out=tmp_path, only=only, settings="published", steps=20)
     assert ended.value.exit_code == 1
     said = capsys.readouterr().out
     assert "rows: 1, done: 0" in said
     assert said.count("no training episode ended") == 2
-    paper.main(out=tmp_path, only=only, recipe="published", steps=60)
+    paper.main(out=tmp_path, only=only, settings="published", steps=60)
     assert "rows: 1, done: 1" not in capsys.readouterr().out
-    paper.main(out=tmp_path, only=only, recipe="published", steps=60)
+    paper.main(out=tmp_path, only=only, settings="published", steps=60)
     assert "rows: 1, done: 1" in capsys.readouterr().out
     paper.main(out=tmp_path / "new", only=["CopperNet"], table=True)
     assert (tmp_path / "new" / "paper_tables.md").is_file()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import shutil
 import sys
@@ -74,30 +75,36 @@ def test_check_has_nothing_to_say_of_the_catalogue(
 
 
 def test_check_names_every_mistake(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Mistakes of different kinds in one file are all named, with key and nearest name; the exit code is 2."""
-    good = (folder("envs") / "copper_net.toml").read_text()
-    bad = good.replace('law = "controlled"', 'law = "controled"').replace(
-        'unit = "kt/day", source = "neutral', 'unit = "kg", source = "neutral'
+    """Mistakes of different kinds in one file are all named, with key and nearest name; the exit code is 2.
+
+    Units are read once all keys are known, and how the compartments fit together once every value can be read; each
+    time all that is wrong is named.
+    """
+    bad = (folder("envs") / "copper_net.toml").read_text()
+    planted = (
+        ("reference_interval", "reference_intervall", "'reference_intervall'. Did you mean 'reference_interval'?"),
+        ('law = "controlled"', 'law = "controled"', "'controled'. Did you mean 'controlled'?"),
+        ('unit = "kt/day", source = "neutral', 'unit = "kg", source = "neutral', "control: unit 'kg' is inconsistent"),
+        (
+            'to = "landfill"',
+            'to = "landfil"',
+            "to: unknown node 'landfil'. Did you mean 'landfill'?",
+        ),
+        ('provider = "use"', 'provider = "us"', "provider: unknown node 'us'. Did you mean 'use'?"),
     )
-    bad = bad.replace('to = "landfill"', 'to = "landfil"').replace("reference_interval", "reference_intervall")
-    bad = bad.replace(
-        "[nodes.mine]", "reference_interval = { value = 1, unit = 'day', source = 's' }\n\n[nodes.mine]", 0
-    )
-    Path("bad.toml").write_text(bad)
-    assert run(monkeypatch, "check", "bad.toml", str(folder("envs") / "carbo_net.toml")) == 2
-    captured = capsys.readouterr()
-    assert "no mistakes" in captured.out
-    for part in (
-        "bad.toml",
-        "'controled'. Did you mean 'controlled'?",
-        "'reference_intervall'. Did you mean 'reference_interval'?",
-    ):
-        assert part in captured.err
-    Path("bad.toml").write_text(bad.replace("reference_intervall", "reference_interval"))
-    assert run(monkeypatch, "check", "bad.toml") == 2
-    found = capsys.readouterr().err
-    assert "'controled'. Did you mean 'controlled'?" in found
-    assert "arcs.use_to_collection.control: unit 'kg' is inconsistent" in found
+    for right, wrong, _ in planted:
+        assert right in bad
+        bad = bad.replace(right, wrong)
+    for corrected, named in (((), {0, 1}), ((0,), {1, 2}), ((1, 2), {3, 4})):
+        for place in corrected:
+            right, wrong, _ = planted[place]
+            bad = bad.replace(wrong, right)
+        Path("bad.toml").write_text(bad)
+        assert run(monkeypatch, "check", "bad.toml", str(folder("envs") / "carbo_net.toml")) == 2
+        captured = capsys.readouterr()
+        assert "no mistakes" in captured.out
+        assert "bad.toml" in captured.err
+        assert {place for place, (_, _, said) in enumerate(planted) if said in captured.err} == named, captured.err
     assert run(monkeypatch, "check", "missing.toml") == 2
     assert "missing.toml: no such file" in capsys.readouterr().err
 
@@ -415,7 +422,7 @@ def guide(changes: Mapping[str, str] | None = None, days: int = 7) -> str:
 def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Both fronts are printed, tabulated and drawn in one picture; the runs stay."""
     bottles()
-    asked = ("--agents", "independent_a2c", "--points", "2", "--steps", "320", "--episodes", "2", "--out", "out")
+    asked = ("--recipe", "independent_a2c", "--points", "2", "--steps", "320", "--episodes", "2", "--out", "out")
     assert run(monkeypatch, "pareto", "bottles.toml", *asked) == 0
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("bound    service", "plan     service", "(weight 1, seed 0)"))
@@ -426,8 +433,9 @@ def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
 def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A run of another network, a plan of a run under a controller, a recipe of other agents: nothing is written."""
     bottles()
-    options = ("--agents", "independent_a2c", "--steps", "320", "--envs", "8", "--episodes", "2", "--out", "run")
-    assert run(monkeypatch, "train", "bottles.toml", *options) == 0
+    options = ("--recipe", "independent_a2c", "--steps", "320", "--envs", "8", "--episodes", "2", "--out", "run")
+    assert run(monkeypatch, "train", "bottles.toml", "--agents", "quarry", *options) == 0
+    assert json.loads(Path("run/config.json").read_text())["agents"] == ["quarry"]
     assert run(monkeypatch, "plan", "run", "--out", "plan.csv") == 0
     assert Path("plan.csv").read_text().startswith("from (day),to (day),quarry: valve factor (1),")
     assert run(monkeypatch, "compare", "run", "--episodes", "2", "--out", "compared") == 0
@@ -440,8 +448,8 @@ def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["compare", "run", "run", "--out", "new"], "the same recipe and seed 0"),
         (["plan", "run", "--control", "mpc", "--out", "new.csv"], "leave out --control"),
         (["plan", "run", "--scenario", "crisis", "--out", "new.csv"], "a run has its own scenario"),
-        (["pareto", "bottles.toml", "--agents", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
-        (["train", "bottles.toml", "--agents", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
+        (["pareto", "bottles.toml", "--recipe", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
+        (["train", "bottles.toml", "--recipe", "recipe.toml", "--out", "new"], "Did you mean 'quarry'?"),
         (["compare", "run", "--out", "recipe.toml"], "is a file, not a folder"),
     ):
         assert run(monkeypatch, *arguments) == 2
@@ -511,7 +519,7 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
             "the program of MPC for decisions 16 to 59",
         ),
         (["pareto", "bottles.toml", "--out", "new"], 4, "the program of the bound with a mean service level of"),
-        (["pareto", "bottles.toml", "--agents", "independent_a2c", "--out", "new"], 0, "with a service weight of"),
+        (["pareto", "bottles.toml", "--recipe", "independent_a2c", "--out", "new"], 0, "with a service weight of"),
     ],
 )
 def test_solver_that_fails(
@@ -571,7 +579,8 @@ def test_simulate_with_inner_physics(
     [
         (["show", "coper_net"], "unknown network 'coper_net'. Did you mean 'copper_net'?"),
         (["show", "copper_net", "--scenario", "papr"], "unknown scenario 'papr'. Did you mean 'paper'?"),
-        (["train", "copper_net", "--agents", "independent_pp"], "Did you mean 'independent_ppo'?"),
+        (["train", "copper_net", "--recipe", "independent_pp"], "Did you mean 'independent_ppo'?"),
+        (["train", "copper_net", "--agents", "mine, ues"], "Did you mean 'use'?"),
         (["train", "copper_net", "--reward", "mixd"], "unknown reward 'mixd'. Did you mean 'mixed'?"),
         (["train"], "train needs NETWORK, or --resume RUN"),
         (["train", "--resume", "nowhere"], "no run in nowhere (it has no config.json)"),
@@ -606,7 +615,7 @@ def test_simulate_with_inner_physics(
         (["paper", "CoperNet"], "unknown environment of the paper 'CoperNet'. Did you mean 'CopperNet'?"),
         (["paper", "CopperNet", "A2"], "unknown algorithm of the paper 'A2'. Did you mean 'A2C'?"),
         (["paper", "CopperNet", "SAC-HER"], "did not run SAC-HER on CopperNet; it ran A2C, ARS, DDPG, PPO, SAC"),
-        (["paper", "CopperNet", "--recipe", "tund"], "unknown recipe 'tund'. Did you mean 'tuned'?"),
+        (["paper", "CopperNet", "--recipe", "tund"], "unknown settings 'tund'. Did you mean 'tuned'?"),
     ],
 )
 def test_bad_input_ends_with_code_2(

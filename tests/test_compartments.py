@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from cirl_marl import compartments
+from cirl_marl import Network, NetworkError, Node, compartments
 from cirl_marl.compartments import model_class, models
 from cirl_marl.compartments.atmosphere import Atmosphere
 from cirl_marl.compartments.delivery_truck import DeliveryTruck
@@ -25,11 +26,25 @@ from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import ContinuousModel
+from cirl_marl.network.model import (
+    MOTIONS,
+    OFFERS,
+    CompartmentModel,
+    ContinuousModel,
+    DiscreteTimeModel,
+    GoalTask,
+    Measuring,
+    Outflowing,
+    OwnStepModel,
+    Releasing,
+    Task,
+    Vehicle,
+    model_faults,
+)
 from cirl_marl.network.rowsum import Floats
 from cirl_marl.network.units import factor
 
-HELPERS = {"model", "light", "nutrient"}
+HELPERS = {"light", "nutrient", "parameters"}
 """Modules of the package that hold no model."""
 
 DISCRETE = {"fetch", "reacher", "sorting_station"}
@@ -73,6 +88,19 @@ RANGES: dict[str, tuple[list[float], list[float], list[float], list[float]]] = {
 CONTEXT: dict[str, tuple[float, float]] = {"load_kg": (0.0, 600.0), "stock_kg": (6e5, 1.5e6)}
 """Ranges of what a network tells a model."""
 
+OFFERED = {
+    "derivative": "ContinuousModel",
+    "integrate": "OwnStepModel",
+    "advance": "DiscreteTimeModel",
+    "outflow": "Outflowing",
+    "measures": "Measuring",
+    "success": "Task",
+    "goal_reward": "GoalTask",
+    "released": "Releasing",
+    "boarding": "Vehicle",
+}
+"""A method of every contract that a model may inherit from."""
+
 SPAN: dict[str, float] = {"s": 5.0, "min": 5.0, "day": 0.5}
 """How long a model runs, in its unit."""
 
@@ -85,17 +113,46 @@ def sample(model: ContinuousModel, size: int) -> tuple[Floats, Floats, dict[str,
     low, high, input_low, input_high = (np.array(bound, dtype=np.float64)[:, None] for bound in RANGES[model.kind])
     state = rng.uniform(low, high, size=(len(low), size))
     inputs = rng.uniform(input_low, input_high, size=(len(input_low), size))
-    return state, inputs, {name: rng.uniform(*CONTEXT[name], size) for name in getattr(model, "context_names", ())}
+    return state, inputs, {name: rng.uniform(*CONTEXT[name], size) for name in model.context_names}
 
 
-def outputs(model: Any, state: Floats, inputs: Floats, context: dict[str, Floats]) -> dict[str, Floats]:
+def outputs(
+    model: CompartmentModel, state: Floats, inputs: Floats, context: dict[str, Floats]
+) -> dict[str, NDArray[Any]]:
     """Return everything that the model computes of a state, by name."""
-    found = {"derivative": model.derivative(state, inputs, **context), "reward": model.reward(state, inputs)}
-    for name in ("outflow", "measures"):
-        if hasattr(model, name):
-            found[name] = getattr(model, name)(state, inputs)
-    if hasattr(model, "receive"):
+    found: dict[str, NDArray[Any]] = {"reward": model.reward(state, inputs)}
+    if type(model).receive is not CompartmentModel.receive:
         found["receive"] = model.receive(state, np.full(state.shape[1], 50.0))
+    if isinstance(model, ContinuousModel):
+        found["derivative"] = model.derivative(state, inputs, **context)
+    if isinstance(model, OwnStepModel):
+        found["integrate"], found["mean outflow"] = model.integrate(state, inputs, 0.01)
+    if isinstance(model, DiscreteTimeModel):
+        found["advance"] = model.advance(state, inputs, **context)
+    if isinstance(model, Outflowing):
+        found["outflow"] = model.outflow(state, inputs)
+    if isinstance(model, Measuring):
+        found["measures"] = model.measures(state, inputs)
+    if isinstance(model, Task):
+        found["success"] = model.success(state, inputs)
+    if isinstance(model, Releasing):
+        found |= {"released": model.released(state), "complete": model.complete(state)}
+    if isinstance(model, Vehicle):
+        found |= {"boarding": model.boarding(state), "arrived": model.arrived(state)}
+        found |= {"depart": model.depart(state, found["boarding"])}
+        found |= {"turn_back": model.turn_back(state, found["arrived"])}
+    return found
+
+
+def shapes(model: CompartmentModel, size: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each of these, where it is not that of the state."""
+    found: dict[str, tuple[int, ...]] = dict.fromkeys(
+        ("reward", "mean outflow", "outflow", "success", "complete", "boarding", "arrived"), (size,)
+    )
+    if isinstance(model, Measuring):
+        found["measures"] = (len(model.measure_names), size)
+    if isinstance(model, Releasing):
+        found["released"] = (len(model.ports), size)
     return found
 
 
@@ -132,11 +189,65 @@ class TestRegistry:
 
     def test_ways_to_move(self) -> None:
         """Which kinds the generic tests cannot integrate, and which bring a step of their own."""
-        moves = {kind: {name for name in ("derivative", "advance") if hasattr(m, name)} for kind, m in models().items()}
-        assert {kind for kind, ways in moves.items() if "derivative" not in ways} == DISCRETE
-        assert {kind for kind, ways in moves.items() if "advance" in ways} == DISCRETE | OWN_STEP
-        for kind, model in models().items():
-            assert hasattr(model, "interval") == hasattr(model, "start") == (kind in DISCRETE), kind
+        moves = {kind: {motion for motion in MOTIONS if issubclass(model, motion)} for kind, model in models().items()}
+        for kind, ways in moves.items():
+            own = {ContinuousModel, OwnStepModel} if kind in OWN_STEP else {ContinuousModel}
+            assert ways == ({DiscreteTimeModel} if kind in DISCRETE else own), kind
+
+    @pytest.mark.parametrize("kind", models())
+    def test_models_keep_their_contract(self, kind: str) -> None:
+        """Names belong together, nothing that is offered is left abstract, and every result has its shape."""
+        assert not list(model_faults(model_class(kind)))
+        model = model_class(kind)()
+        assert model.kind == kind
+        assert not hasattr(model, "__dict__")
+        states, names = model.state_names, {*model.state_names, *model.input_names}
+        assert len(names) == len(states) + len(model.input_names)
+        assert set(model.observed) <= set(states)
+        assert set(model.bounds) <= names
+        assert set(model.context_names) <= set(CONTEXT)
+        assert model.ranged_states == (() if isinstance(model, DiscreteTimeModel) else states)
+        assert bool(model.input_names) == (model.input_unit is not None)
+        assert isinstance(model.robot, CompartmentModel)
+        if isinstance(model, GoalTask):
+            parts = (*model.observation_names, *model.achieved_names, *model.desired_names)
+            assert set(parts) <= set(model.observed)
+            assert len(model.achieved_names) == len(model.desired_names)
+        if isinstance(model, DiscreteTimeModel):
+            assert model.interval > 0.0
+            state = np.stack([model.start(np.random.default_rng(i)) for i in range(2)], axis=1)
+            inputs = np.zeros((len(model.input_names), 2))
+            context = {name: np.full(2, CONTEXT[name][0]) for name in model.context_names}
+        else:
+            state, inputs, context = sample(model, 2)
+        assert len(states) == len(state)
+        expected = shapes(model, 2)
+        for name, value in outputs(model, state, inputs, context).items():
+            assert value.shape == expected.get(name, state.shape), name
+
+    @pytest.mark.parametrize(
+        ("bases", "offered", "said"),
+        [
+            ((), "derivative", "it inherits from none of ContinuousModel, OwnStepModel, DiscreteTimeModel"),
+            ((Outflowing,), "outflow", "it inherits from none of ContinuousModel, OwnStepModel, DiscreteTimeModel"),
+            ((ContinuousModel,), "reward", "it lacks derivative, input_names, kind, reward_state, state_names, time_"),
+            ((DiscreteTimeModel,), "advance", "it lacks input_names, interval, kind, reward, reward_state, start, st"),
+            *(((), name, f"it has {name} and does not inherit from {offer}") for name, offer in OFFERED.items()),
+        ],
+    )
+    def test_what_is_missing_is_named(self, bases: tuple[type[Any], ...], offered: str, said: str) -> None:
+        """A class is told what it lacks, and which contract goes with what it has; Python makes no model of it."""
+        given = type("Given", bases, {offered: lambda *_: None})
+        assert any(fault.startswith(said) for fault in model_faults(given))
+        if bases:
+            with pytest.raises(TypeError, match="Can't instantiate abstract class Given"):
+                given()
+
+    def test_a_network_refuses_what_is_no_model(self) -> None:
+        """By its compartment, with the other mistakes there."""
+        with pytest.raises(NetworkError, match="'tank': model Strange: it inherits from none of Conti") as raised:
+            Network(name="One", nodes=(Node(id="tank", model=type("Strange", (), {})()),), arcs=())
+        assert [problem.split(":")[0] for problem in raised.value.problems] == ["name 'One'", "'tank'"]
 
     def test_every_module_holds_a_model(self) -> None:
         """Each module but the helpers is found by the registry; robots lie in a package of their own."""
@@ -163,6 +274,10 @@ class TestRegistry:
             model_class("digestor")
         with pytest.raises(CirlError, match="Did you mean 'sorting_station'"):
             model_class("sorting_staton")
+
+    def test_every_offer_is_in_the_table(self) -> None:
+        """Each contract has the method that gives it away."""
+        assert set(OFFERED.values()) == {offer.__name__ for offer in OFFERS}
 
     def test_models_returns_a_copy(self) -> None:
         """Nobody can empty the registry."""
@@ -211,13 +326,10 @@ class TestEveryModel:
         kept = state.copy(), inputs.copy(), {name: values.copy() for name, values in context.items()}
         assert state.shape[0] == len(model.state_names)
         assert inputs.shape[0] == len(model.input_names)
-        shapes: dict[str, tuple[int, ...]] = {"reward": (5,), "outflow": (5,)}
-        shapes["measures"] = (len(getattr(model, "measure_names", ())), 5)
-        found = outputs(model, state, inputs, context)
-        assert ("measures" in found) == hasattr(model, "measure_names")
-        for name, value in found.items():
-            assert value.shape == shapes.get(name, state.shape), name
-            assert value.dtype == np.float64, name
+        expected = shapes(model, 5)
+        for name, value in outputs(model, state, inputs, context).items():
+            assert value.shape == expected.get(name, state.shape), name
+            assert value.dtype == (np.bool_ if name in ("boarding", "arrived") else np.float64), name
             assert np.isfinite(value).all(), name
             assert not any(np.shares_memory(value, given) for given in (state, inputs, *context.values())), name
         np.testing.assert_array_equal(state, kept[0])
@@ -259,7 +371,7 @@ class TestEveryModel:
             np.testing.assert_allclose(fine[:, b], exact.y[:, -1], rtol=2e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", [model for model in FORMS if hasattr(model, "context_names")])
+@pytest.mark.parametrize("model", [model for model in FORMS if model.context_names])
 def test_context_matters(model: ContinuousModel) -> None:
     """What the network tells a model changes how it moves."""
     state, inputs, context = sample(model, 6)

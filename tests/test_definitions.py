@@ -27,7 +27,7 @@ from cirl_marl import (
     parallel_env,
 )
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reading import Definition, write_network
 from cirl_marl.definitions.schema import json_schema
 from cirl_marl.network.elements import ControlKind
 
@@ -135,7 +135,7 @@ def broken(tmp_path: Path, *changes: tuple[str, str]) -> str:
     path = tmp_path / "broken.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(DefinitionError) as caught:
-        load_network(path)
+        Definition(path).check()
     message = str(caught.value)
     assert all(line.startswith(str(path)) for line in message.splitlines())
     return message

@@ -25,7 +25,7 @@ from cirl_marl.learners.recipe import Demonstrations
 from cirl_marl.learners.views import View
 from cirl_marl.optimum.named import CONTROLLERS, named_controller
 from cirl_marl.paper.published import ENVIRONMENTS
-from cirl_marl.paper.results import Row
+from cirl_marl.paper.results import PaperRow
 from cirl_marl.paper.tuned import train_tuned
 
 HORIZON, COPIES, SEED = 4, 2, 5
@@ -51,7 +51,7 @@ def trained(asked: Recipe, **options: Any) -> Training:
 
 def buffer_of(training: Training, name: str) -> Any:
     """Return the replay buffer of a learner."""
-    model = training.trainees[name].model
+    model = training.learners[name].model
     assert isinstance(model, OffPolicyAlgorithm)
     return model.replay_buffer
 
@@ -85,13 +85,13 @@ def test_buffer_holds_what_the_controller_did(scheme: str, controller: str) -> N
     shown = {"controller": controller, "steps": 20}
     training = trained(recipe(shown, scheme=scheme), steps=20)
     seed = derived_seed(SEED, "demonstrations", controller)
-    assert len(training.trainees) == (3 if scheme == "independent" else 1)
-    for name, trainee in training.trainees.items():
-        buffer, view = buffer_of(training, name), trainee.seat.view
+    assert len(training.learners) == (3 if scheme == "independent" else 1)
+    for name, learner in training.learners.items():
+        buffer, view = buffer_of(training, name), learner.seat.view
         groups = {group.name: group for group in training.config.recipe.groups(training.env.network, AGENTS)}
         expected = list(shown_by(named_controller(controller), seed, groups[name].view, 10))
         assert buffer.pos == len(expected) == 10
-        assert trainee.model.num_timesteps == 20 * max(1, len(view.row_agents))
+        assert learner.model.num_timesteps == 20 * max(1, len(view.row_agents))
         for t, (before, after, actions, rewards, done) in enumerate(expected):
             np.testing.assert_array_equal(buffer.actions[t], actions)
             np.testing.assert_array_equal(buffer.observations[t], before)
@@ -105,7 +105,7 @@ def test_last_observation_of_an_episode_is_exact_without_a_normaliser() -> None:
     """And is not the first of the next."""
     training = trained(recipe({"controller": "random", "steps": 20}, normalise=PLAIN), steps=20)
     seed = derived_seed(SEED, "demonstrations", "random")
-    buffer, view = buffer_of(training, "use"), training.trainees["use"].seat.view
+    buffer, view = buffer_of(training, "use"), training.learners["use"].seat.view
     for t, (_, after, _, _, done) in enumerate(shown_by(named_controller("random"), seed, lambda env: view, 10)):
         np.testing.assert_array_equal(buffer.next_observations[t], after)
         assert not done or (buffer.observations[t + 1] != after).any()
@@ -119,8 +119,8 @@ def test_steps_count_once(starts: int, updates: int, tmp_path: Path) -> None:
     shown = recipe({"controller": "neutral", "steps": 20}, parameters=parameters)
     training = trained(shown, directory=tmp_path / "run")
     assert training.joint_steps == 20
-    for name, trainee in training.trainees.items():
-        model, buffer = trainee.model, buffer_of(training, name)
+    for name, learner in training.learners.items():
+        model, buffer = learner.model, buffer_of(training, name)
         assert (model.num_timesteps, buffer.pos, model._n_updates) == (40, 20, updates)
         neutral = training.env.neutral_action[name].astype(np.float32)
         assert (buffer.actions[:10] == neutral).all() and (buffer.actions[10:20] != neutral).all()
@@ -135,7 +135,7 @@ def test_others_learn_from_the_start() -> None:
     asked["learner"]["demonstrations"] = None
     asked["match"] = [{**asked["learner"], "agents": ["use"], "demonstrations": {"controller": "random", "steps": 20}}]
     training = trained(Recipe.model_validate(asked))
-    updates = {name: trainee.model._n_updates for name, trainee in training.trainees.items()}
+    updates = {name: learner.model._n_updates for name, learner in training.learners.items()}
     assert updates == {"mine": 20, "use": 10, "use_to_collection": 20}
 
 
@@ -145,7 +145,7 @@ def test_same_seed_gives_the_same_bits() -> None:
 
     def values(seed: int) -> NDArray[np.floating]:
         training = trained(recipe({"controller": "random", "steps": 20}), seed=seed)
-        weights = [p.detach().numpy().ravel() for t in training.trainees.values() for p in t.model.policy.parameters()]
+        weights = [p.detach().numpy().ravel() for t in training.learners.values() for p in t.model.policy.parameters()]
         return np.concatenate([*weights, buffer_of(training, "use").actions.ravel()])
 
     first, again, other = values(3), values(3), values(4)
@@ -163,7 +163,7 @@ def test_resumed_run_gets_the_rest(stop: int, tmp_path: Path, ctrl_c_after: Any)
     for name in AGENTS:
         buffer, neutral = buffer_of(training, name), training.env.neutral_action[name].astype(np.float32)
         by_controller = (buffer.actions[: buffer.pos] == neutral).all(axis=(1, 2))
-        assert training.trainees[name].model.num_timesteps == 40
+        assert training.learners[name].model.num_timesteps == 40
         assert by_controller.tolist() == [True] * 10 + [False] * 10
 
 
@@ -219,7 +219,7 @@ def test_tuned_row_counts_its_demonstrations(monkeypatch: pytest.MonkeyPatch) ->
             normalisers.append(self)
 
     monkeypatch.setattr("cirl_marl.paper.tuned.VecNormalize", Kept)
-    row = Row(environment="FetchWasteSorting", algorithm="TQC", recipe="tuned", steps=300)
+    row = PaperRow(environment="FetchWasteSorting", algorithm="TQC", settings="tuned", steps=300)
     found = train_tuned(ENVIRONMENTS["FetchWasteSorting"], row, lambda *_: None, small)
     statistics: Any = normalisers[0].obs_rms
     assert list(statistics) == ["observation"]
@@ -227,7 +227,7 @@ def test_tuned_row_counts_its_demonstrations(monkeypatch: pytest.MonkeyPatch) ->
     assert max(found.returns[:4]) < -5.0 and min(found.returns[:4]) > -30.0
     assert found.settings["recipe"]["learner"]["demonstrations"] == {"controller": "scripted", "steps": 200}
     with pytest.raises(RecipeError, match=r"learner\.demonstrations\.steps: 200 is more than the 100 steps of the run"):
-        short = Row(environment="FetchWasteSorting", algorithm="TQC", recipe="tuned", steps=100)
+        short = PaperRow(environment="FetchWasteSorting", algorithm="TQC", settings="tuned", steps=100)
         train_tuned(ENVIRONMENTS["FetchWasteSorting"], short, lambda *_: None, small)
 
 

@@ -2,31 +2,77 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import re
+import shlex
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer.main
+from imports import arrows, modules, rooms
 
 import cirl_marl
-from cirl_marl.cli import app
-from cirl_marl.definitions.reading import read_network
+from cirl_marl import cli
+from cirl_marl.definitions.reading import Definition
 from cirl_marl.learners import load_recipe, train
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")])
+WRITTEN = [path for path in DOCUMENTS if path.name != "paper_tables.md"]
+"""Documents that a benchmark does not write whole."""
+WIDTH = 120
+COMMANDS: dict[str, Any] = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def named(path: Path) -> str:
+    """Return the name of a document in the checkout."""
+    return str(path.relative_to(ROOT))
+
+
+each_document = pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+
+
+def blocks(text: str, language: str = "") -> list[str]:
+    """Return the fenced blocks of a language; the empty one stands for shell commands and what they print."""
+    return [code for found, code in re.findall(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S) if found == language]
+
+
+def spans(text: str) -> list[str]:
+    """Return what stands between single backticks in the prose."""
+    return re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S))
+
+
+def anchor(heading: str) -> str:
+    """Return the anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@each_document
 def test_links_lead_somewhere(document: Path) -> None:
-    """Every relative link and picture exists."""
-    targets = re.findall(r"\]\(([^)#]+)\)", document.read_text())
-    missing = [t for t in targets if not t.startswith("http") and not (document.parent / t).exists()]
-    assert missing == []
+    """Every relative link and picture exists, and every heading that a link names."""
+    for target in re.findall(r"\]\(([^)]+)\)", document.read_text()):
+        if target.startswith("http"):
+            continue
+        path, _, heading = target.partition("#")
+        found = document.parent / path if path else document
+        assert found.exists(), target
+        if heading:
+            assert heading in {anchor(line) for line in re.findall(r"^#+ (.*)$", found.read_text(), re.M)}, target
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_pictures_are_shown_and_small() -> None:
+    """Each picture stands in a document and loads at once."""
+    shown = {target for path in DOCUMENTS for target in re.findall(r"pictures/([\w.]+)\)", path.read_text())}
+    pictures = list((ROOT / "docs" / "pictures").iterdir())
+    assert {picture.name for picture in pictures} == shown
+    assert [picture.name for picture in pictures if picture.stat().st_size > 150_000] == []
+
+
+@each_document
 def test_measured_sections_have_content(document: Path) -> None:
     """Every mark ``<!-- name -->`` has its end, and between them stands what was measured."""
     text = document.read_text()
@@ -36,24 +82,147 @@ def test_measured_sections_have_content(document: Path) -> None:
         assert text.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0].strip(), name
 
 
-def test_readme_lists_the_catalogue_and_the_commands() -> None:
-    """Tables of the README name exactly the networks, recipes and commands that there are."""
+@each_document
+def test_table_cells_are_short(document: Path) -> None:
+    """A cell of a table holds a figure or a phrase, not a paragraph."""
+    rows = [line for line in document.read_text().splitlines() if line.startswith("|")]
+    cells = [cell.strip() for row in rows for cell in re.split(r"(?<!\\)\|", row)]
+    assert [cell for cell in cells if len(cell) > WIDTH] == []
+
+
+@pytest.mark.parametrize("document", WRITTEN, ids=named)
+def test_lines_wrap(document: Path) -> None:
+    """Lines end before column 120, but for table rows and what a benchmark writes between marks."""
+    text = re.sub(r"^<!-- (\w+) -->$.*?^<!-- /\1 -->$", "", document.read_text(), flags=re.M | re.S)
+    assert [line for line in text.splitlines() if len(line) > WIDTH and not line.startswith("|")] == []
+
+
+def test_readme_is_short() -> None:
+    """The first page is read in three minutes."""
     text = (ROOT / "README.md").read_text()
-    commands = set(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
-    assert set(re.findall(r"^\| `cirl (\w+)", text, re.MULTILINE)) == commands
+    assert len(text.split()) <= 700
+    (code,) = blocks(text, "python")
+    assert len([line for line in code.splitlines() if line]) <= 10
+
+
+def test_every_page_is_found_from_the_readme() -> None:
+    """The README leads to each document."""
+    text = (ROOT / "README.md").read_text()
+    assert [named(path) for path in DOCUMENTS if path.parent != ROOT and f"({named(path)})" not in text] == []
+
+
+def shown_commands(text: str) -> Iterator[str]:
+    """Yield the ``cirl`` command lines of a document, from its blocks and its prose."""
+    lines = "\n".join(blocks(text)).replace("\\\n", " ").splitlines()
+    parts = [part.strip() for line in lines for part in line.split("&&")]
+    for line in parts + spans(text):
+        if line.startswith("cirl "):
+            yield line.split("  #")[0].replace("…", "")
+
+
+@each_document
+def test_commands_are_those_of_the_command_line(document: Path) -> None:
+    """Each ``cirl`` command shown has a name, options and arguments that the program takes."""
+    for line in shown_commands(document.read_text()):
+        _, name, *arguments = shlex.split(line)
+        assert name in COMMANDS, line
+        if arguments:
+            COMMANDS[name].make_context(name, arguments)  # raises what the program would print
+
+
+def test_a_renamed_option_is_noticed() -> None:
+    """The test of the commands can fail."""
+    with pytest.raises(Exception, match="No such option: --learner"):
+        COMMANDS["train"].make_context("train", ["copper_net", "--learner", "independent_ppo"])
+
+
+@each_document
+def test_make_targets_exist(document: Path) -> None:
+    """What the documents say to make, the Makefile makes."""
+    text = document.read_text()
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.M)
+    shown = re.findall(r"^make ([\w-]+)", "\n".join(blocks(text) + spans(text)), re.M)
+    assert set(shown) <= set(targets)
+
+
+@each_document
+def test_python_names_resolve(document: Path) -> None:
+    """Python blocks compile, and what they import exists; so does each dotted name of the library in the prose."""
+    text = document.read_text()
+    for code in blocks(text, "python"):
+        for statement in ast.walk(ast.parse(code)):
+            if isinstance(statement, ast.ImportFrom):
+                for alias in statement.names:
+                    resolve(f"{statement.module}.{alias.name}")
+            elif isinstance(statement, ast.Import):
+                for alias in statement.names:
+                    resolve(alias.name)
+    for name in re.findall(r"(?<![\w/])cirl_marl(?:\.\w+)+", "\n".join(spans(text))):
+        resolve(name)
+
+
+def resolve(name: str) -> object:
+    """Return what a dotted name stands for."""
+    parts = name.split(".")
+    found: object = importlib.import_module(parts[0])
+    for i, part in enumerate(parts[1:], start=2):
+        if not hasattr(found, part):
+            importlib.import_module(".".join(parts[:i]))
+        found = getattr(found, part)
+    return found
+
+
+def test_reference_lists_the_catalogue_and_the_commands() -> None:
+    """Tables of the reference name exactly the networks, recipes and commands that there are."""
+    text = (ROOT / "docs" / "reference.md").read_text()
+    assert set(re.findall(r"^\| `cirl (\w+)", text, re.MULTILINE)) == set(COMMANDS)
     for name in cirl_marl.networks():
         network = cirl_marl.load_network(name)
         row = next(line for line in text.splitlines() if line.startswith(f"| `{name}`"))
-        assert f"| {len(network.compartments)} (" in row
+        assert f"| {len(network.compartments)} ({len(network.nodes)} nodes, {len(network.arcs)} arcs) |" in row
         assert f"| {len(network.agents)} |" in row
     section = text.split("## Learner recipes")[1].split("## ")[0]
     assert set(re.findall(r"^\| `(\w+)`", section, re.MULTILINE)) == set(cirl_marl.recipes())
 
 
+def test_architecture_draws_the_imports() -> None:
+    """The drawing names every package once, and each imports only from lines below its own."""
+    drawing = blocks((ROOT / "docs" / "architecture.md").read_text())[0]
+    house = rooms(arrows(modules(ROOT)))
+    packages = set(house) - {"__init__"}
+    names = [line.split("  ")[0].split(", ") for line in drawing.splitlines()]
+    floor = {name: -i for i, row in enumerate(names) for name in row}
+    assert sorted(name for row in names for name in row) == sorted(packages)
+    up = [(a, b) for a, b in house.edges if "__init__" not in (a, b) and floor[b] >= floor[a]]
+    assert up == []
+    assert max(floor[name] for name in house.successors("__init__")) == floor["environments"]
+
+
+def test_readme_results_are_those_of_the_study() -> None:
+    """Each row of the README's table stands, rounded, in the study."""
+    study = (ROOT / "docs" / "study.md").read_text()
+    who = {"neutral control": "neutral", "model predictive control": "mpc"}
+    rows = re.findall(
+        r"^\| `(\w+_net)` \| ([^|]+) \| (\S+) (k?t) \| (\S+) \| ([^|]+) \|$", (ROOT / "README.md").read_text(), re.M
+    )
+    assert len(rows) == 8
+    for network, acting, circularity, unit, service, gap in rows:
+        section = study.split(f"<!-- {network} -->")[1].split(f"<!-- /{network} -->")[0]
+        name = who.get(acting, re.sub(r"`(\w+)`.*", r"\1", acting))
+        cells = [cell.strip() for cell in re.search(rf"^\| {name} \|.*$", section, re.M)[0].split("|")]  # type: ignore[index]
+        assert f"λ̄ ({unit})" in section
+        measured = float(cells[2].split()[0])
+        assert abs(float(circularity) - measured) <= 0.5 * 10.0 ** -len(circularity.partition(".")[2]), (network, name)
+        assert cells[4].startswith(service)
+        assert abs(float(gap.split("%")[0]) - float(cells[6].split("%")[0])) <= 0.5
+        if "steps" in acting:
+            assert cells[8].replace(",", " ") in acting
+
+
 @pytest.mark.medium
 def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The ten lines of Python run as printed, but for a shorter training."""
-    code = (ROOT / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    (code,) = blocks((ROOT / "README.md").read_text(), "python")
     assert "seed=0)" in code
     recipe = load_recipe("independent_ppo")
     short = recipe.model_copy(update={"run": recipe.run.model_copy(update={"steps": 1280})})
@@ -61,25 +230,46 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     exec(compile(code, "README.md", "exec"), names)
-    assert "PPO" in type(names["training"].trainees["mine"].model).__name__  # type: ignore[attr-defined]
+    assert "PPO" in type(names["training"].learners["mine"].model).__name__  # type: ignore[attr-defined]
     assert (tmp_path / "runs" / "mine" / "status.json").is_file()
 
 
 @pytest.mark.medium
-def test_readme_example_of_one_agent_runs() -> None:
+def test_reference_example_of_one_agent_runs() -> None:
     """One compartment learns as printed, but for a shorter training."""
-    code = (ROOT / "README.md").read_text().split("```python\n")[2].split("```")[0]
+    (code,) = blocks((ROOT / "docs" / "reference.md").read_text(), "python")
     assert ".learn(20_000)" in code
     names: dict[str, Any] = {}
-    exec(compile(code.replace("20_000", "2_048"), "README.md", "exec"), names)
+    exec(compile(code.replace("20_000", "2_048"), "reference.md", "exec"), names)
     assert names["model"].num_timesteps == 2_048
+
+
+def test_getting_started_prints_what_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first network is valid, and what its commands print before the training is what the page shows."""
+    text = (ROOT / "docs" / "getting_started.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    Path("pallets.toml").write_text(blocks(text, "toml")[0])
+    for command in (
+        "check pallets.toml",
+        "simulate pallets.toml --control neutral",
+        "plan pallets.toml --control optimum",
+    ):
+        shown = text.split(f"```\ncirl {command}\n```\n")[1].split("```\n")[1].strip()
+        monkeypatch.setattr(sys, "argv", ["cirl", *command.split()])
+        with pytest.raises(SystemExit):
+            cli.main()
+        assert shown in capsys.readouterr().out
+    exec(compile(blocks(text, "python")[0], "getting_started.md", "exec"), {})
+    assert capsys.readouterr().out.startswith(text.split("print(bound(")[1].split("```\n")[2].split("...")[0])
 
 
 def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The whole network shown to newcomers reads without a mistake and can be run."""
     definition = tmp_path / "bottles.toml"
-    definition.write_text((ROOT / "envs" / "README.md").read_text().split("```toml\n")[1].split("```")[0])
-    network = read_network(definition)
+    definition.write_text(blocks((ROOT / "envs" / "README.md").read_text(), "toml")[0])
+    network = Definition(definition).network()
     env = cirl_marl.parallel_env(network)
     env.reset(seed=0)
     env.step({agent: [0.0] for agent in env.agents})
@@ -88,7 +278,7 @@ def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:
 
 def test_own_model_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The tables shown for a model of one's own belong to a network that can be run."""
-    whole, parts = (part.split("```")[0] for part in (ROOT / "envs" / "README.md").read_text().split("```toml\n")[1:])
+    whole, parts = blocks((ROOT / "envs" / "README.md").read_text(), "toml")
     definition = tmp_path / "brewery.toml"
     definition.write_text(re.sub(r"\[episode\].*?\n\n", "", whole.split("[nodes.")[0], flags=re.DOTALL) + parts)
     env = cirl_marl.parallel_env(definition)
@@ -101,12 +291,10 @@ def test_own_model_in_the_guide_is_valid(tmp_path: Path) -> None:
 def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The recipe shown to newcomers learns in the network that it is shown for, and what is added to it reads."""
     path = tmp_path / "my_recipe.toml"
-    whole, addition = (
-        part.split("```")[0] for part in (ROOT / "agents" / "README.md").read_text().split("```toml\n")[1:]
-    )
+    whole, addition = blocks((ROOT / "agents" / "README.md").read_text(), "toml")
     path.write_text(whole)
     training = train("copper_net", path, steps=640, envs=8)
-    assert type(training.trainees["mine"].model).__name__ == "SAC"
+    assert type(training.learners["mine"].model).__name__ == "SAC"
     path.write_text(whole + addition)
     assert load_recipe(path).match[1].algorithm == "TQC"
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from small_networks import NO_STATES, advanced, small, start
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, VectorEnv
-from cirl_marl.compartments import RewardState
+from cirl_marl.compartments import ContinuousModel, Outflowing, RewardState
 from cirl_marl.dynamics.motion import Dynamics
 
 Floats = NDArray[np.float64]
@@ -28,7 +28,7 @@ def order(id_: str, donor: str, recipient: str, most: float) -> Arc:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
+class Source(ContinuousModel, Outflowing):
     """A model without states whose output is constant."""
 
     kind: ClassVar[str] = "source"

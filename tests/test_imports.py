@@ -96,7 +96,12 @@ def test_packages_say_their_subject() -> None:
 def test_import_is_light() -> None:
     """What trains nothing loads neither torch nor mujoco; ``learners`` itself only when a training is asked for."""
     light = [name for name in modules(CHECKOUT) if room_of(name) not in TRAINING and ".robots." not in name]
-    light += [f"{PACKAGE}.learners", f"{PACKAGE}.learners.run", f"{PACKAGE}.learners.recipe", f"{PACKAGE}.paper.plan"]
+    light += [
+        f"{PACKAGE}.learners",
+        f"{PACKAGE}.learners.run",
+        f"{PACKAGE}.learners.recipe",
+        f"{PACKAGE}.paper.selection",
+    ]
     code = (
         "import sys, importlib\n"
         f"for name in {light!r}:\n"

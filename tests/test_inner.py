@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv, parallel_env
 from cirl_marl.compartments import model_class
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.definitions.reading import read_network, write_network
+from cirl_marl.definitions.reading import Definition, write_network
 from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Episode, Law, Objective, Observation
@@ -213,7 +213,7 @@ def test_definition_with_a_model_reads_back(tmp_path: Path) -> None:
     """A network with inner physics is written and read to the last bit."""
     network = digester_network()
     write_network(network, tmp_path / "digestion.toml")
-    found = read_network(tmp_path / "digestion.toml")
+    found = Definition(tmp_path / "digestion.toml").network()
     assert (found.nodes, found.arcs, found.episode) == (network.nodes, network.arcs, network.episode)
 
 

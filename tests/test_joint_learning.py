@@ -21,7 +21,7 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import load_recipe, train
 from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.lockstep import Lockstep
-from cirl_marl.learners.recipe import Learner, Match, Normalisation, Recipe, Run
+from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.trained import Trained
 from cirl_marl.learners.training import Training
@@ -138,7 +138,7 @@ def test_team_reward() -> None:
         np.testing.assert_allclose(outcome.reward, np.tile(expected, (len(env.agents), 1)), rtol=1e-12)
 
 
-def small(learner: Learner, **options: Any) -> Recipe:
+def small(learner: LearnerSettings, **options: Any) -> Recipe:
     """Return a recipe for two copies."""
     return Recipe(name="small", title="small", learner=learner, run=Run(steps=64, envs=2), **options)
 
@@ -222,18 +222,18 @@ def test_actor_is_local_and_critic_central() -> None:
 
 def test_trained_actors_need_no_state(tmp_path: Path) -> None:
     """A saved run acts by observations alone, as its policy does with the state before it."""
-    learner = Learner(scheme="shared", algorithm="PPO", policy="CentralCriticPolicy", parameters=SMALL)
+    learner = LearnerSettings(scheme="shared", algorithm="PPO", policy="CentralCriticPolicy", parameters=SMALL)
     training = train("carbo_net", small(learner), directory=tmp_path / "run", horizon=8)
     env = vector_env("carbo_net", num_envs=3, horizon=8)
     observations = env.reset(seed=9)
     controller = Trained(tmp_path / "run")
     controller.start(env, 9)
     got = controller.act(observations)
-    trainee = training.trainees["shared-learner"]
+    learnt = training.learners["shared-learner"]
     view = WithState(env, SharedPolicy(env, env.agents))
     rows = view.observe(observations, env.state)
-    normalised: Any = trainee.env.normalize_obs(rows)  # type: ignore[attr-defined]
-    expected = view.act(trainee.model.predict(normalised, deterministic=True)[0])
+    normalised: Any = learnt.env.normalize_obs(rows)  # type: ignore[attr-defined]
+    expected = view.act(learnt.model.predict(normalised, deterministic=True)[0])
     for agent in env.agents:
         np.testing.assert_array_equal(got[agent], expected[agent])
     unseen: Any = view.observe(observations, unseen_state(env))
@@ -261,7 +261,7 @@ def learnt(name: str, recipe: Recipe, **options: Any) -> Training:
     network = cirl_marl.load_network(name)
     began = {group.name: Beginning() for group in recipe.groups(network, network.agents)}
     training = train(name, recipe, callbacks=began, **options)
-    assert set(training.trainees) == set(began)
+    assert set(training.learners) == set(began)
     for learner, callback in began.items():
         for which, value in callback.parameters_now().items():
             assert not torch.equal(value, callback.first[which]), f"{learner}: {which} did not move"
@@ -277,17 +277,17 @@ def test_learners_share_by_match(tmp_path: Path) -> None:
         Match(kind="node", scheme="shared", algorithm="PPO", parameters=SMALL),
         Match(agents=["use_to_collection", "collection_to_sorting"], scheme="joint", algorithm="PPO", parameters=SMALL),
     ]
-    recipe = small(Learner(scheme="shared", algorithm="PPO", parameters=SMALL), match=matches)
+    recipe = small(LearnerSettings(scheme="shared", algorithm="PPO", parameters=SMALL), match=matches)
     training = learnt("copper_net", recipe, directory=tmp_path / "run", horizon=8)
-    members = {name: trainee.seat.view.agents for name, trainee in training.trainees.items()}
+    members = {name: learner.seat.view.agents for name, learner in training.learners.items()}
     assert set(members) == {"shared-learner-0", "shared-learner-2", "joint-learner", "mine"}
     assert sorted(a for agents in members.values() for a in agents) == sorted(training.env.agents)
     assert members["joint-learner"] == ("use_to_collection", "collection_to_sorting")
     network = training.env.network
     assert all(agent in network.node_index for agent in members["shared-learner-2"])
     assert all(agent in network.arc_index for agent in members["shared-learner-0"])
-    for name, trainee in training.trainees.items():
-        assert trainee.model.num_timesteps == 64 * max(1, len(trainee.seat.view.row_agents)), name
+    for name, learner in training.learners.items():
+        assert learner.model.num_timesteps == 64 * max(1, len(learner.seat.view.row_agents)), name
     controller, env = Trained(tmp_path / "run"), vector_env("copper_net", num_envs=2, horizon=8)
     assert np.isfinite(rollout(env, controller).episode_circularity).all()
 
@@ -316,14 +316,14 @@ def test_every_recipe_learns_on_every_network(name: str, network: str) -> None:
 
 def seen_values(training: Any) -> NDArray[np.floating]:
     """Return all weights of a training in one array."""
-    weights = [p.detach().numpy().ravel() for t in training.trainees.values() for p in t.model.policy.parameters()]
+    weights = [p.detach().numpy().ravel() for t in training.learners.values() for p in t.model.policy.parameters()]
     return np.concatenate(weights)
 
 
 @pytest.mark.parametrize("scheme", ["shared", "joint"])
 def test_same_seed_gives_the_same_bits(scheme: Any) -> None:
     """Learners of several agents are reproducible, and another seed gives other weights."""
-    recipe = small(Learner(scheme=scheme, algorithm="PPO", parameters=SMALL))
+    recipe = small(LearnerSettings(scheme=scheme, algorithm="PPO", parameters=SMALL))
     first, again, other = (seen_values(train("carbo_net", recipe, seed=seed, horizon=8)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
@@ -349,9 +349,9 @@ def test_time_limit_may_be_the_end() -> None:
     """Without bootstrap the last step's reward stands alone; with it the value of what comes next is added."""
     paid = {}
     for bootstrap in (True, False):
-        spec = Learner(scheme="joint", algorithm="PPO", parameters=SMALL, bootstrap=bootstrap)
+        spec = LearnerSettings(scheme="joint", algorithm="PPO", parameters=SMALL, bootstrap=bootstrap)
         training = train("carbo_net", small(spec.model_copy(update={"normalise": NOTHING})), horizon=8, steps=16)
-        model: Any = training.trainees["joint-learner"].model
+        model: Any = training.learners["joint-learner"].model
         paid[bootstrap] = model.rollout_buffer.rewards.copy()
     np.testing.assert_array_equal(paid[True][:-1], paid[False][:-1])
     assert (paid[True][-1] != paid[False][-1]).all()
@@ -362,7 +362,7 @@ def test_weight_of_circularity_is_an_option(tmp_path: Path) -> None:
     half, most = (vector_env("copper_net", num_envs=2, reward="team", circularity_weight=w) for w in (None, 0.9))
     assert (half.network.objective.circularity_weight, most.network.objective.circularity_weight) == (0.5, 0.9)
     assert cirl_marl.parallel_env("copper_net", circularity_weight=1.0).network.objective.circularity_weight == 1.0
-    recipe = small(Learner(scheme="joint", algorithm="PPO", parameters=SMALL))
+    recipe = small(LearnerSettings(scheme="joint", algorithm="PPO", parameters=SMALL))
     training = train("copper_net", recipe, directory=tmp_path / "run", horizon=8, steps=16, circularity_weight=0.9)
     assert training.run is not None
     assert training.run.config.options["circularity_weight"] == 0.9

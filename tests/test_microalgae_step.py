@@ -81,7 +81,7 @@ class TestAnyStep:
     def test_positive(self, situation: tuple[Model, Floats, Floats, float]) -> None:
         """S > 0 (it is fed), X > 0 unless there was none, Q > k_q, uptake ≥ 0."""
         model, state, inputs, interval = situation
-        after, outflow = model.advance(state, inputs, interval)
+        after, outflow = model.integrate(state, inputs, interval)
         assert after[-1, 0] > 0.0
         assert after[0, 0] > 0.0 if state[0, 0] > 0.0 else after[0, 0] == 0.0
         if isinstance(model, MicroalgaeDroop):
@@ -95,7 +95,7 @@ class TestAnyStep:
     def test_nutrient_is_conserved(self, situation: tuple[Model, Floats, Floats, float]) -> None:
         """N tends to the feed's like a tracer, N = S_in + (N₀ − S_in)e^(−Dt), to round-off."""
         model, state, inputs, interval = situation
-        after, _ = model.advance(state, inputs, interval)
+        after, _ = model.integrate(state, inputs, interval)
         before = total(model, state)[0]
         expected = FEED + (before - FEED) * np.exp(-DILUTION * interval)
         if before < FEED:  # without the difference of two nearly equal numbers
@@ -111,11 +111,11 @@ class TestAnyStep:
         state = np.stack([*rows[: len(model.state_names) - 1], 10.0 ** rng.uniform(-5, 2, size)])
         inputs = rng.uniform(0.0, 150.0, (1, size))
         kept = state.copy(), inputs.copy()
-        after, outflow = model.advance(state, inputs, 0.02)
+        after, outflow = model.integrate(state, inputs, 0.02)
         assert after.shape == state.shape
         assert outflow.shape == (size,)
         for b in range(0, size, max(1, size // 50)):
-            own, own_outflow = model.advance(state[:, b : b + 1].copy(), inputs[:, b : b + 1].copy(), 0.02)
+            own, own_outflow = model.integrate(state[:, b : b + 1].copy(), inputs[:, b : b + 1].copy(), 0.02)
             np.testing.assert_array_equal(own, after[:, b : b + 1])
             np.testing.assert_array_equal(own_outflow, outflow[b : b + 1])
         np.testing.assert_array_equal(state, kept[0])
@@ -134,7 +134,7 @@ class TestAccuracy:
         state = reference
         for light in JUMPING_LIGHT:
             reference, uptake = exact(model, reference, light, interval)
-            state, outflow = model.advance(state, np.array([[light]]), interval)
+            state, outflow = model.integrate(state, np.array([[light]]), interval)
             np.testing.assert_allclose(state[:-1], reference[:-1], rtol=1e-5)
             np.testing.assert_allclose(state[-1], reference[-1], rtol=1e-2)
             assert outflow[0] == pytest.approx(uptake, rel=1e-4)
@@ -151,7 +151,7 @@ class TestAccuracy:
         for count in steps:
             monkeypatch.setattr(nutrient, "SUBSTEP", interval * rate / (count - 0.5))
             assert nutrient.substeps(interval, rate) == count
-            after, outflow = model.advance(state, np.array([[light]]), interval)
+            after, outflow = model.integrate(state, np.array([[light]]), interval)
             errors.append([abs(after[0, 0] / reference[0, 0] - 1.0), abs(outflow[0] / uptake - 1.0)])
         slopes = np.polyfit(np.log(steps), np.log(errors), 1)[0]
         # below 2e-8 what is left is the lag of S behind its quasi-steady value, which no slow step resolves
@@ -163,29 +163,29 @@ class TestAccuracy:
     def test_stiff_nutrient_settles(self, model: Model, interval: float, outside: float) -> None:
         """Hundreds of time constants later S is where supply and uptake balance."""
         state, inputs = column(model, 60.0, 1.0, outside), np.array([[30.0]])
-        after, _ = model.advance(state, inputs, interval + 0.1)
+        after, _ = model.integrate(state, inputs, interval + 0.1)
         assert abs(model.derivative(after, inputs)[-1, 0]) < 1e-4 * DILUTION * FEED
-        again, _ = model.advance(after, inputs, 1e-6)
+        again, _ = model.integrate(after, inputs, 1e-6)
         assert again[-1, 0] == pytest.approx(after[-1, 0], rel=1e-3)
 
     @pytest.mark.parametrize("model", [MicroalgaeMonod(), MicroalgaeDroop()], ids=lambda model: model.kind)
     def test_uptake_and_state_agree(self, model: Model) -> None:
         """∫ρX = ∫D(S_in − S) − (S⁺ − S): without dilution, what S lost to round-off."""
         inputs, state, interval = np.array([[60.0]]), column(model, 20.0, 1.0, 4.0), 0.02
-        after, outflow = replace(model, dilution_per_day=0.0).advance(state, inputs, interval)
+        after, outflow = replace(model, dilution_per_day=0.0).integrate(state, inputs, interval)
         taken = 1000.0 * interval * outflow[0] / model.co2_per_nutrient
         assert taken == pytest.approx(state[-1, 0] - after[-1, 0], rel=1e-12)
-        after, outflow = model.advance(state, inputs, interval)
+        after, outflow = model.integrate(state, inputs, interval)
         taken = 1000.0 * interval * outflow[0] / model.co2_per_nutrient
         nodes, weights = np.polynomial.legendre.leggauss(24)
-        passed = [model.advance(state, inputs, interval / 2.0 * (1.0 + node))[0][-1, 0] for node in nodes]
+        passed = [model.integrate(state, inputs, interval / 2.0 * (1.0 + node))[0][-1, 0] for node in nodes]
         supplied = DILUTION * interval * (FEED - weights @ np.array(passed) / 2.0)
         assert taken == pytest.approx(supplied - (after[-1, 0] - state[-1, 0]), rel=1e-6)
 
     def test_published_uptake_and_state_agree(self) -> None:
         """Monod's biomass has no other source: ∫Yρ = ln(X⁺/X) + D·interval, to second order."""
         model, state = MicroalgaeMonod(form="published"), np.array([[20.0], [4.0]])
-        after, outflow = model.advance(state, np.array([[60.0]]), 0.25)
+        after, outflow = model.integrate(state, np.array([[60.0]]), 0.25)
         grown = np.log(after[0, 0] / state[0, 0]) + DILUTION * 0.25
         taken = 0.25 * outflow[0] / model.co2_per_nutrient
         assert model.biovolume_yield * taken == pytest.approx(grown, rel=1e-5)
@@ -196,7 +196,7 @@ class TestAccuracy:
         biomass = 10.0 ** np.arange(-40.0, -5.0)
         for outside in (1e-4, 0.01, 50.0):
             state = np.concatenate([column(model, size, 1.0, outside) for size in biomass], axis=1)
-            after, outflow = model.advance(state, np.full((1, len(biomass)), 60.0), 0.0125)
+            after, outflow = model.integrate(state, np.full((1, len(biomass)), 60.0), 0.0125)
             np.testing.assert_allclose(after[0] / biomass, after[0, -1] / biomass[-1], rtol=1e-3)
             assert (after[:-1] > 0.0).all()
             size = biomass if model.form == "sound" else np.ones_like(biomass)
@@ -206,16 +206,16 @@ class TestAccuracy:
         """Without cells S is diluted like a tracer; without feed or nutrient nothing is taken up; no warning."""
         for model in MODELS:
             state, inputs = column(model, 0.0, 1.0, 3.0), np.array([[60.0]])
-            after, _ = model.advance(state, inputs, 0.3)
+            after, _ = model.integrate(state, inputs, 0.3)
             assert after[0, 0] == 0.0
             assert after[-1, 0] == pytest.approx(FEED - 97.0 * np.exp(-DILUTION * 0.3), rel=1e-13)
             starved = replace(model, nutrient_in_umol_l=0.0)
-            after, outflow = starved.advance(column(model, 5.0, 1.0, 0.0), inputs, 0.3)
+            after, outflow = starved.integrate(column(model, 5.0, 1.0, 0.0), inputs, 0.3)
             assert (after[-1, 0], outflow[0]) == (0.0, 0.0)
             batch = replace(model, dilution_per_day=0.0)
-            after, outflow = batch.advance(state, inputs, 0.3)
+            after, outflow = batch.integrate(state, inputs, 0.3)
             np.testing.assert_allclose(after[[0, -1]], state[[0, -1]], rtol=1e-15)
-        dark = MicroalgaeMonod().advance(np.array([[26.0], [1.0]]), np.zeros((1, 1)), 0.3)
+        dark = MicroalgaeMonod().integrate(np.array([[26.0], [1.0]]), np.zeros((1, 1)), 0.3)
         assert dark[0][0, 0] == pytest.approx(26.0 * np.exp(-DILUTION * 0.3), rel=1e-13)
         assert dark[1][0] == 0.0
 

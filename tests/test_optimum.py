@@ -36,7 +36,7 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verified
 from cirl_marl.optimum.maximise import starting_stocks
 from cirl_marl.optimum.program import Programs
-from cirl_marl.optimum.reach import Comparison
+from cirl_marl.optimum.reach import ComparisonSystem
 from cirl_marl.optimum.solver import solve
 
 Floats = NDArray[np.float64]
@@ -149,7 +149,7 @@ def test_reach(network: Network, interval: float, seed: int) -> None:
     network = certifiable(network, interval, pulls=False)
     single = replace(network, nodes=tuple(replace(n, initial=(n.initial[1],) * 2) for n in network.nodes))
     admissible = Admissible.of(single)
-    reached = Comparison(admissible).reach(starting_stocks(single, None), range(single.episode.horizon))
+    reached = ComparisonSystem(admissible).reach(starting_stocks(single, None), range(single.episode.horizon))
     _, _, highest = episodes(single, seed)
     assert (highest <= reached.upper.max(axis=0) * (1 + 1e-9) + 1e-12).all()
     run = rollout(VectorEnv(single, num_envs=1), Neutral())

@@ -91,8 +91,10 @@ def test_kinds_of_the_library_keep_their_names() -> None:
         (":Fermenter", "kind ':Fermenter': write where the class is, as 'package.module:Class'"),
         (".own_models:Fermenter", "kind '.own_models:Fermenter': write where the class is"),
         ("own_models:", "kind 'own_models:': write where the class is"),
-        ("own_models:Aimless", "lacks state_names, time_unit, reward_state, derivative or advance$"),
-        ("cirl_marl.compartments:CompartmentModel", "lacks kind, time_unit, reward_state, derivative or advance$"),
+        ("own_models:Aimless", "it lacks derivative, reward_state, state_names, time_unit$"),
+        ("own_models:Stray", "it inherits from none of ContinuousModel, OwnStepModel, DiscreteTimeModel; it has deriv"),
+        ("own_models:Stray", "it has derivative and does not inherit from ContinuousModel$"),
+        ("cirl_marl.compartments:CompartmentModel", "inherits from none of ContinuousModel, OwnStepModel, Discret"),
         ("fermenter", "unknown compartment kind 'fermenter'"),
     ],
 )

@@ -17,20 +17,21 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from benchmarks.paper import study_rows
+from benchmarks.paper_document import markdown
 from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
 from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.learners.algorithms import build
-from cirl_marl.paper import evaluation, published, running, session, training, tuned
-from cirl_marl.paper.document import markdown
-from cirl_marl.paper.evaluation import evaluate
-from cirl_marl.paper.plan import planned, study
+from cirl_marl.paper import final_policy, published, running, session, tuned, untuned
+from cirl_marl.paper.final_policy import evaluate
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
-from cirl_marl.paper.results import Evaluation, Result, Results, Row, thinned
+from cirl_marl.paper.results import Evaluation, PaperRow, Result, Results, thinned
 from cirl_marl.paper.running import outdated, run_row
+from cirl_marl.paper.selection import planned
 from cirl_marl.paper.table import table_rows
-from cirl_marl.paper.training import Trained, described
 from cirl_marl.paper.tuned import train_tuned
+from cirl_marl.paper.untuned import PaperTraining, described
 
 COPPER = ENVIRONMENTS["CopperNet"]
 
@@ -80,7 +81,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Iterator[PaperEnvironment]:
 def result(algorithm: str = "A2C", steps: int = 200_000, seed: int = 0, end: float = -5e7, **changes: Any) -> Result:
     """Return a result as a training would."""
     made = Result(
-        row=Row(environment="CopperNet", algorithm=algorithm, steps=steps, seed=seed),
+        row=PaperRow(environment="CopperNet", algorithm=algorithm, steps=steps, seed=seed),
         steps_done=steps,
         seconds=90.0,
         episodes=4000,
@@ -126,7 +127,7 @@ def test_row_is_trained_kept_and_not_run_again(
     assert kept["row"] == {
         "environment": "CopperNet",
         "algorithm": algorithm,
-        "recipe": "published",
+        "settings": "published",
         "steps": steps,
         "seed": 0,
     }
@@ -152,7 +153,8 @@ def test_row_is_trained_kept_and_not_run_again(
 def test_same_seed_same_figures() -> None:
     """The seed decides model and environment."""
     first, second, other = (
-        run_row(Row(environment="CopperNet", algorithm="A2C", steps=100, seed=seed), episodes=20) for seed in (1, 1, 2)
+        run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=100, seed=seed), episodes=20)
+        for seed in (1, 1, 2)
     )
     assert first.curve == second.curve != other.curve
     assert first.evaluation == second.evaluation
@@ -168,7 +170,7 @@ def test_weights_that_become_nan_are_a_result(
     def wild(name: str, policy: str, env: VecEnv, parameters: dict[str, Any], **fixed: Any) -> BaseAlgorithm:
         return build(name, policy, env, parameters | {"learning_rate": 1e30}, **fixed)
 
-    monkeypatch.setattr(training, "build", wild)
+    monkeypatch.setattr(untuned, "build", wild)
     arguments = (algorithm, "--steps", "10000", "--out", str(tmp_path))
     assert cirl(monkeypatch, *arguments) == 0
     assert "weights NaN after" in capsys.readouterr().out
@@ -197,7 +199,7 @@ def test_a_session_goes_on_after_a_row_that_fails(
 ) -> None:
     """The failure is said and in the exit code; other rows are run and shown."""
 
-    def run(row: Row, **_: Any) -> Result:
+    def run(row: PaperRow, **_: Any) -> Result:
         if row.algorithm == "A2C":
             raise CirlError("no training episode ended")
         return replace(result(row.algorithm), row=row)
@@ -215,7 +217,9 @@ def test_a_session_goes_on_after_a_row_that_fails(
 
 def test_recipes_of_other_versions_are_outdated() -> None:
     """A recorded recipe with a key that recipes no longer have is another one."""
-    found = replace(result("PPO"), row=Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=200_000))
+    found = replace(
+        result("PPO"), row=PaperRow(environment="CopperNet", algorithm="PPO", settings="tuned", steps=200_000)
+    )
     recorded = load_recipe("paper_copper_net").model_dump(mode="json")
     assert outdated(replace(found, settings={"recipe": recorded})) == ""
     assert "another now" in outdated(replace(found, settings={"recipe": recorded | {"gone": 1}}))
@@ -223,9 +227,9 @@ def test_recipes_of_other_versions_are_outdated() -> None:
 
 def test_other_failures_of_a_training_are_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only broken weights are what the settings give; anything else that goes wrong is said."""
-    monkeypatch.setattr(training.Watch, "_on_step", lambda _: int("none"))
+    monkeypatch.setattr(untuned.Watch, "_on_step", lambda _: int("none"))
     with pytest.raises(ValueError, match="invalid literal"):
-        run_row(Row(environment="CopperNet", algorithm="SAC", steps=200))
+        run_row(PaperRow(environment="CopperNet", algorithm="SAC", steps=200))
 
 
 def test_interrupted_row_leaves_nothing(
@@ -309,7 +313,9 @@ def test_summary_says_what_was_reached() -> None:
         runs = [
             replace(
                 made,
-                row=Row(environment=name, algorithm=algorithm, recipe="tuned", steps=environment.steps, seed=seed),
+                row=PaperRow(
+                    environment=name, algorithm=algorithm, settings="tuned", steps=environment.steps, seed=seed
+                ),
                 end_return=end,
                 evaluation=Evaluation(episodes=100, mean=mean, deviation=0.1, success=success),
                 published_ends=ends,
@@ -346,7 +352,7 @@ def test_published_table_is_whole() -> None:
 
 def test_study_runs_fast_learners_first() -> None:
     """ARS, PPO and A2C with three seeds on every Box environment, then one seed of the slow ones, then the goals."""
-    rows = [row for row in study() if row.recipe == "published"]
+    rows = [row for row in study_rows() if row.settings == "published"]
     assert len(rows) == 3 * 3 * 7 + 2 * 7 + 4
     assert {row.algorithm for row in rows[:63]} == {"ARS", "PPO", "A2C"}
     assert [row.seed for row in rows[:63]] == sorted(row.seed for row in rows[:63])
@@ -361,16 +367,16 @@ def test_names_choose_rows() -> None:
     assert [row.algorithm for row in planned("FetchWasteSorting", None)] == list(ENVIRONMENTS["FetchWasteSorting"].runs)
     assert [row.seed for row in planned("CopperNet", "ARS", seeds=3)] == [0, 1, 2]
     assert len(planned(None, "SAC")) == 7
-    assert [row.environment for row in planned(None, "SAC", recipe="tuned")] == ["Reacher"]
-    assert [row.algorithm for row in planned("FetchWasteSorting", "TQC-HER", recipe=None)] == ["TQC-HER"] * 2
+    assert [row.environment for row in planned(None, "SAC", settings="tuned")] == ["Reacher"]
+    assert [row.algorithm for row in planned("FetchWasteSorting", "TQC-HER", settings=None)] == ["TQC-HER"] * 2
     with pytest.raises(CirlError, match=r"unknown algorithm of the paper 'PP0'\. Did you mean 'PPO'"):
-        planned(None, "PP0", recipe="tuned")
+        planned(None, "PP0", settings="tuned")
     with pytest.raises(CirlError, match=r"unknown algorithm of the paper 'ppo'\. Did you mean 'PPO'"):
         planned("CopperNet", "ppo")
     with pytest.raises(CirlError, match="A2C is an algorithm, which comes after an environment: Reacher, Tran"):
         planned("A2C", None)
     with pytest.raises(CirlError, match=r"no tuned recipe .* for A2C"):
-        planned(None, "A2C", recipe="tuned")
+        planned(None, "A2C", settings="tuned")
 
 
 def test_results_that_answer_another_question_are_outdated() -> None:
@@ -383,7 +389,7 @@ def test_results_that_answer_another_question_are_outdated() -> None:
     now = described(COPPER)
     assert outdated(replace(kept, settings=now)) == ""
     assert "definition" in outdated(replace(kept, settings=now | {"definition_sha256": "0" * 64}))
-    row = Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=200_000)
+    row = PaperRow(environment="CopperNet", algorithm="PPO", settings="tuned", steps=200_000)
     plain = load_recipe("paper_copper_net").model_dump(mode="json")
     assert outdated(replace(kept, row=row, settings=now | {"recipe": plain})) == ""
     longer = plain | {"run": {"steps": 1, "envs": 1}}
@@ -419,7 +425,7 @@ def test_results_need_a_directory(
 def test_goal_task_learns_with_hindsight(toy: PaperEnvironment) -> None:
     """Successes count when they come, in the number of episodes asked for."""
     del toy
-    found = run_row(Row(environment="Toy", algorithm="SAC-HER", steps=110), episodes=40)
+    found = run_row(PaperRow(environment="Toy", algorithm="SAC-HER", steps=110), episodes=40)
     assert found.evaluation == Evaluation(episodes=40, mean=-10.0, deviation=0.0, success=50.0)
     assert found.end_return == -10.0
     assert found.settings["policy"] == "MultiInputPolicy"
@@ -441,7 +447,7 @@ def recipe(algorithm: str, environment: dict[str, Any] | None = None, **paramete
 @pytest.mark.medium
 def test_tuned_network_counts_steps_and_episodes_over_the_copies() -> None:
     """As many environment steps as asked for, the returns of all copies, the paper's reward."""
-    row = Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=800)
+    row = PaperRow(environment="CopperNet", algorithm="PPO", settings="tuned", steps=800)
     trained = train_tuned(COPPER, row, lambda *_: None, recipe("PPO", n_steps=50, batch_size=100))
     assert (trained.steps, len(trained.returns), trained.ends[-1]) == (800, 16, 800)
     assert all(-5e8 < value < -4.6e7 for value in trained.returns)
@@ -460,16 +466,16 @@ def test_tuned_policy_is_measured_behind_its_normaliser(monkeypatch: pytest.Monk
         return kept[-1]
 
     monkeypatch.setattr(tuned, "train", keeping)
-    row = Row(environment="CopperNet", algorithm="PPO", recipe="tuned", steps=200)
+    row = PaperRow(environment="CopperNet", algorithm="PPO", settings="tuned", steps=200)
     trained = train_tuned(COPPER, row, lambda *_: None, recipe("PPO", n_steps=50, batch_size=100))
-    (trainee,) = kept[0].trainees.values()
-    assert isinstance(trainee.env, VecNormalize)
+    (learner,) = kept[0].learners.values()
+    assert isinstance(learner.env, VecNormalize)
     seen = np.random.default_rng(0).uniform(50, 2000, (3, 6)).astype(np.float32)
     assert trained.predict is not None
     chosen = trained.predict(seen, None, np.ones(3, dtype=bool))[0]
-    expected = trainee.model.predict(np.asarray(trainee.env.normalize_obs(seen)), deterministic=True)[0]
+    expected = learner.model.predict(np.asarray(learner.env.normalize_obs(seen)), deterministic=True)[0]
     np.testing.assert_array_equal(chosen, expected)
-    assert not np.array_equal(chosen, trainee.model.predict(seen, deterministic=True)[0])
+    assert not np.array_equal(chosen, learner.model.predict(seen, deterministic=True)[0])
 
 
 @pytest.mark.medium
@@ -497,7 +503,7 @@ def test_final_policies_play_their_quota_on_episodes_of_their_own() -> None:
 def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """r_s and r_e are means over 100 episodes each, or over half of those that there were."""
     returns = list(np.random.default_rng(0).normal(size=episodes))
-    done = Trained(
+    done = PaperTraining(
         predict=lambda *_: (np.zeros((20, 1), dtype=np.float32), None),
         ends=[50 * (i + 1) for i in range(episodes)],
         returns=returns,
@@ -508,8 +514,8 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
         options={},
     )
     monkeypatch.setattr(running, "train_published", lambda *_: done)
-    monkeypatch.setattr(evaluation, "EVALUATION_EPISODES", 20)
-    found = run_row(Row(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
+    monkeypatch.setattr(final_policy, "EVALUATION_EPISODES", 20)
+    found = run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
     assert found.start_return == pytest.approx(np.mean(returns[:window]))
     assert found.end_return == pytest.approx(np.mean(returns[-window:]))
 
@@ -517,7 +523,7 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
 @pytest.mark.medium
 def test_tuned_robot_trains_in_copies(toy: PaperEnvironment) -> None:
     """A goal task gets hindsight and as many steps as asked for."""
-    row = Row(environment="Toy", algorithm="SAC", recipe="tuned", steps=120)
+    row = PaperRow(environment="Toy", algorithm="SAC", settings="tuned", steps=120)
     trained = train_tuned(toy, row, lambda *_: None, recipe("SAC", learning_starts=100, batch_size=16))
     assert (trained.steps, trained.returns) == (120, [-10.0] * 12)
 
@@ -534,7 +540,7 @@ def test_rows_of_other_seeds_have_starts_of_their_own(toy: PaperEnvironment, mon
             return reset(self, seed=seed, options=options)
 
         monkeypatch.setattr(Toy, "reset", recorded)
-        row = Row(environment="Toy", algorithm="SAC", recipe="tuned", steps=120, seed=seed)
+        row = PaperRow(environment="Toy", algorithm="SAC", settings="tuned", steps=120, seed=seed)
         train_tuned(toy, row, lambda *_: None, recipe("SAC", learning_starts=100, batch_size=16))
     assert given[0]
     assert not set(given[0]) & set(given[1])
@@ -543,7 +549,7 @@ def test_rows_of_other_seeds_have_starts_of_their_own(toy: PaperEnvironment, mon
 def test_rows_that_cannot_run_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
     """Too few steps for an episode, and an environment that is not there, are errors."""
     with pytest.raises(CirlError, match="no training episode ended"):
-        run_row(Row(environment="CopperNet", algorithm="A2C", steps=5))
+        run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=5))
     monkeypatch.delitem(gymnasium.registry, COPPER.id)
     with pytest.raises(RunError, match="does not register it"):
-        run_row(Row(environment="CopperNet", algorithm="A2C", steps=5))
+        run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=5))

@@ -64,7 +64,7 @@ class TestReference:
         start = np.array(paper.initial_state, dtype=np.float32)[:, None]
         np.testing.assert_array_equal(start[:, 0], expected[0])
         inputs = paper.inputs(actions[:1][None])
-        rate = model.derivative(start, inputs)
+        rate = model.derivative(start, inputs)  # type: ignore[arg-type]
         state = start + paper.dt * rate
         for i in rounded:
             state[i] = start[i] + np.float32(paper.dt * rate[i])

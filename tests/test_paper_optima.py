@@ -18,7 +18,7 @@ from cirl_marl import VectorEnv
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING, rollout
 from cirl_marl.network import Floats
-from cirl_marl.paper.evaluation import EVALUATION_COPIES, EVALUATION_EPISODES, evaluate
+from cirl_marl.paper.final_policy import EVALUATION_COPIES, EVALUATION_EPISODES, evaluate
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Result, Results
 
@@ -159,7 +159,7 @@ def test_light_makes_hardly_a_difference_to_droop() -> None:
 
 def tuned(name: str) -> list[Result]:
     """Return the rows of our recipe."""
-    return [result for result in kept(name) if result.row.recipe == "tuned"]
+    return [result for result in kept(name) if result.row.settings == "tuned"]
 
 
 def kept(name: str) -> list[Result]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import cirl_marl
 from cirl_marl import Arc, CirlError, Network, Node, Role
 from cirl_marl.drawing import picture as drawing
-from cirl_marl.drawing.arrangement import layout_of
+from cirl_marl.drawing.arrangement import arrangement_of
 from cirl_marl.drawing.digraph import Canvas, draw_network, save_before_after, save_network
 from cirl_marl.network import Floats
 from cirl_marl.report import curves
@@ -93,7 +93,7 @@ def test_catalogue_is_readable(name: str) -> None:
     """In every network of the catalogue no box, label or arrow hides another box or label."""
     network = cirl_marl.load_network(name)
     for aspect in (0.9, 1.6):
-        layout = layout_of(network, aspect)
+        layout = arrangement_of(network, aspect)
         assert layout.routes is not None
         for one, two in combinations(layout.positions, 2):
             assert (np.abs(one - two) > layout.box).any()
@@ -131,7 +131,7 @@ def test_long_chain_and_ring(tmp_path: Path, nodes: int) -> None:
             nodes=tuple(Node(id=f"n{i}") for i in range(nodes)),
             arcs=tuple(Arc(id=f"a{i}", donor=f"n{i}", recipient=f"n{j}", rate=0.1) for i, j in pairs),
         )
-        positions = layout_of(network, 1.4).positions
+        positions = arrangement_of(network, 1.4).positions
         assert len(np.unique(positions, axis=0)) == nodes
         width, height = np.ptp(positions, axis=0)
         assert 0.3 < width / max(height, 1.0) < 12
@@ -142,7 +142,7 @@ def test_long_chain_and_ring(tmp_path: Path, nodes: int) -> None:
 def test_opposite_arcs_keep_apart() -> None:
     """Two arcs between the same compartments bend to opposite sides."""
     network = cirl_marl.load_network("carbo_net")
-    routes = layout_of(network, 1.4).routes
+    routes = arrangement_of(network, 1.4).routes
     assert routes is not None
     there, back = (routes.curves[network.arc_index[arc]] for arc in ("urban_to_adjacent", "adjacent_to_urban"))
     assert np.hypot(*(there[:, None] - back).T).min() > 1.5

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl import CirlError, LearnerError, RecipeError, RunError
 from cirl_marl.learners import Progress, Recipe, RunDirectory, resume, train
 from cirl_marl.learners.learner import load_model
-from cirl_marl.learners.recipe import Demonstrations, Learner, Run
+from cirl_marl.learners.recipe import Demonstrations, LearnerSettings, Run
 
 pytestmark = pytest.mark.medium
 
@@ -60,11 +60,11 @@ def test_a_failed_learner_does_not_take_the_good_checkpoint_with_it(tmp_path: Pa
 
 def test_resumed_exploration_is_fresh(tmp_path: Path, ctrl_c_after: Any) -> None:
     """Before it learns, SAC draws its actions; after a resumption it does not draw the same ones again."""
-    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
+    learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
     recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
-    model = resume(tmp_path).trainees["use"].model
+    model = resume(tmp_path).learners["use"].model
     drawn = model.replay_buffer.actions[:40, 0, 0]  # type: ignore[attr-defined]
     assert len(np.unique(drawn)) == 40
 
@@ -73,11 +73,11 @@ def test_returns_of_several_steps_end_where_a_run_was_stopped(tmp_path: Path, ct
     """19 transitions were kept; the next begins an episode, so that no return goes on into it."""
     parameters = {"learning_starts": 100, "buffer_size": 100, "n_steps": 3}
     recipe = Recipe(
-        name="x", title="x", run=Run(steps=40, envs=1), learner=Learner(algorithm="SAC", parameters=parameters)
+        name="x", title="x", run=Run(steps=40, envs=1), learner=LearnerSettings(algorithm="SAC", parameters=parameters)
     )
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
-    model = resume(tmp_path).trainees["use"].model
+    model = resume(tmp_path).learners["use"].model
     assert isinstance(model, SAC)
     assert isinstance(model.replay_buffer, NStepReplayBuffer)
     assert model.replay_buffer.pos == 40
@@ -115,7 +115,7 @@ def test_misspelt_callbacks_leave_nothing_behind(tmp_path: Path, ppo_recipe: Rec
 @pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"nothing")])
 def test_lost_experience_is_an_error(damage: Callable[[Path], None], tmp_path: Path, ctrl_c_after: Any) -> None:
     """A replay buffer that is gone, or no longer one, is named instead of begun anew."""
-    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
+    learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
     recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
@@ -126,7 +126,7 @@ def test_lost_experience_is_an_error(damage: Callable[[Path], None], tmp_path: P
 
 def test_room_in_a_replay_buffer_costs_little(tmp_path: Path, ctrl_c_after: Any) -> None:
     """A checkpoint is not as large as the buffer may become, but as what is in it."""
-    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 1_000_000})
+    learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 1_000_000})
     recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
@@ -146,7 +146,7 @@ def test_a_complete_run_goes_on_to_more_steps(tmp_path: Path, ppo_recipe: Recipe
         resume(tmp_path, steps=160, report=ctrl_c_after(50))
     policy = load_model(run.checkpoint, "mine", "PPO").policy
     assert policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-2 * (1 - 120 / 160))
-    model = resume(tmp_path).trainees["mine"].model
+    model = resume(tmp_path).learners["mine"].model
     assert (run.status["state"], run.status["joint_steps"], run.config.steps) == ("complete", 85, 160)
     assert model.num_timesteps == 160  # the rollout that was interrupted is begun anew
     after = run.metrics()
@@ -160,7 +160,7 @@ def test_a_complete_run_goes_on_to_more_steps(tmp_path: Path, ppo_recipe: Recipe
 
 def test_what_needs_its_past_does_not_go_on_without(tmp_path: Path) -> None:
     """A complete run has no replay buffers; it says so, and stays what it was."""
-    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
+    learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
     recipe = Recipe(name="x", title="x", run=Run(steps=20, envs=1), learner=learner)
     train("copper_net", recipe, agents=["use"], directory=tmp_path)
     with pytest.raises(RunError, match=r"keep no replay buffers, without which \['use'\] cannot go on"):
@@ -178,9 +178,9 @@ def test_an_interrupted_rollout_is_begun_anew(tmp_path: Path, ppo_recipe: Recipe
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
             resume(tmp_path, report=ctrl_c_after(60))
-    for trainee in resume(tmp_path).trainees.values():
-        assert trainee.model.num_timesteps == 160
-        assert trainee.model._n_updates == 2 * 2  # rollouts and epochs
+    for each in resume(tmp_path).learners.values():
+        assert each.model.num_timesteps == 160
+        assert each.model._n_updates == 2 * 2  # rollouts and epochs
     assert RunDirectory(tmp_path).status["joint_steps"] == 50 + 3 * 30 + 40
 
 
@@ -203,7 +203,7 @@ def test_a_run_is_trained_by_one_at_a_time(tmp_path: Path, ppo_recipe: Recipe) -
 def test_demonstrations_have_room_in_a_run_that_goes_on(tmp_path: Path, ctrl_c_after: Any) -> None:
     """A run is not cut so short that nobody would learn from what is shown."""
     shown = Demonstrations(controller="neutral", steps=60)
-    learner = Learner(algorithm="SAC", parameters={"buffer_size": 100}, demonstrations=shown)
+    learner = LearnerSettings(algorithm="SAC", parameters={"buffer_size": 100}, demonstrations=shown)
     recipe = Recipe(name="x", title="x", run=Run(steps=100, envs=1), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
@@ -214,7 +214,7 @@ def test_demonstrations_have_room_in_a_run_that_goes_on(tmp_path: Path, ctrl_c_a
 
 def test_the_experience_of_another_learner_is_refused(tmp_path: Path, ctrl_c_after: Any) -> None:
     """Replay buffers that were mixed up are found out before anybody learns from them."""
-    learner = Learner(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
+    learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
     for name, observe in (("a", "local"), ("b", "full")):
         options: dict[str, Any] = {"observe": observe}
         recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), environment=options, learner=learner)
@@ -231,7 +231,10 @@ def test_a_policy_that_breaks_is_a_failure(algorithm: str, tmp_path: Path) -> No
     """Learners whose weights overflow end the run as failed, with a reason of one line."""
     parameters = {"learning_starts": 2, "buffer_size": 100, "batch_size": 4, "learning_rate": 1e30}
     recipe = Recipe(
-        name="x", title="x", run=Run(steps=40, envs=1), learner=Learner(algorithm=algorithm, parameters=parameters)
+        name="x",
+        title="x",
+        run=Run(steps=40, envs=1),
+        learner=LearnerSettings(algorithm=algorithm, parameters=parameters),
     )
     with pytest.raises(LearnerError, match="failed at joint step"):
         train("copper_net", recipe, agents=["use"], directory=tmp_path)
@@ -244,7 +247,7 @@ def test_a_policy_that_breaks_is_a_failure(algorithm: str, tmp_path: Path) -> No
 def test_what_cannot_be_kept_is_refused_before_anything_is_written(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """Recipes of Python objects train in memory; a directory needs plain values."""
     parameters = ppo_recipe.learner.parameters | {"learning_rate": lambda left: 1e-3 * left}
-    recipe = ppo_recipe.model_copy(update={"learner": Learner(algorithm="PPO", parameters=parameters)})
+    recipe = ppo_recipe.model_copy(update={"learner": LearnerSettings(algorithm="PPO", parameters=parameters)})
     with pytest.raises(RunError, match="needs a recipe of plain values"):
         train("copper_net", recipe, directory=tmp_path / "run")
     assert not (tmp_path / "run").exists()

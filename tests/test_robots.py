@@ -65,7 +65,7 @@ def follow_the_library(robot: Robot, seed: int, policy: Callable[[int, Floats], 
     for step in range(50):
         held = policy(step, state)
         seen, reward, *_ = env.step(held[:, 0])
-        state = robot.advance(state, held, robot.interval)
+        state = robot.advance(state, held)
         np.testing.assert_array_equal(state[: len(begun), 0], flat(seen))
         assert robot.reward(state, held)[0] == reward
     env.close()
@@ -85,7 +85,7 @@ def actions(robot: Robot | SortingStation, steps: int, copies: int, seed: int = 
 def roll(robot: Robot, state: Floats, inputs: Floats) -> Floats:
     """Return the state after all the inputs."""
     for held in inputs:
-        state = robot.advance(state, held, robot.interval)
+        state = robot.advance(state, held)
     return state
 
 
@@ -136,7 +136,7 @@ class TestRobots:
         """Pure: nothing is written into, nothing is shared."""
         state, inputs = starts(robot, 2), actions(robot, 1, 2)[0]
         kept = state.copy(), inputs.copy()
-        after = robot.advance(state, inputs, robot.interval)
+        after = robot.advance(state, inputs)
         np.testing.assert_array_equal(state, kept[0])
         np.testing.assert_array_equal(inputs, kept[1])
         assert not np.shares_memory(after, state)
@@ -144,7 +144,7 @@ class TestRobots:
     def test_empty_batch(self, robot: Robot) -> None:
         """No copies are no error."""
         none, held = np.empty((len(robot.state_names), 0)), np.empty((len(robot.input_names), 0))
-        assert robot.advance(none, held, robot.interval).shape == none.shape
+        assert robot.advance(none, held).shape == none.shape
         assert robot.reward(none, held).shape == robot.success(none, held).shape == (0,)
 
     def test_names_and_interval(self, robot: Robot) -> None:
@@ -155,8 +155,6 @@ class TestRobots:
         env = reference(robot)
         assert robot.interval == env.unwrapped.dt
         env.close()
-        with pytest.raises(CirlError, match=r"moves in steps of 0\.0[24], not 0\.1"):
-            robot.advance(state, np.zeros((len(robot.input_names), 1)), 0.1)
 
 
 class TestTasks:
@@ -201,7 +199,7 @@ class TestTasks:
         state, done, signed = starts(robot, 250, 0), np.zeros(250, dtype=bool), np.zeros(250, dtype=bool)
         for _ in range(50):
             inputs = np.clip(rng.standard_normal((2, 250)), -1.0, 1.0)
-            state = robot.advance(state, inputs, robot.interval)
+            state = robot.advance(state, inputs)
             done |= robot.success(state, inputs)
             signed |= (state[robot.state_names.index("distance_m")] < 0.04) & (inputs < 0.005).all(axis=0)
         assert done.mean() < 0.01
@@ -215,7 +213,7 @@ class TestTasks:
         rng = np.random.default_rng(0)
         for _ in range(40):
             inputs = act(robot, reacher, state) + rng.choice([0.0, 0.004, -0.006], (2, 30))
-            state = robot.advance(state, inputs, robot.interval)
+            state = robot.advance(state, inputs)
             first = np.arctan2(state[rows["sin_0"]], state[rows["cos_0"]])
             both = first + np.arctan2(state[rows["sin_1"]], state[rows["cos_1"]])
             tip = 0.1 * np.array([np.cos(first), np.sin(first)]) + 0.11 * np.array([np.cos(both), np.sin(both)])
@@ -235,7 +233,7 @@ class TestTasks:
         state, done = starts(robot, copies, 1000), np.zeros(copies, dtype=bool)
         for _ in range(50):
             inputs = act(robot, script, state)
-            state = robot.advance(state, inputs, robot.interval)
+            state = robot.advance(state, inputs)
             done |= robot.success(state, inputs)
         assert done.mean() >= 0.95
 
@@ -245,7 +243,7 @@ class TestTasks:
         state, earned = starts(Fetch(), 60, 3000), np.zeros(60)
         for _ in range(50):
             inputs = act(Fetch(), fetch, state)
-            state = Fetch().advance(state, inputs, Fetch.interval)
+            state = Fetch().advance(state, inputs)
             earned += Fetch().reward(state, inputs)
         assert -12.5 < earned.mean() < -10.0
 
@@ -280,7 +278,7 @@ class Books:
                 self.column = self.robot.start(np.random.default_rng([self.key, self.attempt]))
                 self.attempt, self.busy = self.attempt + 1, True
             return
-        self.column = self.robot.advance(self.column[:, None], inputs[:, None], self.robot.interval)[:, 0]
+        self.column = self.robot.advance(self.column[:, None], inputs[:, None])[:, 0]
         self.step += 1
         self.reward = float(self.robot.reward(self.column[:, None], inputs[:, None])[0])
         good = bool(self.robot.success(self.column[:, None], inputs[:, None])[0])
@@ -312,7 +310,7 @@ class TestSortingStation:
             rng = np.random.default_rng(seed)
             for stock in stocks:
                 stock_kg, inputs = np.array([stock, 100.0]), rng.uniform(-1.0, 1.0, (2, 2))
-                state = station.advance(state, inputs, station.interval, stock_kg=stock_kg)
+                state = station.advance(state, inputs, stock_kg=stock_kg)
                 for i, own in enumerate(books):
                     own.advance(inputs[:, i], stock_kg[i], items, steps)
                     ledger = own.busy, own.step, own.done, *own.now, own.key, own.attempt
@@ -330,7 +328,7 @@ class TestSortingStation:
             for _ in range(3 * 31):
                 inputs = act(Fetch(), script, state[len(BOOKS) :])
                 stock_kg = 300.0 - 100.0 * released.sum(axis=0)
-                state = station.advance(state, inputs, 0.04, stock_kg=stock_kg)
+                state = station.advance(state, inputs, stock_kg=stock_kg)
                 released, completed = released + station.released(state), completed + int(station.complete(state)[0])
             np.testing.assert_array_equal(released[:, 0], ports)
             assert completed == 1
@@ -344,7 +342,7 @@ class TestSortingStation:
         rng, presented = np.random.default_rng(0), 0
         for _ in range(12):
             was_idle = state[BOOKS.index("busy"), 0] == 0
-            state = station.advance(state, rng.uniform(-1, 1, (2, 3)), station.interval, stock_kg=np.full(3, 1e3))
+            state = station.advance(state, rng.uniform(-1, 1, (2, 3)), stock_kg=np.full(3, 1e3))
             if was_idle:
                 presented += 1
                 np.testing.assert_array_equal(state[:, 0], state[:, 1])
@@ -373,8 +371,6 @@ class TestSortingStation:
         """What has no meaning is refused by name."""
         with pytest.raises(CirlError, match=message):
             SortingStation(**given_)
-        with pytest.raises(CirlError, match=r"moves in steps of 0\.04, not 0\.02"):
-            SortingStation().advance(np.zeros((1, 1)), np.zeros((4, 1)), 0.02, stock_kg=np.zeros(1))
 
 
 class TestThreads:

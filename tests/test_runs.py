@@ -17,7 +17,7 @@ from cirl_marl import RunError, VectorEnv
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners import run as learners_run
-from cirl_marl.learners.recipe import Learner, Normalisation, Run
+from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Run
 from cirl_marl.learners.trained import Trained
 from cirl_marl.records import files as files_module
 from cirl_marl.records.files import write_atomically
@@ -35,10 +35,10 @@ def test_run_directory_holds_what_is_needed(tmp_path: Path, ppo_recipe: Recipe) 
     controller = Trained(run)
     controller.start(env, 0)
     actions = controller.act(observations)
-    for agent, trainee in training.trainees.items():
-        assert isinstance(trainee.env, VecNormalize)
-        seen = trainee.env.normalize_obs(np.ascontiguousarray(observations[agent]))
-        assert np.array_equal(actions[agent], trainee.model.predict(seen, deterministic=True)[0])
+    for agent, learner in training.learners.items():
+        assert isinstance(learner.env, VecNormalize)
+        seen = learner.env.normalize_obs(np.ascontiguousarray(observations[agent]))
+        assert np.array_equal(actions[agent], learner.model.predict(seen, deterministic=True)[0])
     versions = json.loads((run.path / "versions.json").read_text())
     assert versions["stable-baselines3"]
     metrics = run.metrics()
@@ -151,11 +151,13 @@ def test_recurrent_policies_remember_within_an_episode_and_forget_after_it(tmp_p
     """A run's LSTM is fed its state from step to step, from nothing at each start."""
     parameters = {"n_steps": 10, "batch_size": 10, "n_epochs": 1, "policy_kwargs": {"lstm_hidden_size": 8}}
     normalise = Normalisation(observation=False, reward=False)
-    learner = Learner(algorithm="RecurrentPPO", policy="MlpLstmPolicy", parameters=parameters, normalise=normalise)
+    learner = LearnerSettings(
+        algorithm="RecurrentPPO", policy="MlpLstmPolicy", parameters=parameters, normalise=normalise
+    )
     recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=2), learner=learner)
     training = train("copper_net", recipe, agents=["use"], directory=tmp_path / "run", horizon=5)
     env = RunDirectory(tmp_path / "run").make_env(2)
-    controller, model = Trained(tmp_path / "run"), training.trainees["use"].model
+    controller, model = Trained(tmp_path / "run"), training.learners["use"].model
     for seed in (0, 1):
         seen = env.reset(seed=seed)
         controller.start(env, 0)

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from cirl_marl import DefinitionError
+from cirl_marl import DefinitionError, load_network
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.definitions.reading import read_network
+from cirl_marl.definitions.reading import Definition
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_scenarios_are_strict(tmp_path: Path, scenario: str, message: str) -> No
     path = tmp_path / "net.toml"
     path.write_text((folder("envs") / "copper_net.toml").read_text(encoding="utf-8") + "\n" + scenario + "\n")
     with pytest.raises(DefinitionError) as raised:
-        read_network(path)
+        Definition(path).check()
     assert message in str(raised.value)
 
 
@@ -55,7 +55,7 @@ def test_scenarios_change_models_and_controls_key_by_key(tmp_path: Path, scenari
     """What they do not give, stays; to repeat the kind changes nothing."""
     path = tmp_path / "net.toml"
     path.write_text((folder("envs") / "net_zero.toml").read_text(encoding="utf-8") + "\n" + scenario + "\n")
-    network = read_network(path)
+    network = Definition(path).network()
     usual, other = (net.compartments["microalgae"] for net in (network, network.scenarios["other"]))
     assert usual.control is not None
     if "high" in same:
@@ -68,8 +68,27 @@ def test_a_model_or_control_of_another_kind_is_a_new_one(tmp_path: Path) -> None
     path, text = tmp_path / "net.toml", (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
     droop = text[text.index("[scenarios.droop.nodes.microalgae.model]") : text.index("[scenarios.paper_monod]")]
     path.write_text(text + droop.replace("scenarios.droop", "scenarios.other"))  # without ``without``
-    network = read_network(path)
+    network = Definition(path).network()
     assert network.scenarios["other"].compartments == network.scenarios["droop"].compartments
     path.write_text(text + "\n" + MODEL + ']\nkind = "microalgae_droop"\nsource = "x"\n')
     with pytest.raises(DefinitionError, match="biomass_um3_l"):
-        read_network(path)
+        Definition(path).check()
+
+
+def test_scenarios_are_built_when_asked_for(tmp_path: Path) -> None:
+    """A fault in a scenario is told by whoever asks for it, and by a check of the file; the others can be used."""
+    text = (folder("envs") / "copper_net.toml").read_text(encoding="utf-8")
+    path = tmp_path / "copper.toml"
+    path.write_text(text.replace('law = "recipient"', 'law = "receiver"'), encoding="utf-8")
+    usual = load_network(path)
+    assert list(usual.scenarios) == ["paper"]
+    said = r"copper.toml: scenarios.paper.arcs.mine_to_refinery.law: unknown value 'receiver'"
+    with pytest.raises(DefinitionError, match=said):
+        usual.scenario("paper")
+    with pytest.raises(DefinitionError, match=said):
+        Definition(path).check()
+    sound = load_network("copper_net")
+    assert sound.scenario("paper") is sound.scenario("paper")
+    assert sound.scenario("paper").scenario("default") == sound
+    with pytest.raises(KeyError):
+        sound.scenarios["default"]

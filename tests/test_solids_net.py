@@ -31,7 +31,7 @@ BATCH_KG, ITEMS = 300.0, 3
 both = pytest.mark.parametrize("scenario", ["default", "reacher"])
 
 
-class Mixed:
+class Mixed(Controller):
     """Scripted, but every other item is left alone, and the truck and the incinerator start with random actions."""
 
     def __init__(self, erratic: int) -> None:

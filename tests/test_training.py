@@ -19,12 +19,12 @@ import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, LearnerError, Network, Node, RunError, VectorEnv
 from cirl_marl.learners import Recipe, RunDirectory, Training, resume, train
 from cirl_marl.learners.learner import derived_seed
-from cirl_marl.learners.recipe import Learner, Match, Run
+from cirl_marl.learners.recipe import LearnerSettings, Match, Run
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.trained import Trained
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network.elements import Episode, Law
-from cirl_marl.paper.results import Row
+from cirl_marl.paper.results import PaperRow
 from cirl_marl.paper.running import run_row
 
 pytestmark = pytest.mark.medium
@@ -73,8 +73,8 @@ def weights(training: Training) -> dict[str, torch.Tensor]:
     """Return every parameter of every policy."""
     return {
         f"{agent}.{name}": value.clone()
-        for agent, trainee in training.trainees.items()
-        for name, value in trainee.model.policy.state_dict().items()
+        for agent, learner in training.learners.items()
+        for name, value in learner.model.policy.state_dict().items()
     }
 
 
@@ -87,7 +87,7 @@ def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) ->
 def test_ten_algorithms_in_one_run_are_reproducible(mixed_recipe: Recipe) -> None:
     """The same seed gives bit-identical weights, for on-policy, off-policy and evolutionary learners side by side."""
     first = train("copper_net", mixed_recipe, seed=4, horizon=10)
-    names = {type(trainee.model).__name__ for trainee in first.trainees.values()}
+    names = {type(learner.model).__name__ for learner in first.learners.values()}
     assert names == {"PPO", *MIXED}
     again = train("copper_net", mixed_recipe, seed=4, horizon=10)
     assert_same(weights(first), weights(again))
@@ -103,7 +103,7 @@ def test_every_algorithm_learns_something(mixed_recipe: Recipe) -> None:
     start, end = weights(before), weights(after)
     for agent in after.env.agents:
         changed = [name for name in start if name.startswith(f"{agent}.") and not torch.equal(start[name], end[name])]
-        assert changed, f"{agent} ({type(after.trainees[agent].model).__name__}) did not change"
+        assert changed, f"{agent} ({type(after.learners[agent].model).__name__}) did not change"
 
 
 class Draws(BaseCallback):
@@ -224,7 +224,7 @@ def test_different_rollouts_and_shares_finish_cleanly(ppo_recipe: Recipe) -> Non
     ends = {agent: CountsEnds() for agent in ("mine", "use", "sorting", "refinery")}
     training = train("copper_net", ppo_recipe.model_copy(update={"match": matches}), horizon=5, callbacks=ends)
     assert {agent: callback.ends for agent, callback in ends.items()} == dict.fromkeys(ends, 1)
-    steps = {agent: trainee.model.num_timesteps for agent, trainee in training.trainees.items()}
+    steps = {agent: learner.model.num_timesteps for agent, learner in training.learners.items()}
     assert steps["mine"] == 84  # 14 rollouts of 3 steps in 2 copies: the first count of at least 80
     assert steps["use"] == 24
     assert steps["refinery"] == 80
@@ -246,7 +246,7 @@ def test_who_has_learnt_enough_acts_without_exploring(ppo_recipe: Recipe, monkey
 
     monkeypatch.setattr(VectorEnv, "step", recorded)
     training = train("copper_net", ppo_recipe.model_copy(update={"match": [match]}), horizon=20)
-    model, normaliser = training.trainees["use"].model, training.trainees["use"].env
+    model, normaliser = training.learners["use"].model, training.learners["use"].env
     assert model.num_timesteps == 40
     assert isinstance(normaliser, VecNormalize)
     means = [model.predict(normaliser.normalize_obs(shown), deterministic=True)[0] for shown, _ in done]
@@ -321,7 +321,7 @@ def test_interruption_saves_and_resumption_finishes(tmp_path: Path, mixed_recipe
     training = resume(directory)
     assert RunDirectory(directory).status["state"] == "complete"
     assert training.joint_steps >= 40
-    assert training.trainees["refinery"].model.num_timesteps >= 80
+    assert training.learners["refinery"].model.num_timesteps >= 80
     rows = RunDirectory(directory).metrics()["joint_step"]
     assert rows == sorted(set(rows))
     assert rows[0] == 5
@@ -349,7 +349,7 @@ def test_no_temporary_folders_are_left(
     train("copper_net", mixed_recipe, horizon=5)
     train("copper_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
     resume(tmp_path / "run", steps=1000)
-    run_row(Row(environment="CopperNet", algorithm="A2C", steps=100))
+    run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=100))
     assert list(scratch.iterdir()) == []
 
 
@@ -379,7 +379,7 @@ def test_schedules_run_from_their_first_value_to_their_last(algorithm: str) -> N
 
     rate = {"linear_from": 1e-3, "linear_to": 1e-5}
     policy = "LinearPolicy" if algorithm == "ARS" else "MlpPolicy"
-    learner = Learner(algorithm=algorithm, policy=policy, parameters={**parameters, "learning_rate": rate})
+    learner = LearnerSettings(algorithm=algorithm, policy=policy, parameters={**parameters, "learning_rate": rate})
     recipe = Recipe(name="x", title="x", run=Run(steps=480, envs=2), learner=learner)
     training = train("copper_net", recipe, agents=["use"], horizon=10, callbacks={"use": Rates()})
     assert training.joint_steps == 240

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import sys
 
-from cirl_marl.cli import comparing, networks
-from cirl_marl.cli import learning as training
+from cirl_marl.cli import comparing, learning, networks
 from cirl_marl.cli.common import app, errors, plain
 from cirl_marl.errors import CirlError, LearnerError
 
-__all__ = ["app", "comparing", "main", "networks", "training"]
+__all__ = ["app", "comparing", "learning", "main", "networks"]
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ NetworkName = Annotated[str, typer.Argument(metavar="NETWORK", help="Name in the
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a training run.")]
 Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]
-Episodes = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
+EpisodeCount = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
 MinService = Annotated[
     float | None,
     typer.Option(min=0.0, max=1.0, help="Mean service level that mpc and optimum plan for; default: all there is."),
@@ -38,6 +38,11 @@ MinService = Annotated[
 def plain(error: BaseException) -> str:
     """Keep rich from reading brackets in a message as markup."""
     return str(error).replace("[", r"\[")
+
+
+def listed(text: str) -> list[str]:
+    """Return what a comma-separated option names."""
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def say(line: str) -> None:
@@ -59,11 +64,8 @@ def folder_for(path: Path, option: str) -> Path:
 @contextmanager
 def bar(what: str) -> Iterator[Callable[[float], None]]:
     """Progress bar; the yielded function takes the share that is done."""
-    with Progress(
-        TextColumn(what), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=console, transient=True
-    ) as progress:
-        task = progress.add_task(what, total=1.0)
-        yield lambda share: progress.update(task, completed=share)
+    with shares() as told:
+        yield lambda share: told(what, share)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cirl_marl.cli.common import (
-    Episodes,
+    EpisodeCount,
     MinService,
     NetworkName,
     Scenario,
@@ -16,6 +16,7 @@ from cirl_marl.cli.common import (
     app,
     console,
     folder_for,
+    listed,
     say,
     shares,
 )
@@ -35,7 +36,7 @@ def compare(
         str | None, typer.Option(help="Catalogue name or .toml file; default: the network of the runs.")
     ] = None,
     scenario: Scenario = None,
-    episodes: Episodes = 16,
+    episodes: EpisodeCount = 16,
     seed: Seed = 0,
     min_service: MinService = None,
     out: Annotated[
@@ -45,14 +46,14 @@ def compare(
     """Compare trained runs and controllers on the same fresh episodes, and with the best possible.
 
     Runs of one recipe with different seeds share a row: the interquartile mean over seeds with its bootstrap interval.
-    The gap to the bound is to the highest circularity of any episode from the same start that serves at least as well.
+    The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     mpc and optimum solve linear programs for every episode: minutes for each on the larger networks.
     Where nothing bounds a network, optimum is the best plan that a search by simulation finds, without certificate.
     """
     from cirl_marl.evaluation import compare as compared
     from cirl_marl.report.comparison import comparison_notes, comparison_table, write_comparison
 
-    names = [name.strip() for name in controllers.split(",") if name.strip()]
+    names = listed(controllers)
     folder = None if out is None else folder_for(out, "--out")
     with shares() as progress:
         found = compared(
@@ -77,7 +78,7 @@ def compare(
 @app.command()
 def pareto(
     network: NetworkName,
-    agents: Annotated[
+    recipe: Annotated[
         str | None, typer.Option(help="Learner recipe to train with several weights; default: bound and plans only.")
     ] = None,
     points: Annotated[int, typer.Option(min=2, help="Service levels of the bound, and weights of the learners.")] = 5,
@@ -85,7 +86,7 @@ def pareto(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Environment steps of each training; default: the recipe's.")
     ] = None,
-    episodes: Episodes = 16,
+    episodes: EpisodeCount = 16,
     scenario: Scenario = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK.")
@@ -104,7 +105,7 @@ def pareto(
         with shares() as progress:
             found = swept(
                 network,
-                agents,
+                recipe,
                 directory=folder,
                 scenario=scenario,
                 points=points,
@@ -122,6 +123,6 @@ def pareto(
             say(f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {found.network.mass_unit}{about}")
     if found.reason:
         say(f"no bound: {found.reason}")
-    asked = {"agents": agents, "points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
+    asked = {"recipe": recipe, "points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
     for path in write_sweep(found, folder, **asked):
         say(f"wrote {path}")

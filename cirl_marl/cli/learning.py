@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cirl_marl.cli.common import Episodes, RunPath, Scenario, Seed, app, console, say, shares, training_bar
+from cirl_marl.cli.common import EpisodeCount, RunPath, Scenario, Seed, app, console, listed, say, shares, training_bar
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network.elements import OBSERVE, REWARDS
@@ -17,7 +17,10 @@ from cirl_marl.network.elements import OBSERVE, REWARDS
 def train(
     context: typer.Context,
     network: Annotated[str | None, typer.Argument(metavar="NETWORK", help="Catalogue name or .toml file.")] = None,
-    agents: Annotated[str, typer.Option(help="Learner recipe: catalogue name or .toml file.")] = "independent_ppo",
+    recipe: Annotated[str, typer.Option(help="Who learns how: catalogue name or .toml file.")] = "independent_ppo",
+    agents: Annotated[
+        str | None, typer.Option(help="Who acts and learns, comma-separated ids; default: the network's choice.")
+    ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps, summed over the copies.")] = None,
     envs: Annotated[int | None, typer.Option(min=1, help="Copies of the environment.")] = None,
     seed: Seed = 0,
@@ -30,7 +33,7 @@ def train(
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run; with --steps, to so many.")
     ] = None,
-    episodes: Episodes = 64,
+    episodes: EpisodeCount = 64,
 ) -> None:
     """Train one learner per compartment, all at once, then evaluate them and draw what changed."""
     from cirl_marl import learners
@@ -43,7 +46,7 @@ def train(
         _only_resume(context)
     directory = resume or out
     if directory is None:
-        directory = Path("runs") / f"{load_network(str(network)).name}-{Path(agents).stem}-seed{seed}"
+        directory = Path("runs") / f"{load_network(str(network)).name}-{Path(recipe).stem}-seed{seed}"
     with training_bar() as report:
         try:
             if resume is not None:
@@ -51,11 +54,12 @@ def train(
             else:
                 training = learners.train(
                     str(network),
-                    agents,
+                    recipe,
                     directory=directory,
                     steps=steps,
                     envs=envs,
                     seed=seed,
+                    agents=None if agents is None else listed(agents),
                     scenario=scenario,
                     reward=reward,
                     observe=observe,
@@ -69,10 +73,10 @@ def train(
 
 
 @app.command()
-def evaluate(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
+def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     """Compare the trained policies with neutral and random control on fresh seeds, and with the best possible.
 
-    The gap to the bound is to the highest circularity of any episode from the same start that serves at least as well.
+    The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     """
     from cirl_marl.learners.run import RunDirectory
     from cirl_marl.report.run import evaluate_run
@@ -87,7 +91,7 @@ def evaluate(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
 
 
 @app.command()
-def report(run: RunPath, episodes: Episodes = 64, seed: Seed = 0) -> None:
+def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     """Evaluate a run and draw its pictures anew."""
     _evaluate_and_draw(run, episodes, seed)
 
@@ -98,7 +102,9 @@ def paper(
     algorithm: Annotated[str | None, typer.Argument(metavar="ALGORITHM", help="Such as A2C; default: all.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps; default: the paper's.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="How many seeds: 0, 1, …")] = 1,
-    recipe: Annotated[str, typer.Option(help="published: the paper's settings; tuned: ours.")] = "published",
+    settings: Annotated[
+        str, typer.Option("--recipe", help="published: the paper's settings; tuned: our recipes.")
+    ] = "published",
     episodes: Annotated[
         int | None, typer.Option(min=1, help="Evaluation episodes; default: 100, where successes count the paper's.")
     ] = None,
@@ -107,11 +113,11 @@ def paper(
     ),
 ) -> None:
     """Repeat the CiRL paper's training runs, half a day in all, and show their figures beside the published ones."""
-    from cirl_marl.paper.plan import planned
     from cirl_marl.paper.results import Results
+    from cirl_marl.paper.selection import planned
     from cirl_marl.paper.session import run_session
 
-    rows = planned(environment, algorithm, steps=steps, seeds=seeds, recipe=recipe)
+    rows = planned(environment, algorithm, steps=steps, seeds=seeds, settings=settings)
     try:
         failed = run_session(rows, Results(out), console, episodes=episodes)
     except KeyboardInterrupt:

@@ -14,6 +14,7 @@ from cirl_marl.controllers import Controller
 from cirl_marl.controllers.rollout import Rollout, interval_ends, rollout
 from cirl_marl.controllers.watched import Watched
 from cirl_marl.definitions.catalogue import load_network, networks, recipes
+from cirl_marl.definitions.reading import Definition
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.figures import time_window
@@ -30,7 +31,7 @@ def list_networks() -> None:
     from cirl_marl.report.tables import networks_table
 
     console.print(networks_table({name: load_network(name) for name in networks()}))
-    console.print(f"recipes for --agents: {', '.join(recipes())}")
+    console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
 
 @app.command()
@@ -68,8 +69,7 @@ def show(
 @app.command()
 def check(
     sources: Annotated[
-        list[str],
-        typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue."),
+        list[str], typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue.")
     ],
     network: Annotated[
         str | None, typer.Option(help="Check that recipes fit this network too: scenario, agents, matches, algorithms.")
@@ -121,10 +121,10 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
     from cirl_marl.learners.launch import prepared
 
     try:
-        trainees = prepared(network, recipe).trainees.values()
+        learners = prepared(network, recipe).learners.values()
     except CirlError as error:
         raise CirlError(f"{source} in {network.name}: {error}") from error
-    busy = {id(trainee.spec) for trainee in trainees}
+    busy = {id(learner.spec) for learner in learners}
     return [where for where, learner in recipe.learners()[1:] if id(learner) not in busy]
 
 
@@ -132,6 +132,8 @@ def _check_network(source: str) -> None:
     from cirl_marl.controllers.remarks import remarks
 
     network = load_network(source)
+    assert network.source is not None
+    Definition(network.source).check()
     for each in (network, *network.scenarios.values()):
         try:
             VectorEnv(each, num_envs=1)  # finds what only a network that is run says, as rates no solver can follow
@@ -216,7 +218,6 @@ def plan(
     valve lets through, or an input of a model) with its unit, the resulting flows, circularity and service level.
     """
     from cirl_marl.controllers.schedule import schedule
-    from cirl_marl.optimum.controller import Optimum
 
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
@@ -229,7 +230,7 @@ def plan(
     path.parent.mkdir(parents=True, exist_ok=True)
     found.write(path)
     _say_figures(found.rollout, env.network)
-    if isinstance(controller, Optimum) and controller.note:
+    if controller.note:
         say(controller.note)
     say(f"wrote {path}")
 

@@ -2,33 +2,46 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import pkgutil
 from functools import cache
+from inspect import isabstract
 from typing import Any
 
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.network.model import CompartmentModel, ContinuousModel, DiscreteTimeModel, OwnStepModel, RewardState
+from cirl_marl.network.model import (
+    CompartmentModel,
+    ContinuousModel,
+    DiscreteTimeModel,
+    GoalTask,
+    Measuring,
+    Outflowing,
+    OwnStepModel,
+    Releasing,
+    RewardState,
+    Task,
+    Vehicle,
+    model_faults,
+)
 
 __all__ = [
     "CompartmentModel",
     "ContinuousModel",
     "DiscreteTimeModel",
+    "GoalTask",
+    "Measuring",
+    "Outflowing",
     "OwnStepModel",
+    "Releasing",
     "RewardState",
+    "Task",
+    "Vehicle",
     "kind_of",
     "model_class",
     "models",
 ]
 
 ROBOTS = f"{__name__}.robots"
-
-NEEDED = ("kind", "state_names", "input_names", "time_unit", "reward_state", "reward")
-"""What the library asks of every model."""
-
-MOTIONS = ("derivative", "advance")
-"""How a model moves, at least one of them."""
 
 
 @cache
@@ -42,9 +55,9 @@ def _found(package: str) -> dict[str, type[Any]]:
         for member in vars(module).values():
             if not isinstance(member, type) or member.__module__ != module.__name__:
                 continue
-            kind = getattr(member, "kind", None)
-            if not isinstance(kind, str):
+            if not issubclass(member, CompartmentModel) or isabstract(member):
                 continue
+            kind = member.kind
             if kind in found:
                 raise CirlError(f"{module.__name__}: kind '{kind}' is taken by {found[kind].__module__}.")
             found[kind] = member
@@ -84,9 +97,9 @@ def model_class(kind: str) -> type[Any]:
         raise CirlError(unknown("compartment kind", kind, models())) from None
 
 
-def kind_of(model: object) -> str:
+def kind_of(model: CompartmentModel) -> str:
     """Return the name by which definitions call the class of ``model``: its kind, or where it is if it is your own."""
-    own, kind = type(model), getattr(model, "kind", "")
+    own, kind = type(model), model.kind
     known = kind in _found(__name__) or kind in _found(ROBOTS)
     return kind if known and model_class(kind) is own else f"{own.__module__}:{own.__qualname__}"
 
@@ -105,15 +118,6 @@ def _elsewhere(place: str) -> type[Any]:
         raise CirlError(f"compartment kind '{place}': importing it failed: {type(error).__name__}: {error}") from error
     if not isinstance(found, type):
         raise CirlError(f"compartment kind '{place}': is no class of compartment models, but {found!r}")
-    lacking = _lacking(found)
-    if lacking:
-        raise CirlError(f"compartment kind '{place}': is no class of compartment models: it lacks {', '.join(lacking)}")
+    if faults := list(model_faults(found)):
+        raise CirlError(f"compartment kind '{place}': is no class of compartment models: {'; '.join(faults)}")
     return found
-
-
-def _lacking(found: type[Any]) -> list[str]:
-    """Return what every compartment model has and this class has not, neither itself nor as a field of it."""
-    fields = dataclasses.fields(found) if dataclasses.is_dataclass(found) else ()
-    offered = {*dir(found), *(field.name for field in fields)}
-    lacking = [name for name in NEEDED if name not in offered]
-    return lacking if offered & set(MOTIONS) else [*lacking, " or ".join(MOTIONS)]

@@ -7,12 +7,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from cirl_marl.network.model import RewardState, check_positive
+from cirl_marl.compartments.parameters import check_positive
+from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Atmosphere:
+class Atmosphere(ContinuousModel):
     """Stock of CO₂ that rises by what is emitted and falls by what is removed: ṁ = ṁ12 − ṁ23 (arXiv 2502.02382).
 
     It is for studies of the box alone: its agent sets both flows, and no mass of the network moves through it. Where

@@ -8,14 +8,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.compartments.parameters import check_positive
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import RewardState, check_positive
+from cirl_marl.network.model import RewardState, Vehicle
 from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DeliveryTruck(TransportTruck):
+class DeliveryTruck(TransportTruck, Vehicle):
     """The point mass of ``TransportTruck`` with the load that the network gives it, on a road of ``target_m``.
 
     m v̇ = F − resistances with m = truck + load; the third state is where the truck is heading: ``target_m`` with a

@@ -9,13 +9,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from cirl_marl.compartments.parameters import check_not_negative, check_positive, check_share
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import RewardState, check_not_negative, check_positive, check_share
+from cirl_marl.network.model import ContinuousModel, Measuring, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Digester:
+class Digester(ContinuousModel, Outflowing, Measuring):
     """AM2 with one dilution rate D, the control: the physically sound form.
 
     Ẋ1 = (μ1 − αD)X1, Ṡ1 = D(S1in − S1) − k1μ1X1, Ẋ2 = (μ2 − αD)X2, Ṡ2 = D(S2in − S2) + k2μ1X1 − k3μ2X2,

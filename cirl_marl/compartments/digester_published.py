@@ -8,12 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.network.model import RewardState, check_positive
+from cirl_marl.compartments.parameters import check_positive
+from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DigesterPublished:
+class DigesterPublished(ContinuousModel, Outflowing):
     """AM2 after arXiv 2502.02382: ż = f(z) + G(z)·(D̄ + φ) with one dilution D̄ + φ_i for each state.
 
     The initial-condition-dependent controller φ = −½G⁻¹(2f + ∇V) with V = p(x̃ᵀx̃)^q and x̃ = z − z̄ gives x̃̇ = −½∇V and

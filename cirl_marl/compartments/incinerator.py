@@ -9,7 +9,8 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from cirl_marl.network.model import RewardState, check_form, check_not_negative, check_positive, check_share
+from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive, check_share
+from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ min. Horizon 100 and T_g(0) ~ U[900, 1100] °C are inferred: from the
@@ -47,7 +48,7 @@ PUBLISHED_FLOWS = Flows(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Incinerator:
+class Incinerator(ContinuousModel, Outflowing):
     """Masses and temperatures of wastebed (waste M, char M_c, gas M_w, T_w) and freeboard (gas M_f, T_g).
 
     Ṁ = F_in − F_out − R_w, Ṁ_c = P − R_c − F_c, Ṁ_w = F_aI + R_g − F_w, Ṁ_f = F_w + F_aII − F_g,

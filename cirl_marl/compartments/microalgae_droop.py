@@ -11,7 +11,8 @@ import numpy as np
 
 from cirl_marl.compartments.light import light_response
 from cirl_marl.compartments.nutrient import draw_down, substeps
-from cirl_marl.network.model import RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive
+from cirl_marl.network.model import ContinuousModel, OwnStepModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred (mean return 454; the paper's end
@@ -19,7 +20,7 @@ from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MicroalgaeDroop:
+class MicroalgaeDroop(ContinuousModel, OwnStepModel):
     """Chemostat with biomass X, cell quota Q and dissolved nutrient S; the control is the light I.
 
     μ = μ̃·f(I)·(1 − k_q/Q), ρ = ρ_max·S/(S + K_S), Ẋ = (μ − D)X, Q̇ = ρ − μQ, Ṡ = D(S_in − S) − ρX; both forms.
@@ -120,7 +121,7 @@ class MicroalgaeDroop:
         taken = self.reward(state, inputs)
         return taken if self.form == "published" else taken / 1000.0
 
-    def advance(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
+    def integrate(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
         """Return the state after an interval of constant light, (3, B), and the mean ``outflow`` over it, (B,).
 
         A substep h splits what the cells do, after Strang: uptake and dilution for h/2, growth for h, uptake and

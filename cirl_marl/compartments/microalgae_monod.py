@@ -11,7 +11,8 @@ import numpy as np
 
 from cirl_marl.compartments.light import light_response
 from cirl_marl.compartments.nutrient import draw_down, substeps
-from cirl_marl.network.model import RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive
+from cirl_marl.network.model import ContinuousModel, OwnStepModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[1, 5] µmol/L is inferred: from S = 0 constant darkness
@@ -20,7 +21,7 @@ from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MicroalgaeMonod:
+class MicroalgaeMonod(ContinuousModel, OwnStepModel):
     """Chemostat with biomass X and dissolved nutrient S; the control is the light I.
 
     μ = μ_max·f(I)·S/(S + K_S), ρ = μ/Y, Ẋ = (μ − D)X, Ṡ = D(S_in − S) − ρX; both forms.
@@ -120,7 +121,7 @@ class MicroalgaeMonod:
         taken = self.reward(state, inputs)
         return taken if self.form == "published" else taken / 1000.0
 
-    def advance(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
+    def integrate(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
         """Return the state after an interval of constant light, (2, B), and the mean ``outflow`` over it, (B,).
 
         S relaxes within seconds, X within hours. So a substep h is two halves, in each of which X is frozen in the

@@ -7,7 +7,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from cirl_marl.network.model import RewardState, check_form, check_not_negative, check_positive
+from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive
+from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ s, an episode 0.01 s. x(0) ~ U[0, 500] m is inferred: from 0 the
@@ -15,7 +16,7 @@ from cirl_marl.network.rowsum import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TransportTruck:
+class TransportTruck(ContinuousModel):
     """Point mass on a straight road, driven by a force F.
 
     ``published``: ẋ = v, v̇ = F/m with m = 3000 + 210 kg.

@@ -7,15 +7,16 @@ from typing import ClassVar
 
 import numpy as np
 
+from cirl_marl.compartments.parameters import check_not_negative, check_positive
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import RewardState, check_not_negative, check_positive
+from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 SECONDS_PER_DAY = 86400.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TroposphereTemperature:
+class TroposphereTemperature(ContinuousModel):
     """Radiation balance C·Ṫ = S(1 − α) − ε·σ·T⁴ with the emissivity ε = ε_n − η·x₁/V₁ of air that holds x₁ of CO₂.
 
     The steady state is T = (S(1 − α)/(εσ))^¼: 13.454 °C at the pre-industrial x₁ = 637.2 t (closed loop) and 35.38 °C

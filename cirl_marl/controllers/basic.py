@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +14,43 @@ from cirl_marl.errors import ControlError, unknown
 Arrays = Mapping[str, NDArray[np.floating]]
 
 
-class Controller(Protocol):
+class Controller(ABC):
     """Maps the observations of all agents to their actions.
 
-    ``start`` is called once before an evaluation; ``act`` takes agent → observations (B, k) and returns agent → actions
-    (B, entries of its action) in [−1, 1].
+    Attributes:
+        note: once started, what is to be said beside its figures; empty if nothing is.
     """
 
+    note: str = ""
+
+    @abstractmethod
     def start(self, env: VectorEnv, seed: int) -> None:
-        """Get ready to act in ``env``; random controllers draw from ``seed`` only."""
+        """Get ready to act in ``env``, once before an evaluation; random controllers draw from ``seed`` only."""
 
+    @abstractmethod
     def act(self, observations: Arrays) -> Arrays:
-        """Return the actions of all agents."""
+        """Return agent → actions (B, entries of its action) in [−1, 1], given agent → observations (B, k)."""
 
 
-class Constant:
+class Planner(Controller):
+    """A controller that plans when it is started, for so long that it tells how far it is.
+
+    Attributes:
+        ahead: about what share of the work of an episode is done before it begins.
+    """
+
+    ahead: float
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        """Plan without telling how far it is."""
+        self.plan(env, seed, lambda share: None)
+
+    @abstractmethod
+    def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
+        """Do what ``start`` does; ``progress`` is called with the share of it that is done."""
+
+
+class Constant(Controller):
     """Holds fixed normalised actions, the same for each entry of an action; agents that are not named stay neutral."""
 
     def __init__(self, actions: Mapping[str, float] | None = None) -> None:
@@ -67,7 +89,7 @@ class Neutral(Constant):
         super().__init__()
 
 
-class Random:
+class Random(Controller):
     """Draws every action uniformly and independently."""
 
     def start(self, env: VectorEnv, seed: int) -> None:

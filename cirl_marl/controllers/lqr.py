@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from cirl_marl.controllers.basic import Arrays
+from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
@@ -184,7 +184,7 @@ def output_gain(A: Floats, B: Floats, C: Floats, Q: Floats, R: Floats) -> tuple[
 
 
 @dataclass(kw_only=True, eq=False)
-class LQR:
+class LQR(Controller):
     """Linear-quadratic regulator: measures stocks, feeds them back, clips to the bounds of the controls.
 
     It reads the stocks from the environment it was started in, whatever the agents observe. Its gains are those of

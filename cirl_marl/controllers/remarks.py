@@ -11,6 +11,7 @@ from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Compartment, ControlKind, Law, Role
+from cirl_marl.network.model import Releasing
 from cirl_marl.network.units import factor
 from cirl_marl.network.validate_settings import is_whole
 
@@ -64,7 +65,7 @@ def _departures(network: Network) -> Iterator[str]:
         if late:
             yield f"arc '{arc.id}': series: {end}, so that what begins at {late[0]:g} {network.time_unit} never comes"
         recipient = network.nodes[network.node_index[arc.recipient]]
-        batch_kg = getattr(recipient.model, "batch_kg", None)
+        batch_kg = recipient.model.batch_kg if isinstance(recipient.model, Releasing) else None
         for time, mass in arc.batches:
             at = f"arc '{arc.id}': batch at {time:g} {network.time_unit}"
             if round(time / interval) >= horizon:

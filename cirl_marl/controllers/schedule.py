@@ -46,8 +46,8 @@ class Schedule:
         write_atomically(path, lambda partial: write_table(partial, self.header, rows))
 
 
-@dataclass(slots=True)
-class _Recorded:
+@dataclass
+class _Recorded(Controller):
     """A controller whose actions are kept."""
 
     controller: Controller

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.compartments.incinerator import Incinerator
-from cirl_marl.controllers.basic import Arrays, Constant
+from cirl_marl.controllers.basic import Arrays, Constant, Controller
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Control, ControlKind
+from cirl_marl.network.model import CompartmentModel
 
 Seen = dict[str, Floats]
 """Observed states of an agent's own model by name, shape (B,) each, in physical units."""
@@ -117,14 +118,14 @@ SCRIPTS: dict[str, Script] = {
 """Script of each kind of model; that of a sorting station is its robot's."""
 
 
-class Scripted:
+class Scripted(Controller):
     """Acts by the script for the agent's kind of model; agents without one, and those held constant, do not listen."""
 
     def __init__(self, constant: Mapping[str, float] | None = None) -> None:
         """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral."""
         self._constant = Constant(constant)
         self._held = frozenset(constant or ())
-        self._scripts: dict[str, tuple[Script, Any, dict[str, int], Control]] = {}
+        self._scripts: dict[str, tuple[Script, CompartmentModel, dict[str, int], Control]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Find the script of each agent and what it reads.
@@ -137,8 +138,10 @@ class Scripted:
         for agent in env.agents:
             compartment = env.network.compartments[agent]
             model, control = compartment.model, compartment.control
-            script = SCRIPTS.get(getattr(getattr(model, "robot", model), "kind", ""))
-            if script is None or agent in self._held or control is None or control.kind is not ControlKind.INPUT:
+            if model is None or agent in self._held or control is None or control.kind is not ControlKind.INPUT:
+                continue
+            script = SCRIPTS.get(model.robot.kind)
+            if script is None:
                 continue
             own = f"{agent}."
             columns = {

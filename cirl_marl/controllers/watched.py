@@ -1,29 +1,14 @@
-"""Controllers that plan for long before they act, and how far they are."""
+"""How far a controller is, in its plans and in its episode."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
-from cirl_marl.controllers.basic import Arrays, Controller
+from cirl_marl.controllers.basic import Arrays, Controller, Planner
 from cirl_marl.environments.vector import VectorEnv
 
 
-@runtime_checkable
-class Planner(Controller, Protocol):
-    """A controller that plans when it is started, for so long that it tells how far it is.
-
-    Attributes:
-        ahead: about what share of the work of an episode is done before it begins.
-    """
-
-    ahead: float
-
-    def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
-        """Do what ``start`` does; ``progress`` is called with the share of it that is done."""
-
-
-class Watched:
+class Watched(Controller):
     """A controller that tells how far its episode is: its plans, if it is a planner, and what it has carried out.
 
     >>> from cirl_marl.controllers import Neutral

@@ -8,7 +8,7 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-from cirl_marl.definitions.reading import read_network
+from cirl_marl.definitions.reading import Definition
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Network
 
@@ -76,4 +76,4 @@ def _in_catalogue(kind: str, name: str, known: list[str]) -> Path:
 @cache
 def _read(path: Path, stamp: int) -> Network:
     del stamp  # part of the cache key, so that an edited file is read again
-    return read_network(path)
+    return Definition(path).network()

@@ -21,7 +21,6 @@ from cirl_marl.network.elements import (
     Objective,
     Observation,
     Service,
-    ranged_states,
 )
 from cirl_marl.network.units import factor
 
@@ -173,7 +172,7 @@ class Converter:
         except (ArithmeticError, TypeError, ValueError) as error:
             self.mistakes.append(f"{where}: '{table.kind}' refuses its parameters: {type(error).__name__}: {error}")
             return {}
-        ranged = ranged_states(model)
+        ranged = model.ranged_states
         for name in (*table.initial, *ranged):
             if name not in ranged or name not in table.initial:
                 missing = [state for state in ranged if state not in table.initial]
@@ -194,7 +193,7 @@ class Converter:
         target = {
             ControlKind.RATE: "1",
             ControlKind.FLOW: "flow",
-            ControlKind.INPUT: control.unit if model is None else getattr(model, "input_unit", None),
+            ControlKind.INPUT: control.unit if model is None else model.input_unit,
         }[control.kind]
         if target is None and model is not None and control.unit != "1":
             self.mistakes.append(

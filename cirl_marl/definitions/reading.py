@@ -6,8 +6,8 @@ import copy
 import difflib
 import hashlib
 import tomllib
-import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,43 +19,92 @@ from cirl_marl.definitions.schema import NetworkTable
 from cirl_marl.errors import DefinitionError, NetworkError, unknown
 from cirl_marl.network import Network
 
+DEFAULT = "default"
+"""The scenario that stands outside ``[scenarios]``."""
 
-def read_network(path: Path) -> Network:
-    """Read a definition file; the other scenarios hang on the returned default network.
 
-    Raises:
-        DefinitionError: with every mistake in the file; nothing is returned half-read.
+class Definition:
+    """A definition file; each scenario of it is built when it is asked for.
+
+    Attributes:
+        path: of the file.
+        names: of the scenarios, ``default`` first.
     """
-    document = read_toml(path)
-    source_sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    overrides = document.get("scenarios", {})
-    if not isinstance(overrides, dict) or not all(isinstance(o, dict) for o in overrides.values()):
-        raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
-    mistakes: list[str] = []
-    networks: dict[str, Network] = {}
-    if "default" in overrides:
-        mistakes.append("scenarios.default: the default scenario is what stands outside [scenarios]")
-    for name, override in {"default": {}, **{k: v for k, v in overrides.items() if k != "default"}}.items():
-        where = "" if name == "default" else f"scenarios.{name}."
-        strangers = list(_strangers(document, override, where))
-        mistakes += strangers
-        if strangers:
-            continue
-        try:
+
+    def __init__(self, path: Path) -> None:
+        """Read the file; no network is built yet.
+
+        Raises:
+            DefinitionError: if it is no TOML, or its scenarios are no tables.
+        """
+        self.path = path
+        self._document = read_toml(path)
+        self._sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        overrides = self._document.get("scenarios", {})
+        if not isinstance(overrides, dict) or not all(isinstance(each, dict) for each in overrides.values()):
+            raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
+        if DEFAULT in overrides:
+            raise DefinitionError(
+                str(path), ["scenarios.default: the default scenario is what stands outside [scenarios]"]
+            )
+        self._overrides = {DEFAULT: {}, **overrides}
+        self.names = tuple(self._overrides)
+        self._built: dict[str, Network] = {}
+
+    def network(self, name: str = DEFAULT) -> Network:
+        """Return the network under a scenario; the others hang on it, and are built when they are asked for.
+
+        Raises:
+            DefinitionError: with every mistake in what the scenario is made of; nothing is returned half-read.
+        """
+        if name not in self._built:
+            override, where = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
+            mistakes = list(_strangers(self._document, override, where))
+            if mistakes:
+                raise DefinitionError(str(self.path), mistakes)
             told = {key: value for key, value in override.items() if key != "without"}
-            networks[name] = _build(_merge(_without(document, override), told), name)
-        except NetworkError as error:
-            mistakes += [where + problem for problem in error.problems]
-            if name == "default":
-                break  # the scenarios would only repeat these
-    if mistakes:
-        raise DefinitionError(str(path), mistakes)
-    for network in networks.values():
-        others = {name: other for name, other in networks.items() if other is not network}
-        object.__setattr__(network, "scenarios", others)
-        object.__setattr__(network, "source", path)
-        object.__setattr__(network, "source_sha256", source_sha256)
-    return networks["default"]
+            try:
+                network = _build(_merge(_without(self._document, override), told), name)
+            except NetworkError as error:
+                raise DefinitionError(str(self.path), [where + problem for problem in error.problems]) from None
+            others = _Others(self, name)
+            self._built[name] = replace(network, scenarios=others, source=self.path, source_sha256=self._sha256)
+        return self._built[name]
+
+    def check(self) -> None:
+        """Build every scenario.
+
+        Raises:
+            DefinitionError: with every mistake in the file.
+        """
+        mistakes: list[str] = []
+        for name in self.names:
+            try:
+                self.network(name)
+            except DefinitionError as error:
+                mistakes += error.problems
+                if name == DEFAULT:
+                    break  # the scenarios would only repeat these
+        if mistakes:
+            raise DefinitionError(str(self.path), mistakes)
+
+
+class _Others(Mapping[str, Network]):
+    """The scenarios of a definition but one."""
+
+    def __init__(self, definition: Definition, own: str) -> None:
+        self._definition, self._own = definition, own
+
+    def __getitem__(self, name: str) -> Network:
+        if name not in set(self):
+            raise KeyError(name)
+        return self._definition.network(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self._definition.names if name != self._own)
+
+    def __len__(self) -> int:
+        return len(self._definition.names) - 1
 
 
 def write_network(network: Network, path: Path) -> None:
@@ -115,7 +164,7 @@ def _without(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[s
     return kept
 
 
-def _lost(document: Mapping[str, Any], paths: Any, where: str) -> typing.Iterator[str]:
+def _lost(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
     """Yield what is wrong with the dotted paths of a scenario's ``without``."""
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         yield f"{where}without: must be a list of dotted paths, such as ['nodes.digester.model']"
@@ -135,7 +184,7 @@ def _lost(document: Mapping[str, Any], paths: Any, where: str) -> typing.Iterato
             table = table[key]
 
 
-def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> typing.Iterator[str]:
+def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> Iterator[str]:
     """Yield the compartments and services that a scenario names but the network does not have."""
     yield from _lost(document, override.get("without", []), where)
     for table in ("nodes", "arcs", "services"):

@@ -13,7 +13,7 @@ from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
 from cirl_marl.network.declared import Flag, Names, Nested, Numbers, Quantity, declarations, default_of, is_required
-from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law, ranged_states
+from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 
 SOURCE = "network built in Python"
 
@@ -101,13 +101,7 @@ class _Writer:
             elif isinstance(declared, Nested):
                 table[key] = self._control(part) if declared.of == "control" else self._model(part)
             else:
-                table[key] = (
-                    list(value)
-                    if isinstance(declared, Names)
-                    else bool(value)
-                    if isinstance(declared, Flag)
-                    else str(value)
-                )
+                table[key] = {Names: list, Flag: bool}.get(type(declared), str)(value)
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
 
@@ -129,8 +123,8 @@ class _Writer:
         control = part.control
         assert isinstance(control, Control)
         unit = self._units["flow"] if control.kind is ControlKind.FLOW else "1"
-        if control.kind is ControlKind.INPUT:
-            unit = getattr(part.model, "input_unit", "1")
+        if control.kind is ControlKind.INPUT and part.model is not None:
+            unit = part.model.input_unit or "1"
         bounds = {name: float(getattr(control, name)) for name in ("low", "neutral", "high")}
         return {"kind": control.kind.value, **bounds, "unit": unit, "source": SOURCE}
 
@@ -148,7 +142,7 @@ class _Writer:
                     f"parameter '{each.name}' of its model '{model.kind}' is no number, which a definition cannot say"
                 )
                 raise NetworkError(f"compartment '{part.id}'", [problem])
-        spans = zip(ranged_states(model), part.inner, strict=True)
+        spans = zip(model.ranged_states, part.inner, strict=True)
         table["initial"] = {name: {"low": float(a), "high": float(b), "source": SOURCE} for name, (a, b) in spans}
         table["reward_scale"] = self._quantity(part.reward_scale, "1")
         return table

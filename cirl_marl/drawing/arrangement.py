@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +11,7 @@ from cirl_marl.drawing.places import Pitch, place
 from cirl_marl.drawing.routing import LABEL, Routes, route
 from cirl_marl.drawing.style import spoken
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Role
 
 LABELLED_NODES = 60
 """Largest network drawn with boxes and labels."""
@@ -19,7 +20,7 @@ LINE_LETTERS = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class Arrangement:
     """Where everything of one network goes, in em.
 
     Attributes:
@@ -41,41 +42,29 @@ class Layout:
             margin = 0.04 * np.ptp(places, axis=0) + 1
             return places.min(axis=0) - margin, places.max(axis=0) + margin
         labels = self.routes.labels
-        corners = [
-            places - half,
-            places + half,
-            self.routes.curves.reshape(-1, 2),
-            labels - label,
-            labels + label,
-        ]
+        corners = [places - half, places + half, self.routes.curves.reshape(-1, 2), labels - label, labels + label]
         points = np.concatenate(corners)
         return points.min(axis=0), points.max(axis=0)
 
 
-def layout_of(network: Network, aspect: float) -> Layout:
+def arrangement_of(network: Network, aspect: float) -> Arrangement:
     """Return the layout of ``network`` for pictures of about this width over height."""
-    return _layout(_Structure(network), round(2 * aspect) / 2 or 0.5)
+    nodes = tuple((node.id, node.role) for node in network.nodes)
+    arcs = tuple((arc.donor, arc.recipient) for arc in network.arcs)
+    return _layout(_Structure(nodes, arcs, network), round(2 * aspect) / 2 or 0.5)
 
 
+@dataclass(frozen=True, slots=True)
 class _Structure:
     """A network that equals every other with the same nodes, arcs and roles, whatever its numbers."""
 
-    def __init__(self, network: Network) -> None:
-        self.network = network
-        self._key = (
-            tuple((node.id, node.role) for node in network.nodes),
-            tuple((arc.donor, arc.recipient) for arc in network.arcs),
-        )
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Structure) and self._key == other._key
+    nodes: tuple[tuple[str, Role], ...]
+    arcs: tuple[tuple[str, str], ...]
+    network: Network = field(compare=False)
 
 
 @lru_cache(maxsize=16)
-def _layout(structure: _Structure, aspect: float) -> Layout:
+def _layout(structure: _Structure, aspect: float) -> Arrangement:
     network = structure.network
     names = tuple(_lines(node.id) for node in network.nodes)
     letters = max(len(line) for name in names for line in name)
@@ -83,7 +72,7 @@ def _layout(structure: _Structure, aspect: float) -> Layout:
     positions = place(network, Pitch(box[0] + 4.8, box[1] + 3.7), aspect)
     labelled = len(network.nodes) <= LABELLED_NODES and len(network.arcs) <= LABELLED_ARCS
     routes = route(positions, network.donors, network.recipients, box) if labelled else None
-    return Layout(positions, routes, box, names)
+    return Arrangement(positions, routes, box, names)
 
 
 def _lines(identifier: str) -> tuple[str, ...]:

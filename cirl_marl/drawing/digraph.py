@@ -71,14 +71,9 @@ class Canvas:
 
 
 def save_network(
-    path: str | Path,
-    network: Network,
-    stock: Floats,
-    flow: Floats,
-    title: str = "",
-    circularity: float | None = None,
+    path: str | Path, network: Network, stock: Floats, flow: Floats, title: str = "", circularity: float | None = None
 ) -> Path:
-    """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide.
+    """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide, and return its path.
 
     Args:
         path: file to write; its folder is made.
@@ -87,9 +82,6 @@ def save_network(
         flow: flows, shape (arcs,), mass/time.
         title: heading; empty takes that of the network.
         circularity: λ, mass; see ``draw_network``.
-
-    Returns:
-        The path.
 
     Raises:
         CirlError: if an array has the wrong shape.
@@ -108,7 +100,7 @@ def save_before_after(
     labels: tuple[str, str] = ("before", "after"),
     circularity: tuple[float | None, float | None] = (None, None),
 ) -> Path:
-    """Save two states of one network side by side, with arrows at the same scale.
+    """Save two states of one network side by side, with arrows at the same scale, and return the path.
 
     Args:
         path: file to write; its folder is made.
@@ -117,9 +109,6 @@ def save_before_after(
         after: the same, later or under other control.
         labels: headings of the two.
         circularity: λ of the two, mass; see ``draw_network``.
-
-    Returns:
-        The path.
 
     Raises:
         CirlError: if an array has the wrong shape.

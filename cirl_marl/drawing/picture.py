@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from cirl_marl.drawing.arrangement import Layout, layout_of
+from cirl_marl.drawing.arrangement import Arrangement, arrangement_of
 from cirl_marl.drawing.routing import Routes, bezier
 from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, ROLE_NAMES, WARNING, number, spoken
 from cirl_marl.errors import CirlError
@@ -66,7 +66,7 @@ def draw_network(
     reference = largest_flow(flow) if reference_flow is None else reference_flow
     share = np.clip(np.nan_to_num(np.abs(flow)) / max(reference, 1e-12), 0, BROADEST)
     width, height = _inches(axes)
-    layout = layout_of(network, width / height)
+    layout = arrangement_of(network, width / height)
     axes.clear()
     axes.set_axis_off()
     em = _frame(axes, layout, legend)
@@ -115,7 +115,7 @@ def _inches(axes: Axes) -> tuple[float, float]:
     return axes.bbox.width / axes.figure.dpi, axes.bbox.height / axes.figure.dpi
 
 
-def _frame(axes: Axes, layout: Layout, legend: bool) -> float:
+def _frame(axes: Axes, layout: Arrangement, legend: bool) -> float:
     """Set limits in em around the digraph and return the size of one em in points."""
     low, high = layout.extent()
     width, height = (72 * inches for inches in _inches(axes))
@@ -140,8 +140,7 @@ def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, sha
         for curve, value, size in zip(routes.curves, flow, share, strict=True)
     ]
     axes.add_collection(
-        PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.4, zorder=2),
-        autolim=False,
+        PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.4, zorder=2), autolim=False
     )
     halo = [withStroke(linewidth=0.25 * em, foreground="white")]
     ends = Counter((arc.donor, arc.recipient) for arc in network.arcs)
@@ -167,7 +166,7 @@ def _arrow(curve: Floats, width: float) -> Floats:
     return np.concatenate([sides[0], [neck + across * flare, tip, neck - across * flare], sides[1][::-1]])
 
 
-def _draw_boxes(axes: Axes, network: Network, layout: Layout, stock: Floats, em: float) -> None:
+def _draw_boxes(axes: Axes, network: Network, layout: Arrangement, stock: Floats, em: float) -> None:
     width, height = layout.box
     for node, (x, y), amount, name in zip(network.nodes, layout.positions, stock, layout.names, strict=True):
         corner, colour = (x - width / 2, y - height / 2), ROLE_COLOURS[node.role]
@@ -200,7 +199,7 @@ def _darker(colour: str) -> str:
     return "#" + "".join(f"{int(colour[i : i + 2], 16) * 6 // 10:02x}" for i in (1, 3, 5))
 
 
-def _draw_dots(axes: Axes, network: Network, layout: Layout, stock: Floats, share: Floats, em: float) -> None:
+def _draw_dots(axes: Axes, network: Network, layout: Arrangement, stock: Floats, share: Floats, em: float) -> None:
     """Draw a large network: dots whose area shows the stock, bent lines whose width shows the flow."""
     ends = layout.positions[network.donors], layout.positions[network.recipients]
     # Arcs that count towards λ come last, on top of the others.

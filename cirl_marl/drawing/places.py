@@ -253,12 +253,10 @@ def _cross(a: Floats, b: Floats, c: Floats, d: Floats) -> NDArray[np.bool_]:
     """Whether the segments a–b and c–d cross."""
     one = _turn(a, b, c) * _turn(a, b, d)
     two = _turn(c, d, a) * _turn(c, d, b)
-    crossed: NDArray[np.bool_] = (one < 0) & (two < 0)
-    return crossed
+    return (one < 0) & (two < 0)
 
 
 def _turn(a: Floats, b: Floats, c: Floats) -> Floats:
     """Twice the signed area of the triangles a–b–c."""
     u, v = b - a, c - a
-    area: Floats = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-    return area
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]

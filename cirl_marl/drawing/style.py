@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from cirl_marl.network.elements import Role
+from cirl_marl.records.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,21 +79,9 @@ def dressed(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9.0)
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write ``figure`` as a PNG; a reader never sees half of it.
-
-    Returns:
-        The path written to; missing folders are made.
-    """
+    """Write ``figure`` as a PNG and return the path; a reader never sees half of it, and missing folders are made."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
-    os.close(handle)
-    try:
-        FigureCanvasAgg(figure)
-        figure.savefig(temporary, format="png", dpi=DPI, facecolor="white")
-        Path(temporary).chmod(0o644)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    FigureCanvasAgg(figure)
+    write_atomically(target, lambda part: figure.savefig(part, format="png", dpi=DPI, facecolor="white"))
     return target

@@ -23,7 +23,7 @@ from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import RowSum, disposable
 
 
-class Batches:
+class BatchTransport:
     """The batch arcs of a network, compiled.
 
     Attributes:

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from cirl_marl.dynamics.batches import Batches
+from cirl_marl.dynamics.batches import BatchTransport
 from cirl_marl.dynamics.inner import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.errors import CirlError
@@ -71,7 +71,7 @@ class Dynamics(FlowLaws):
         """Compile ``network``."""
         super().__init__(network)
         rows = self.rows
-        self.inner, self.batches = InnerPhysics(network, rows), Batches(network, rows)
+        self.inner, self.batches = InnerPhysics(network, rows), BatchTransport(network, rows)
         episode = network.episode
         self.physical = episode.solver != "euler"
         self._exact = episode.solver == "exact"

@@ -15,6 +15,7 @@ from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.environments.state import Snapshot
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
+from cirl_marl.network.model import GoalTask
 
 Goals = dict[str, NDArray[np.float32]]
 PARTS = ("observation", "achieved_goal", "desired_goal")
@@ -43,10 +44,12 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         """
         self.flat = SingleAgentEnv(network, agent, **options)
         self.agent = self.flat.agent
-        self._model: Any = self.flat.network.compartments[self.agent].model
+        model = self.flat.network.compartments[self.agent].model
         names = [name.split(".")[-1] for name in self.flat.parallel.layout.names[self.agent]]
-        wanted = [getattr(self._model, f"{part.removesuffix('_goal')}_names", ()) for part in PARTS]
-        if not all(wanted) or any(name not in names for part in wanted for name in part):
+        wanted: tuple[tuple[str, ...], ...] = ()
+        if isinstance(model, GoalTask):
+            self._task, wanted = model, (model.observation_names, model.achieved_names, model.desired_names)
+        if not wanted or any(name not in names for part in wanted for name in part):
             raise CirlError(f"agent '{self.agent}' of '{self.flat.network.name}' has no goals to observe")
         reward = options.get("reward") or self.flat.network.objective.reward
         if reward != "local":  # hindsight would learn from two rewards that disagree
@@ -87,7 +90,7 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:
         """Return the reward for goals of shape (..., 3); ``info`` has no influence."""
-        reward = self._model.goal_reward(np.asarray(achieved_goal), np.asarray(desired_goal))
+        reward = self._task.goal_reward(np.asarray(achieved_goal), np.asarray(desired_goal))
         return reward / self.flat.network.compartments[self.agent].reward_scale
 
     def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.errors import ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.elements import ranged_states
+from cirl_marl.network.model import DiscreteTimeModel, GoalTask
 
 
 class Starts:
@@ -164,7 +164,8 @@ def _bounds(network: Network) -> dict[str, tuple[float, float]]:
     return {
         f"{owner}.{name}": bounds
         for owner, compartment in network.compartments.items()
-        for name, bounds in getattr(compartment.model, "bounds", {}).items()
+        if compartment.model is not None
+        for name, bounds in compartment.model.bounds.items()
     }
 
 
@@ -173,8 +174,8 @@ def _wholes(network: Network) -> dict[str, tuple[str, ...]]:
     found = {}
     for owner, compartment in network.compartments.items():
         model = compartment.model
-        if model is not None and not ranged_states(model):
-            goals = getattr(model, "desired_names", ())
+        if isinstance(model, DiscreteTimeModel):
+            goals = model.desired_names if isinstance(model, GoalTask) else ()
             found[owner] = tuple(f"{owner}.{name}" for name in model.state_names if name not in goals)
     return found
 

@@ -14,12 +14,12 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.contenders import contenders
-from cirl_marl.evaluation.figures import gain, relative
+from cirl_marl.evaluation.figures import gain
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds
-from cirl_marl.evaluation.yardstick import Yardstick, yardstick
+from cirl_marl.evaluation.yardsticks import Yardstick, yardstick
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum import NoCertificate
+from cirl_marl.optimum import NoCertificate, gap
 
 FIGURES = ("circularity", "gain", "service", "bound", "gap")
 EVERYWHERE = (-np.inf, np.inf)
@@ -27,7 +27,8 @@ LIMITS = {"service": SHARE, "gap": (0.0, np.inf)}
 """Within which figures lie: the bound is proved, so that no gap is below 0."""
 SOLVING = 0.7
 """Share of solving programs in the work on bounds; the rest is to evaluate their multipliers for every episode."""
-Progress = Callable[[str, float], None]
+ProgressReport = Callable[[str, float], None]
+"""Takes what is being done and the share of all that is done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +42,7 @@ class Entry:
         checkpoint: name of the checkpoint that acted; empty if nothing was trained.
         rollout: its episodes.
         gain: circularity gain over neutral control from the same start, shape (episodes,).
-        bound: the highest λ̄ of any episode from the same start with at least the same mean service level, shape
+        bound: what no λ̄ of an episode from the same start with at least the same mean service level exceeds, shape
             (episodes,), mass; None if nothing is proved.
     """
 
@@ -66,7 +67,7 @@ class Entry:
     @property
     def gap(self) -> Floats | None:
         """(bound − λ̄)/|bound| of each episode, shape (episodes,); NaN where the bound is 0."""
-        return None if self.bound is None else relative(self.bound - self.circularity, self.bound)
+        return None if self.bound is None else gap(self.bound, self.circularity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,7 @@ def compare(
     seed: int = 0,
     min_service: float | None = None,
     bounds: bool = True,
-    progress: Progress = lambda what, share: None,
+    progress: ProgressReport = lambda what, share: None,
 ) -> Comparison:
     """Let trained policies and controllers act in the same fresh episodes.
 
@@ -181,7 +182,7 @@ def compare(
     for place, contender in enumerate(entered):
         controller = contender.controller()
         checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
-        watched = Watched(controller, _told(progress, contender.name, place * share, share))
+        watched = Watched(controller, part_of(progress, contender.name, place * share, share))
         rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.acted))
     measure, proved = _unproved(len(entered), "")
     if bounds:
@@ -210,11 +211,7 @@ def starting_stocks(env: VectorEnv, seed: int) -> Floats:
 
 
 def _measured(
-    env: VectorEnv,
-    starts: Floats,
-    names: Sequence[str],
-    rollouts: Sequence[Rollout],
-    progress: Callable[[float], None],
+    env: VectorEnv, starts: Floats, names: Sequence[str], rollouts: Sequence[Rollout], progress: Callable[[float], None]
 ) -> tuple[Yardstick, list[Floats | None]]:
     """Return the yardstick of all rows, and the bounds of the episodes of each rollout."""
     services: dict[str, list[Floats]] = {}
@@ -239,6 +236,7 @@ def _unproved(entries: int, reason: str) -> tuple[Yardstick, list[Floats | None]
     return Yardstick(None, np.empty((0, 2)), reason), [None] * entries
 
 
-def _told(progress: Progress, what: str, done: float, each: float) -> Callable[[float], None]:
+def part_of(progress: ProgressReport, what: str, done: float, share: float) -> Callable[[float], None]:
+    """Return what takes the part that is done of something that makes up a ``share`` of all and follows on ``done``."""
     progress(what, done)
-    return lambda share: progress(what, done + each * share)
+    return lambda part: progress(what, done + share * min(1.0, part))

@@ -111,7 +111,7 @@ def _trained(runs: Sequence[RunDirectory]) -> Iterator[Contender]:
     seen: dict[tuple[str, int], RunDirectory] = {}
     for run in runs:
         config = run.config
-        plain = config.as_dict()
+        plain = config.model_dump(mode="json")
         status = run.status
         asked = repr([plain[field] for field in ("recipe", "steps", "envs", "options")])
         name = config.recipe.name

@@ -5,18 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.evaluation.statistics import SHARE, over_episodes
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.staged import CIRO_FACTOR
-
-
-def relative(difference: Floats, reference: Floats) -> Floats:
-    """Return ``difference``/|``reference``|, NaN where the reference is 0."""
-    return np.divide(difference, np.abs(reference), out=np.full_like(difference, np.nan), where=reference != 0)
+from cirl_marl.optimum.bounds import relative
 
 
 def gain(rollout_: Rollout, neutral: Rollout) -> Floats:

@@ -14,8 +14,9 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.evaluation.contenders import differences
-from cirl_marl.evaluation.yardstick import FRONT
+from cirl_marl.evaluation.yardsticks import FRONT
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
@@ -23,7 +24,6 @@ from cirl_marl.optimum.mpc import SERVICE_FIRST
 
 WEIGHED = ("mixed", "mixed_difference", "team")
 """Reward modes in which the circularity weight has a part."""
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +80,7 @@ def pareto(
     seeds: int = 1,
     steps: int | None = None,
     episodes: int = 16,
-    progress: Progress = lambda what, share: None,
+    progress: ProgressReport = lambda what, share: None,
 ) -> Sweep:
     """Sweep the weight between circularity and service.
 
@@ -125,7 +125,8 @@ def pareto(
     runs = []
     for place in range(points * seeds):
         asked = _Asked(found, chosen, place // seeds / (points - 1), place % seeds, steps)
-        told = _part(progress, f"training {asked}", share, (1 - share) / (points * seeds), place)
+        each = (1 - share) / (points * seeds)
+        told = part_of(progress, f"training {asked}", share + each * place, each)
         runs.append(asked.run(directory / "runs", told))
     groups = [runs[first : first + seeds] for first in range(0, len(runs), seeds)]
     learnt = tuple(point for group in groups for point in _learnt(group, episodes))
@@ -197,7 +198,7 @@ def _check_fit(network: Network, recipe: Recipe) -> None:
         )
 
 
-def _possible(network: Network, points: int, progress: Progress) -> tuple[tuple[Point, ...], Floats]:
+def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[tuple[Point, ...], Floats]:
     """Return bounds by demanded service, what their improved plans do in the simulator, and the front they prove."""
     found: list[Point] = []
     bounds: list[Bound] = []
@@ -207,16 +208,12 @@ def _possible(network: Network, points: int, progress: Progress) -> tuple[tuple[
         solved = bound(network, min_service=level, near=bounds[-1] if bounds else None)
         bounds.append(solved)
         found.append(Point(kind="bound", service=level, circularity=solved.objective))
-        episode = achieved(improved(solved, progress=_planned(progress, place / points, 1 / points)))
+        episode = achieved(improved(solved, progress=part_of(progress, "bounds and plans", place / points, 1 / points)))
         service, circularity = float(episode.episode_service[0]), float(episode.episode_circularity[0])
         found.append(Point(kind="plan", service=service, circularity=circularity))
         progress("bounds and plans", (place + 1) / points)
     levels = np.linspace(least, most, FRONT)
     return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels)], axis=1)
-
-
-def _planned(progress: Progress, done: float, each: float) -> Callable[[float], None]:
-    return lambda share: progress("bounds and plans", done + each * share)
 
 
 def _levels(least: float, most: float, points: int) -> list[float]:
@@ -235,7 +232,3 @@ def _learnt(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
             weight=None if entry.run is None else entry.run.config.options["circularity_weight"],
             seed=entry.seed,
         )
-
-
-def _part(progress: Progress, what: str, done: float, each: float, place: int) -> Callable[[float], None]:
-    return lambda share: progress(what, done + each * (place + min(1.0, share)))

@@ -7,6 +7,7 @@ import importlib
 import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,6 @@ POLICIES: Mapping[str, type[BasePolicy]] = {CENTRAL_CRITIC: CentralCriticPolicy}
 """Policies that Stable-Baselines3 has no name for."""
 
 RESERVED = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "device", "_init_setup_model")
-SET_BY_ALGORITHM = ("self", "observation_space", "action_space", "lr_schedule", "use_sde")
-"""What an algorithm hands to the constructor of its policy by itself."""
-
 BOUNDS = {
     **dict.fromkeys(("gamma", "gae_lambda", "tau"), (0.0, 1.0)),
     **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "n_delta"), (1.0, math.inf)),
@@ -73,18 +71,8 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 def parameters_of(name: str) -> dict[str, inspect.Parameter]:
     """Return the constructor parameters that a recipe may set."""
-    return _parameters(algorithm_class(name), RESERVED)
-
-
-def policy_parameters_of(name: str, policy: str) -> dict[str, inspect.Parameter] | None:
-    """Return what ``policy_kwargs`` may hold for an algorithm and its policy; None if it has no such policy."""
-    classes = {**algorithm_class(name).policy_aliases, **POLICIES}
-    return _parameters(classes[policy], SET_BY_ALGORITHM) if policy in classes else None
-
-
-def _parameters(made: type, reserved: Iterable[str]) -> dict[str, inspect.Parameter]:
-    signature = inspect.signature(made.__init__)  # type: ignore[misc]
-    return {name: parameter for name, parameter in signature.parameters.items() if name not in reserved}
+    parameters = inspect.signature(algorithm_class(name).__init__).parameters
+    return {key: parameter for key, parameter in parameters.items() if key not in RESERVED}
 
 
 def algorithm_mistakes(name: str, policy: str, parameters: Mapping[str, Any]) -> Iterator[str]:
@@ -99,39 +87,27 @@ def algorithm_mistakes(name: str, policy: str, parameters: Mapping[str, Any]) ->
         fit.append(CENTRAL_CRITIC)
     if policy not in fit:
         yield f"policy: {unknown(f'policy of {name} for vectors', policy, fit)}"
-    yield from parameter_mistakes(name, policy, parameters)
+    yield from parameter_mistakes(name, parameters)
 
 
-def parameter_mistakes(name: str, policy: str, parameters: Mapping[str, Any]) -> Iterator[str]:
-    """Yield parameters that there are not, values of another type than the constructor states, and numbers like NaN.
+def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str]:
+    """Yield parameters that there are not, numbers like NaN, and values of another type or size than can be meant.
 
-    The constructor is that of the algorithm, and for ``policy_kwargs`` that of the policy.
+    Stable-Baselines3 checks ``policy_kwargs`` when it is constructed, but few others: an entropy coefficient that is a
+    text fails in the middle of a training, a discount of 1.5 or a batch of 0 never does.
     """
-    known, of_policy = parameters_of(name), policy_parameters_of(name, policy)
+    known = parameters_of(name)
     for key, value in parameters.items():
-        if key == "policy_kwargs" and isinstance(value, Mapping) and of_policy is not None:
-            for argument, each in value.items():
-                yield from _argument_mistakes("parameters.policy_kwargs", policy, of_policy, argument, each)
-        else:
-            yield from _argument_mistakes("parameters", name, known, key, value)
-
-
-def _argument_mistakes(
-    where: str, owner: str, known: Mapping[str, inspect.Parameter], name: str, value: object
-) -> Iterator[str]:
-    """Yield what is wrong with one keyword argument of a constructor that takes ``known``."""
-    if name not in known:
-        yield f"{where}: {unknown(f'parameter of {owner}', name, known)}"
-        return
-    place = f"{where}.{name}"
-    mistakes = list(_not_finite(place, value))
-    yield from mistakes
-    if mistakes or _takes(known[name], value):
-        return
-    if name in WRITTEN:
-        yield from WRITTEN[name](place, value)
-    else:
-        yield f"{place}: {owner} needs {_needed(known[name])}, got {value!r}"
+        place = f"parameters.{key}"
+        if key not in known:
+            yield f"parameters: {unknown(f'parameter of {name}', key, known)}"
+        elif infinite := list(_not_finite(place, value)):
+            yield from infinite
+        elif not _takes(known[key], value):
+            if key in WRITTEN:
+                yield from WRITTEN[key](place, value)
+            else:
+                yield f"{place}: {name} needs {_needed(known[key])}, got {value!r}"
 
 
 def _not_finite(place: str, value: object) -> Iterator[str]:
@@ -152,11 +128,9 @@ def _takes(parameter: inspect.Parameter, value: object) -> bool:
             return False
     checked = TypeAdapter[Any](parameter.annotation, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
     for form in (value, _as_tuple(value)):
-        try:
+        with suppress(ValidationError):
             checked.validate_python(form)
-        except ValidationError:
-            continue
-        return True
+            return True
     return False
 
 
@@ -215,8 +189,7 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
     Raises:
         RecipeError: for unknown parameters or values that the algorithm refuses.
     """
-    mistakes = list(parameter_mistakes(name, policy, parameters))
-    if mistakes:
+    if mistakes := list(parameter_mistakes(name, parameters)):
         raise RecipeError("; ".join(mistakes))
     arguments = {key: _as_tuple(value) for key, value in copy.deepcopy(dict(parameters)).items()}
     rate = arguments.get("learning_rate")

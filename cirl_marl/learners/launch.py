@@ -6,7 +6,6 @@ import inspect
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +55,7 @@ def train(
             override the recipe's.
 
     Returns:
-        The finished training; ``trainees[name].model`` is the Stable-Baselines3 model.
+        The finished training; ``learners[name].model`` is the Stable-Baselines3 model.
 
     Raises:
         CirlError: for input that cannot be used, before anything is written.
@@ -95,7 +94,8 @@ def prepared(
         CirlError: for input that cannot be used.
     """
     found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
-    found.check()
+    steps = found.run.steps if steps is None else _whole("steps", steps, 1)
+    found.check(steps)
     given = {name: value for name, value in options.items() if value is not None}
     settings = found.environment | {n: v.item() if isinstance(v, np.generic) else v for n, v in given.items()}
     copies = found.run.envs if envs is None else _whole("envs", envs, 1)
@@ -110,11 +110,10 @@ def prepared(
         agents=env.agents,
         recipe=found,
         seed=_whole("seed", seed, 0),
-        steps=found.run.steps if steps is None else _whole("steps", steps, 1),
+        steps=steps,
         envs=copies,
         options=settings,
     )
-    found.check_demonstrations(config.steps)
     return Training(config, env)
 
 
@@ -159,8 +158,8 @@ def _extended(run: RunDirectory, config: RunConfig, steps: int | None) -> RunCon
     status = run.status
     done, complete = status["joint_steps"] * config.envs, status["state"] == "complete"
     if steps is not None:
-        config = replace(config, steps=_whole("steps", steps, done + 1))
-        config.recipe.check_demonstrations(config.steps)
+        config = config.model_copy(update={"steps": _whole("steps", steps, done + 1)})
+        config.recipe.check(config.steps)
     elif complete:
         raise RunError(f"{run.path}: the run is complete ({done:,} environment steps); give more steps to go on")
     if complete:
@@ -186,7 +185,7 @@ def _create(directory: Path, config: RunConfig, network: Network) -> RunDirector
             load_network(written)
         except CirlError as error:
             raise RunError(f"{directory}: a run on disk needs a network that can be read again: {error}") from error
-        return RunDirectory.create(directory, replace(config, scenario="default"), written)
+        return RunDirectory.create(directory, config.model_copy(update={"scenario": "default"}), written)
 
 
 def _whole(name: str, value: object, least: int) -> int:

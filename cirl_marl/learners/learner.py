@@ -27,7 +27,7 @@ from cirl_marl.errors import RecipeError, RunError
 from cirl_marl.learners.algorithms import algorithm_class, build
 from cirl_marl.learners.demonstrations import Demonstrator, demonstrate
 from cirl_marl.learners.lockstep import BudgetSpent
-from cirl_marl.learners.recipe import Learner
+from cirl_marl.learners.recipe import LearnerSettings
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams, global_streams_kept
 
@@ -50,7 +50,7 @@ def derived_seed(seed: int, *names: str | int) -> int:
     return int(np.random.SeedSequence([seed, *keys]).generate_state(1)[0] >> 1)
 
 
-class Trainee:
+class Learner:
     """A learner seated in the joint environment.
 
     Attributes:
@@ -67,7 +67,7 @@ class Trainee:
     env: VecEnv
     demonstrator: Demonstrator | None = None
 
-    def __init__(self, seat: Seat, spec: Learner, seed: int, *, done: int = 0) -> None:
+    def __init__(self, seat: Seat, spec: LearnerSettings, seed: int, *, done: int = 0) -> None:
         """Give the learner its streams, others after each number of joint steps ``done`` before.
 
         ``build`` or ``load`` makes the algorithm.
@@ -80,14 +80,14 @@ class Trainee:
         noisy = spec.parameters.get("action_noise") is not None
         self.streams = Streams(self._seed, keep_gaussian=noisy)
 
-    def build(self) -> Trainee:
+    def build(self) -> Learner:
         """Make a fresh algorithm.
 
         Raises:
             RecipeError: naming the learner, if the algorithm refuses its parameters.
         """
         spec = self.spec
-        self.env = self._normalised(spec)
+        self.env = normalised(self.seat, spec)
         parameters = dict(spec.parameters)
         if issubclass(algorithm_class(spec.algorithm), ARS):
             parameters.setdefault("n_eval_episodes", self.seat.num_envs)
@@ -106,7 +106,7 @@ class Trainee:
                 )
         return self
 
-    def load(self, folder: Path) -> Trainee:
+    def load(self, folder: Path) -> Learner:
         """Go on with the algorithm saved in ``folder``, and what it has seen.
 
         A rollout that was under way is lost, so its steps are not behind the learner but before it.
@@ -208,22 +208,25 @@ class Trainee:
         """Close the log files."""
         self.model.logger.close()
 
-    def _normalised(self, spec: Learner) -> VecEnv:
-        normalise = spec.normalise
-        if not normalise.any:
-            return self.seat
-        return VecNormalize(
-            self.seat,
-            norm_obs=normalise.observation,
-            norm_reward=normalise.reward,
-            clip_obs=normalise.clip_observation,
-            clip_reward=normalise.clip_reward,
-            gamma=spec.parameters.get("gamma", 0.99),
-        )
-
     def log_to(self, log: Path) -> None:
         """Write TensorBoard events below the folder ``log``."""
         self.model.set_logger(configure(str(log / self.name), ["tensorboard"]))
+
+
+def normalised(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:
+    """Return ``env`` behind the normaliser that the settings ask for, if they do; of a dict ``keys`` are normalised."""
+    normalise = spec.normalise
+    if not normalise.any:
+        return env
+    return VecNormalize(
+        env,
+        norm_obs=normalise.observation,
+        norm_reward=normalise.reward,
+        clip_obs=normalise.clip_observation,
+        clip_reward=normalise.clip_reward,
+        gamma=spec.parameters.get("gamma", 0.99),
+        norm_obs_keys=keys,
+    )
 
 
 def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = None) -> BaseAlgorithm:
@@ -242,7 +245,7 @@ def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = Non
             raise RunError(f"{path}: cannot be read: {error}") from error
 
 
-def load_normaliser(folder: Path, name: str, spec: Learner, seat: Seat | None = None) -> VecNormalize | None:
+def load_normaliser(folder: Path, name: str, spec: LearnerSettings, seat: Seat | None = None) -> VecNormalize | None:
     """Load the normaliser saved with a policy; None if its recipe does not normalise.
 
     Raises:

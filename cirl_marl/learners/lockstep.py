@@ -14,11 +14,12 @@ from greenlet import GreenletExit, greenlet
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from cirl_marl.controllers.basic import Arrays
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import ControlError, LearnerError
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams
-from cirl_marl.learners.views import Arrays, OneAgent, View
+from cirl_marl.learners.views import OneAgent, View
 
 StepHook = Callable[[Infos, NDArray[np.bool_]], None]
 

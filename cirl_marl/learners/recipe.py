@@ -34,11 +34,13 @@ Count = Annotated[int, Field(strict=True, gt=0)]
 Limit = Annotated[Number, Field(gt=0)]
 
 
-class _Table(BaseModel):
+class Settings(BaseModel):
+    """Named values, none of them unknown, that do not change."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Options(_Table):
+class Options(Settings):
     """What a recipe may say of the environment; None takes the definition's."""
 
     reward: Reward | None = None
@@ -52,7 +54,7 @@ class Options(_Table):
 OPTIONS = tuple(Options.model_fields)
 
 
-class Normalisation(_Table):
+class Normalisation(Settings):
     """Running normalisation by Stable-Baselines3's ``VecNormalize``, one per agent, saved with its policy."""
 
     observation: StrictBool = True
@@ -66,7 +68,7 @@ class Normalisation(_Table):
         return self.observation or self.reward
 
 
-class Demonstrations(_Table):
+class Demonstrations(Settings):
     """A controller that acts in the learner's place at first, while the learner keeps what it sees."""
 
     controller: Literal["neutral", "random", "scripted", "lqr", "mpc", "optimum"]
@@ -75,7 +77,7 @@ class Demonstrations(_Table):
     )
 
 
-class Learner(_Table):
+class LearnerSettings(Settings):
     """One algorithm with its parameters."""
 
     algorithm: str
@@ -100,26 +102,19 @@ class Learner(_Table):
     def steps_of(self, steps: int) -> int:
         """Return during how many of the ``steps`` of a run it learns, rounded up.
 
-        >>> Learner(algorithm="PPO", share_of_steps=0.55).steps_of(100)
+        >>> LearnerSettings(algorithm="PPO", share_of_steps=0.55).steps_of(100)
         55
         """
         return math.ceil(round(steps * self.share_of_steps, 6))
 
-    def mistakes(self) -> Iterator[str]:
-        """Yield what is wrong whatever the network and the number of steps: key, value and what would do."""
-        from cirl_marl.learners.algorithms import algorithm_mistakes
+    def mistakes(self, steps: int) -> Iterator[str]:
+        """Yield what is wrong whatever the network, in a run of ``steps``: key, value and what would do."""
+        from cirl_marl.learners.algorithms import algorithm_mistakes, algorithms, has_replay_buffer
 
         yield from algorithm_mistakes(self.algorithm, self.policy, self.parameters)
         if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
             yield f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true"
-
-    def demonstration_mistakes(self, steps: int) -> Iterator[str]:
-        """Yield why the algorithm cannot keep its demonstrations, or why a run of ``steps`` has no room for them."""
-        if self.demonstrations is None:
-            return
-        from cirl_marl.learners.algorithms import algorithms, has_replay_buffer
-
-        if self.algorithm not in algorithms():
+        if self.demonstrations is None or self.algorithm not in algorithms():
             return
         if not has_replay_buffer(self.algorithm):
             fit = ", ".join(filter(has_replay_buffer, algorithms()))
@@ -129,7 +124,7 @@ class Learner(_Table):
             yield f"demonstrations.steps: {self.demonstrations.steps} is more than the {steps} steps of the run{share}"
 
 
-class Match(Learner):
+class Match(LearnerSettings):
     """A learner for some agents only; of several matches the first applies."""
 
     kind: Literal["node", "arc"] | None = None
@@ -147,7 +142,7 @@ class Match(Learner):
         )
 
 
-class Run(_Table):
+class Run(Settings):
     """How long and in how many copies; the command line overrides it."""
 
     steps: Count = Field(200_000, description="environment steps, summed over the copies")
@@ -167,14 +162,14 @@ class Group:
 
     name: str
     agents: tuple[str, ...]
-    spec: Learner
+    spec: LearnerSettings
 
     def view(self, env: VectorEnv) -> View:
         """Return how the learner sees ``env``."""
         return view_of(env, self.agents, self.spec.scheme, with_state=self.spec.policy == CENTRAL_CRITIC)
 
 
-class Recipe(_Table):
+class Recipe(Settings):
     """A learner for each agent of a network.
 
     Attributes:
@@ -190,7 +185,7 @@ class Recipe(_Table):
     title: str
     run: Run = Run()
     environment: Annotated[dict[str, Any], WithJsonSchema(Options.model_json_schema())] = {}
-    learner: Learner
+    learner: LearnerSettings
     match: list[Match] = []
 
     @field_validator("match", mode="before")
@@ -200,7 +195,7 @@ class Recipe(_Table):
             raise PydanticCustomError("one_bracket", "write [[match]], with two brackets")
         return match
 
-    def learner_of(self, agent: str, network: Network) -> Learner:
+    def learner_of(self, agent: str, network: Network) -> LearnerSettings:
         """Return the learner of ``agent``: that of the first match that fits, else the common one."""
         return next((match for match in self.match if match.fits(agent, network)), self.learner)
 
@@ -219,13 +214,13 @@ class Recipe(_Table):
             found[name] = Group(name, (*members, agent), spec)
         return tuple(found.values())
 
-    def check(self) -> None:
-        """Refuse what is wrong whatever the network and the number of steps.
+    def check(self, steps: int) -> None:
+        """Refuse what is wrong whatever the network, in a run of ``steps``.
 
         Raises:
             RecipeError: naming every mistake.
         """
-        self._refuse(self.mistakes())
+        self._refuse(self.mistakes(steps))
 
     def check_agents(self, agents: Sequence[str]) -> None:
         """Refuse matches that name agents which do not act.
@@ -240,21 +235,13 @@ class Recipe(_Table):
             if agent not in agents
         )
 
-    def check_demonstrations(self, steps: int) -> None:
-        """Refuse demonstrations that an algorithm cannot keep, or that a run of ``steps`` has no room for.
-
-        Raises:
-            RecipeError: naming the learner and the key.
-        """
-        self._refuse(self.demonstration_mistakes(steps))
-
     def _refuse(self, mistakes: Iterable[str]) -> None:
         found = "; ".join(mistakes)
         if found:
             raise RecipeError(f"recipe '{self.name}': {found}")
 
-    def mistakes(self) -> Iterator[str]:
-        """Yield what is wrong whatever the network and the number of steps: key, value and what would do."""
+    def mistakes(self, steps: int) -> Iterator[str]:
+        """Yield what is wrong whatever the network, in a run of ``steps``: key, value and what would do."""
         try:
             Options.model_validate(self.environment)
         except ValidationError as error:
@@ -263,14 +250,9 @@ class Recipe(_Table):
             if match.kind is None and match.role is None and match.agents is None:
                 yield f"match.{i}: fits every agent; give kind, role or agents"
         for where, learner in self.learners():
-            yield from (f"{where}.{mistake}" for mistake in learner.mistakes())
+            yield from (f"{where}.{mistake}" for mistake in learner.mistakes(steps))
 
-    def demonstration_mistakes(self, steps: int) -> Iterator[str]:
-        """Yield what is wrong with demonstrations in a run of ``steps``: learner, key and value."""
-        for where, learner in self.learners():
-            yield from (f"{where}.{mistake}" for mistake in learner.demonstration_mistakes(steps))
-
-    def learners(self) -> tuple[tuple[str, Learner], ...]:
+    def learners(self) -> tuple[tuple[str, LearnerSettings], ...]:
         """Return every learner and what messages call its table."""
         return ("learner", self.learner), *((f"match.{i}", match) for i, match in enumerate(self.match))
 
@@ -280,7 +262,7 @@ def recipe_schema() -> dict[str, Any]:
     from cirl_marl.learners.algorithms import algorithms
 
     schema = Recipe.model_json_schema()
-    for table in ("Learner", "Match"):
+    for table in ("LearnerSettings", "Match"):
         schema["$defs"][table]["properties"]["algorithm"]["enum"] = list(algorithms())
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return schema
@@ -300,7 +282,7 @@ def load_recipe(name: str | Path) -> Recipe:
     except ValidationError as error:
         mistakes += mistakes_of(error, Recipe)
         recipe = _sound_part(document, {str(item["loc"][0]) for item in error.errors()})
-    mistakes += [*recipe.mistakes(), *recipe.demonstration_mistakes(recipe.run.steps)]
+    mistakes += recipe.mistakes(recipe.run.steps)
     if mistakes:
         raise DefinitionError(str(path), mistakes)
     return recipe

@@ -21,18 +21,19 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+from pydantic import StrictInt, ValidationError, field_validator
 
 from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.definitions.mistakes import mistakes_of
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError, unknown
-from cirl_marl.learners.recipe import OPTIONS, Group, Recipe
+from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
 from cirl_marl.network import Network
 from cirl_marl.records.files import sync, write_atomically, write_json
 from cirl_marl.records.machine import versions
@@ -40,8 +41,7 @@ from cirl_marl.records.machine import versions
 STATES = ("running", "complete", "interrupted", "failed")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunConfig:
+class RunConfig(Settings):
     """What a run was asked to do, fully resolved.
 
     Attributes:
@@ -59,31 +59,18 @@ class RunConfig:
     scenario: str
     agents: tuple[str, ...]
     recipe: Recipe
-    seed: int
-    steps: int
-    envs: int
+    seed: StrictInt
+    steps: StrictInt
+    envs: StrictInt
     options: dict[str, Any]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        plain = {name: getattr(self, name) for name in RunConfig.__slots__}
-        return {**plain, "agents": list(self.agents), "recipe": self.recipe.model_dump(mode="json")}
-
+    @field_validator("options")
     @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> RunConfig:
-        """Read what ``as_dict`` returned.
-
-        Raises:
-            KeyError, TypeError, ValueError: if it is something else.
-        """
-        found = cls(**{**plain, "agents": tuple(plain["agents"]), "recipe": Recipe.model_validate(plain["recipe"])})
-        for name in ("seed", "steps", "envs"):
-            if type(getattr(found, name)) is not int:
-                raise ValueError(f"{name} is {getattr(found, name)!r}, not a whole number")
-        for name in found.options:
+    def _are_known(cls, options: dict[str, Any]) -> dict[str, Any]:
+        for name in options:
             if name not in OPTIONS:
                 raise ValueError(unknown("option", name, OPTIONS))
-        return found
+        return options
 
 
 class RunDirectory:
@@ -108,7 +95,7 @@ class RunDirectory:
         if run.path.exists() and (not run.path.is_dir() or any(run.path.iterdir())):
             raise RunError(f"{run.path}: already exists and is not empty; choose another directory, or resume it")
         try:
-            plain = config.as_dict()
+            plain = config.model_dump(mode="json")
             json.dumps(plain)
         except (TypeError, ValueError) as error:
             raise RunError(f"{run.path}: a run on disk needs a recipe of plain values: {error}") from error
@@ -145,9 +132,10 @@ class RunDirectory:
         """
         plain = self._json("config.json")
         try:
-            return RunConfig.from_dict(plain)
-        except (KeyError, TypeError, ValueError) as error:
-            raise RunError(f"{self.path / 'config.json'}: is not a run configuration: {error!r}") from error
+            return RunConfig.model_validate(plain)
+        except ValidationError as error:
+            found = "; ".join(mistakes_of(error, RunConfig))
+            raise RunError(f"{self.path / 'config.json'}: is not a run configuration: {found}") from error
 
     @property
     def status(self) -> dict[str, Any]:
@@ -170,7 +158,7 @@ class RunDirectory:
 
     def go_on(self, config: RunConfig) -> None:
         """Say that the run goes on, to the steps of ``config``, which is the run's but for these."""
-        write_json(self.path / "config.json", config.as_dict())
+        write_json(self.path / "config.json", config.model_dump(mode="json"))
         status = self.status
         self.set_status("running", status["joint_steps"], status["checkpoint"])
 
@@ -209,12 +197,7 @@ class RunDirectory:
     def make_env(self, num_envs: int) -> VectorEnv:
         """Return the environment that the run trained in, with ``num_envs`` copies."""
         config = self.config
-        return VectorEnv(
-            self.network(),
-            num_envs=num_envs,
-            agents=config.agents,
-            **config.options,
-        )
+        return VectorEnv(self.network(), num_envs=num_envs, agents=config.agents, **config.options)
 
     def save_checkpoint(self, joint_steps: int, write: Callable[[Path], None], state: str, reason: str = "") -> None:
         """Let ``write`` fill a new checkpoint folder, then make it the one that counts and drop the older ones.

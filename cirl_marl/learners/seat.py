@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, Vec
 
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.learners.views import Observation, View
+from cirl_marl.learners.views import ObservedRows, View
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Compartment
 
@@ -71,7 +71,7 @@ class Seat(VecEnv):
         """Seat the learner ``name``; ``exchange`` hands in its action and waits for the outcome of the joint step."""
         self.name = name
         self.view = view
-        self.latest: Observation | None = None
+        self.latest: ObservedRows | None = None
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
         self.copies = env.num_envs
@@ -92,7 +92,7 @@ class Seat(VecEnv):
         done: NDArray[np.bool_],
         returns: Mapping[str, Floats],
         lengths: NDArray[np.integer],
-        final: Observation | None,
+        final: ObservedRows | None,
     ) -> VecEnvStepReturn:
         """Put together what a joint step brought the learner.
 
@@ -161,7 +161,7 @@ class Seat(VecEnv):
         return [self.views[i] for i in self._get_indices(indices)]
 
 
-def _row(observation: Observation, row: int) -> Observation:
+def _row(observation: ObservedRows, row: int) -> ObservedRows:
     if isinstance(observation, dict):
         return {key: value[row].copy() for key, value in observation.items()}
     own: NDArray[np.floating] = observation[row].copy()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.controllers.basic import Arrays
+from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.learners.learner import load_model, load_normaliser
@@ -16,7 +16,7 @@ from cirl_marl.learners.run import RunDirectory
 from cirl_marl.learners.views import View, unseen_state
 
 
-class Trained:
+class Trained(Controller):
     """Acts by the deterministic policies of a run's newest checkpoint, with their normalisers frozen.
 
     Attributes:

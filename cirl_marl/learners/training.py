@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -19,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
-from cirl_marl.learners.learner import Trainee, derived_seed
+from cirl_marl.learners.learner import Learner, derived_seed
 from cirl_marl.learners.lockstep import Interrupted, Lockstep
 from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
 
@@ -54,7 +55,7 @@ class Training:
     Attributes:
         config: what it was asked to do.
         env: the joint environment.
-        trainees: the learners by name; an independent learner has its agent's.
+        learners: the learners by name; an independent learner has its agent's.
         run: where it is kept; None if it is not.
     """
 
@@ -72,10 +73,10 @@ class Training:
         seeds = [derived_seed(config.seed, "copies", i, self.done) for i in range(config.envs)]
         groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
         self.lockstep = Lockstep(env, seeds, {name: group.view(env) for name, group in groups.items()}, done=self.done)
-        self.trainees: dict[str, Trainee] = {}
+        self.learners: dict[str, Learner] = {}
         for name, seat in self.lockstep.seats.items():
-            trainee = Trainee(seat, groups[name].spec, config.seed, done=self.done)
-            self.trainees[name] = trainee.load(checkpoint) if checkpoint else trainee.build()
+            learner = Learner(seat, groups[name].spec, config.seed, done=self.done)
+            self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
         self._appoint_demonstrators()
         self._log()
 
@@ -88,23 +89,20 @@ class Training:
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
         known: dict[str, Demonstrator] = {}
-        for trainee in self.trainees.values():
-            asked = trainee.spec.demonstrations
-            if asked is not None and trainee.demonstrations:
+        for learner in self.learners.values():
+            asked = learner.spec.demonstrations
+            if asked is not None and learner.demonstrations:
                 seed = derived_seed(self.config.seed, "demonstrations", asked.controller, self.done)
                 known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
-                trainee.follow(known[asked.controller])
+                learner.follow(known[asked.controller])
 
     def _log(self) -> None:
         if self.run is not None:
-            for trainee in self.trainees.values():
-                trainee.log_to(self.run.path / "tensorboard")
+            for learner in self.learners.values():
+                learner.log_to(self.run.path / "tensorboard")
 
     def start(
-        self,
-        *,
-        callbacks: Mapping[str, BaseCallback] | None = None,
-        report: Callable[[Progress], None] | None = None,
+        self, *, callbacks: Mapping[str, BaseCallback] | None = None, report: Callable[[Progress], None] | None = None
     ) -> None:
         """Train to the end of the budget.
 
@@ -124,11 +122,11 @@ class Training:
         try:
             with one_torch_thread(), self._interruptible():
                 self.lockstep.run(
-                    learners={a: _learner(t, steps, callbacks.get(a)) for a, t in self.trainees.items()},
-                    actors={a: t.act for a, t in self.trainees.items()},
-                    streams={a: t.streams for a, t in self.trainees.items()},
-                    budgets={a: t.budget(steps) for a, t in self.trainees.items()},
-                    hook=_Hook(self, report),
+                    learners={a: partial(each.learn, steps, callbacks.get(a)) for a, each in self.learners.items()},
+                    actors={a: each.act for a, each in self.learners.items()},
+                    streams={a: each.streams for a, each in self.learners.items()},
+                    budgets={a: each.budget(steps) for a, each in self.learners.items()},
+                    hook=partial(self._after_step, time.perf_counter(), report),
                 )
         except Interrupted:
             self._save("interrupted", "stopped by the user")
@@ -141,48 +139,58 @@ class Training:
         finally:
             if self._metrics is not None:
                 self._metrics.close()
-            for trainee in self.trainees.values():
-                trainee.close()
+            for learner in self.learners.values():
+                learner.close()
 
     def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
         """Raise a ``CirlError`` for callbacks of learners that there are not."""
         for name in callbacks:
-            if name not in self.trainees:
-                raise CirlError(f"callbacks: {unknown('learner', name, self.trainees)}")
+            if name not in self.learners:
+                raise CirlError(f"callbacks: {unknown('learner', name, self.learners)}")
 
     @property
     def joint_steps(self) -> int:
         """Joint steps done, those before a resumption included."""
         return self.lockstep.joint_steps
 
-    def after_step(self, seconds: float, infos: Infos, ended: NDArray[np.bool_]) -> None:
-        """Record finished episodes, save checkpoints, heed Ctrl-C."""
-        if ended.any() and self._metrics is not None:
-            first = infos[self.env.agents[0]]
-            returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
-            self._metrics.append(
-                [
-                    self.joint_steps,
-                    self.joint_steps * self.env.num_envs,
-                    self._metrics.seconds + seconds,
-                    float(first["episode_circularity"][ended].mean()),
-                    float(first["episode_service_level"][ended].mean()),
-                    *returns,
-                ]
-            )
+    def _after_step(
+        self, began: float, report: Callable[[Progress], None] | None, infos: Infos, ended: NDArray[np.bool_]
+    ) -> None:
+        """Report, record finished episodes, save checkpoints, heed Ctrl-C."""
+        finished = bool(ended.any())
+        if finished or report is not None:
+            self._tell(time.perf_counter() - began, report, infos, ended if finished else None)
         every = max(1, self.config.steps // self.env.num_envs // CHECKPOINTS)
         if self.joint_steps % every == 0:
             self._save("running")
         if self._interrupted:
             raise Interrupted
 
+    def _tell(
+        self, seconds: float, report: Callable[[Progress], None] | None, infos: Infos, ended: NDArray[np.bool_] | None
+    ) -> None:
+        """Report how far the training is, and keep the figures of episodes that ended, if some did."""
+        first, copies, steps = infos[self.env.agents[0]], self.env.num_envs, self.joint_steps
+        names = ("circularity", "service_level")
+        if ended is None:
+            circularity, service = (float(first[name].mean()) for name in names)
+        else:
+            circularity, service = (float(first[f"episode_{name}"][ended].mean()) for name in names)
+        if report is not None:
+            total = max(self.config.steps, steps * copies) - self.done * copies
+            report(Progress((steps - self.done) * copies, total, seconds, circularity, service, ended is not None))
+        if ended is not None and self._metrics is not None:
+            returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
+            spent = self._metrics.seconds + seconds
+            self._metrics.append([steps, steps * copies, spent, circularity, service, *returns])
+
     def _save(self, state: str, reason: str = "") -> None:
         if self.run is None:
             return
 
         def write(folder: Path) -> None:
-            for trainee in self.trainees.values():
-                trainee.save(folder, replay=state != "complete")
+            for learner in self.learners.values():
+                learner.save(folder, replay=state != "complete")
 
         self.run.save_checkpoint(self.joint_steps, write, state, reason)
 
@@ -203,40 +211,6 @@ class Training:
             yield
         finally:
             signal.signal(signal.SIGINT, before)
-
-
-class _Hook:
-    """Runs after each joint step."""
-
-    def __init__(self, training: Training, report: Callable[[Progress], None] | None) -> None:
-        self._training = training
-        self._report = report
-        self._began = time.perf_counter()
-
-    def __call__(self, infos: Infos, ended: NDArray[np.bool_]) -> None:
-        training = self._training
-        seconds = time.perf_counter() - self._began
-        if self._report is not None:
-            copies = training.env.num_envs
-            first = infos[training.env.agents[0]]
-            episode = bool(ended.any())
-            circularity = first["episode_circularity"][ended] if episode else first["circularity"]
-            service = first["episode_service_level"][ended] if episode else first["service_level"]
-            self._report(
-                Progress(
-                    (training.joint_steps - training.done) * copies,
-                    max(training.config.steps, training.joint_steps * copies) - training.done * copies,
-                    seconds,
-                    float(circularity.mean()),
-                    float(service.mean()),
-                    episode,
-                )
-            )
-        training.after_step(seconds, infos, ended)
-
-
-def _learner(trainee: Trainee, steps: int, callback: BaseCallback | None) -> Callable[[], None]:
-    return lambda: trainee.learn(steps, callback)
 
 
 @contextmanager

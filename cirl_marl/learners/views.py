@@ -8,18 +8,18 @@ and evaluation, with any number of copies.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from cirl_marl.controllers.basic import Arrays
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.network import Floats
 
-Arrays = Mapping[str, NDArray[np.floating]]
-Observation = NDArray[np.floating] | dict[str, NDArray[np.floating]]
+ObservedRows = NDArray[np.floating] | dict[str, NDArray[np.floating]]
 Scheme = Literal["independent", "shared", "joint"]
 CENTRAL_CRITIC = "CentralCriticPolicy"
 """Name of the policy whose critic sees the whole state."""
@@ -41,7 +41,7 @@ class View(ABC):
     action_space: spaces.Space[Any]
 
     @abstractmethod
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
         """Return the rows of all copies, agent by agent; ``state`` is called by those who see the whole state."""
 
     @abstractmethod
@@ -66,7 +66,7 @@ class OneAgent(View):
         self.observation_space = env.observation_spaces[agent]
         self.action_space = env.action_spaces[agent]
 
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
         """Return the agent's observation, shape (B, k)."""
         return np.ascontiguousarray(observations[self.agents[0]])
 
@@ -104,7 +104,7 @@ class SharedPolicy(View):
         self.observation_space = spaces.Box(low, high, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (max(self._actions.values()),), dtype=np.float32)
 
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
         """Return the padded and marked observations, shape (N·B, longest + N)."""
         copies = len(observations[self.agents[0]])
         rows = np.zeros((len(self.agents), copies, self._length + len(self.agents)), dtype=np.float32)
@@ -145,7 +145,7 @@ class AllAtOnce(View):
         )
         self.action_space = spaces.Box(-1.0, 1.0, (int(self._ends[-1]),), dtype=np.float32)
 
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
         """Return the observations side by side, shape (B, Σ k)."""
         return np.concatenate([observations[agent] for agent in self.agents], axis=1)
 
@@ -177,7 +177,7 @@ class WithState(View):
         state = spaces.Box(-np.inf, np.inf, (len(env.state_names) + 1,), dtype=np.float64)
         self.observation_space = spaces.Dict({"observation": view.observation_space, "state": state})
 
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> Observation:
+    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
         """Return the view's rows, and for each the state of its copy."""
         rows = self._view.observe(observations, state)
         assert isinstance(rows, np.ndarray)

@@ -96,11 +96,6 @@ MEASURED: Mapping[str, Kind] = {"stock": "mass", "measure": "1"}
 """Kind of quantity of a service's band, where it is no flow."""
 
 
-def ranged_states(model: CompartmentModel) -> tuple[str, ...]:
-    """Return the states whose start is drawn from a given range: all, unless the model has a ``start`` of its own."""
-    return () if hasattr(model, "start") else model.state_names
-
-
 @part
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:

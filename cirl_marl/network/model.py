@@ -1,136 +1,266 @@
-"""What every compartment model offers.
+"""What every compartment model offers, and what some offer besides.
 
 A model is frozen parameters and pure functions of arrays that are compartment-major: states (k, B), inputs (c, B),
 results (k, B) or (B,), in float64, contiguous along the batch. Nothing loops over the batch, and every operation is
 elementwise along it, so that a column's bits do not depend on the batch it is in.
+
+A model inherits from the class that says how it moves (``MOTIONS``) and from one for each thing that it offers besides
+(``OFFERS``); Python refuses to make a model that lacks a method of theirs.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from typing import ClassVar, Literal, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from inspect import isabstract
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.rowsum import Floats
 
 RewardState = Literal["before", "after"]
+Bools = NDArray[np.bool_]
 
 
-class CompartmentModel(Protocol):
-    """What every kind of compartment has; how it moves in time is one of the three protocols below.
+class _Stated:
+    """Stands for an attribute that the class of a model has to state: Python takes it for abstract."""
 
-    Besides, a model may offer
+    __isabstractmethod__ = True
 
-    - ``outflow(state, inputs)``, shape (B,): the output that drives flows of law ``compartment``;
-    - ``measure_names`` and ``measures(state, inputs)``, shape (measures, B): what services and observers may read;
-    - ``success(state, inputs)``, shape (B,): whether the task is done, reported in the infos of the agent;
-    - ``observed``: names of the states that an agent sees, by default all;
-    - ``input_unit``: unit of all inputs, as pint reads it, to which definitions are converted; without it they give
-      bounds of controls as numbers without unit, ``unit = "1"``;
-    - ``bounds``: lowest and highest value of states and inputs, by name, between which the equations hold; starts and
-      controls beyond are refused;
-    - ``context_names``: keyword arguments that ``derivative`` or ``advance`` takes from the network, shape (B,) each:
-      on a node ``stock_kg``, what it holds; on a batch arc whose vehicle it is ``load_kg``, what that carries;
-    - ``receive(state, mass_kg)``: the state after a delivery of ``mass_kg``, shape (B,);
-    - ``ports``, ``released(state)``, shape (ports, B), and ``complete(state)``, shape (B,): units released into batch
-      arcs in the last step, and whether that completed a batch; ``unit_kg`` and ``batch_kg``: the mass of a
-      unit and of a batch, if the model needs them;
-    - ``goal_reward(achieved, desired)`` with ``observation_names``, ``achieved_names`` and ``desired_names``: a task
-      with goals, for ``GoalEnv``;
-    - ``robot``: the model that acts within this one;
-    - ``boarding(state)``, ``depart(state, where)``, ``arrived(state)``, ``turn_back(state, where)``: a vehicle, which
-      says where it can load and has arrived, shape (B,), and is told where it leaves, loaded or empty.
+
+STATED: Any = _Stated()
+
+
+class CompartmentModel(ABC):
+    """What every kind of compartment has.
 
     Attributes:
         kind: name in the registry.
-        state_names: the states, with units, in order.
-        input_names: the controls, with units, in order.
         time_unit: unit of the model's time, as pint reads it.
         reward_state: whether the reward of a step takes the state ``before`` or ``after`` it; the published
             environments differ in this. The input is that of the step in either case.
+        input_unit: unit of all inputs, as pint reads it, to which definitions are converted; without it they give
+            bounds of controls as numbers without unit, ``unit = "1"``.
+        context_names: keyword arguments that the method by which it moves takes from the network, shape (B,) each: on a
+            node ``stock_kg``, what it holds; on a batch arc whose vehicle it is ``load_kg``, what that carries.
     """
 
-    kind: ClassVar[str]
-    time_unit: ClassVar[str]
-    reward_state: ClassVar[RewardState]
+    __slots__ = ()
+    kind: ClassVar[str] = STATED
+    time_unit: ClassVar[str] = STATED
+    reward_state: ClassVar[RewardState] = STATED
+    input_unit: ClassVar[str | None] = None
+    context_names: ClassVar[tuple[str, ...]] = ()
 
     @property
-    def state_names(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def input_names(self) -> tuple[str, ...]: ...  # noqa: D102
+    @abstractmethod
+    def state_names(self) -> tuple[str, ...]:
+        """The states, with units, in order."""
 
+    @property
+    @abstractmethod
+    def input_names(self) -> tuple[str, ...]:
+        """The controls, with units, in order."""
+
+    @abstractmethod
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return the reward of a step, shape (B,)."""
-        ...
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """States that an agent sees; by default all."""
+        return self.state_names
+
+    @property
+    def ranged_states(self) -> tuple[str, ...]:
+        """States whose start is drawn from a range that the network gives."""
+        return self.state_names
+
+    @property
+    def bounds(self) -> Mapping[str, tuple[float, float]]:
+        """Lowest and highest value of states and inputs, by name, for which the equations hold; others are refused."""
+        return {}
+
+    @property
+    def robot(self) -> CompartmentModel:
+        """The model that acts: this one, or one within it."""
+        return self
+
+    def receive(self, state: Floats, mass_kg: Floats) -> Floats:
+        """Return the state, shape (k, B), after a delivery, shape (B,); by default it takes no notice."""
+        return state
 
 
-class ContinuousModel(CompartmentModel, Protocol):
+class Outflowing(CompartmentModel):
+    """A model whose output drives flows of law ``compartment``."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def outflow(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the output, shape (B,); the arc's rate converts it to mass/time."""
+
+
+class ContinuousModel(CompartmentModel):
     """ż = f(z, u), integrated by the solver of the network."""
 
-    @property
-    def derivative(self) -> Callable[..., Floats]:
-        """``derivative(state, inputs)`` is dz/dt, shape (k, B); by keyword it is told what ``context_names`` lists."""
-        ...
+    __slots__ = ()
+
+    @abstractmethod
+    def derivative(self, state: Floats, inputs: Floats, *_: Any, **context: Any) -> Floats:
+        """Return dz/dt, shape (k, B), per ``time_unit``; a model names the ``context`` that it takes."""
 
 
-class OwnStepModel(CompartmentModel, Protocol):
-    """Continuous in time, with a step of its own, for physics that Runge-Kutta cannot follow."""
+class OwnStepModel(Outflowing):
+    """Continuous in time, with a step of its own, for physics that Runge-Kutta cannot follow.
 
-    def advance(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
-        """Return the state after ``interval``, shape (k, B), and the mean of its outflow over it, shape (B,)."""
-        ...
-
-
-class DiscreteTimeModel(CompartmentModel, Protocol):
-    """Moves once per control interval, which must be its own.
-
-    Attributes:
-        interval: length of its step in its time unit.
+    If it has a ``derivative`` too, solver ``euler`` takes that, as the published environments do.
     """
 
-    @property
-    def interval(self) -> float: ...  # noqa: D102
+    __slots__ = ()
 
+    @abstractmethod
+    def integrate(
+        self, state: Floats, inputs: Floats, interval: float, *_: Any, **context: Any
+    ) -> tuple[Floats, Floats]:
+        """Return the state after ``interval`` ``time_unit``, (k, B), and the mean of ``outflow`` over it, (B,)."""
+
+
+class DiscreteTimeModel(CompartmentModel):
+    """Moves once per control interval, and draws its own start."""
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def interval(self) -> float:
+        """Length of its step, ``time_unit``; the control interval of its network must be that."""
+
+    @property
+    def ranged_states(self) -> tuple[str, ...]:
+        """None: it draws them itself."""
+        return ()
+
+    @abstractmethod
     def start(self, stream: np.random.Generator) -> Floats:
         """Draw a start, shape (k,)."""
-        ...
 
-    def advance(self, state: Floats, inputs: Floats, interval: float) -> Floats:
+    @abstractmethod
+    def advance(self, state: Floats, inputs: Floats, *_: Any, **context: Any) -> Floats:
         """Return the state one step later, shape (k, B)."""
-        ...
 
 
-def check_step(kind: str, interval: float, own: float) -> None:
-    """Raise a ``CirlError`` unless ``interval`` is the step ``own`` of a model in discrete time."""
-    if not math.isclose(interval, own, rel_tol=1e-9):
-        raise CirlError(f"{kind}: moves in steps of {own:g}, not {interval:g}.")
+class Measuring(CompartmentModel):
+    """A model of which services and observers may read more than its states.
+
+    Attributes:
+        measure_names: what it measures, with units, in order.
+    """
+
+    __slots__ = ()
+    measure_names: ClassVar[tuple[str, ...]] = STATED
+
+    @abstractmethod
+    def measures(self, state: Floats, inputs: Floats) -> Floats:
+        """Return what it measures, shape (measures, B)."""
 
 
-def check_form(form: str, known: tuple[str, ...]) -> None:
-    """Raise a ``CirlError`` unless ``form`` is one of ``known``."""
-    if form not in known:
-        raise CirlError(unknown("form", form, known))
+class Task(CompartmentModel):
+    """A model whose agent has a task that can be done; the agent's infos report it."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def success(self, state: Floats, inputs: Floats) -> Bools:
+        """Return whether the task is done, shape (B,)."""
 
 
-def check_positive(kind: str, **parameters: float) -> None:
-    """Raise a ``CirlError`` that names the first parameter that is not a positive finite number."""
-    for name, value in parameters.items():
-        if not (math.isfinite(value) and value > 0.0):
-            raise CirlError(f"{kind}: {name} = {value!r}, but it must be positive and finite.")
+class GoalTask(Task):
+    """A task with goals, for ``GoalEnv``; all names are of states that are observed.
+
+    Attributes:
+        observation_names: what is seen besides the goals.
+        achieved_names: the goal as it is.
+        desired_names: the goal as it should be.
+    """
+
+    __slots__ = ()
+    observation_names: ClassVar[tuple[str, ...]] = STATED
+    achieved_names: ClassVar[tuple[str, ...]] = STATED
+    desired_names: ClassVar[tuple[str, ...]] = STATED
+
+    @abstractmethod
+    def goal_reward(self, achieved: Floats, desired: Floats) -> Floats:
+        """Return the reward, shape (...), for goals of shape (..., entries of a goal)."""
 
 
-def check_not_negative(kind: str, **parameters: float) -> None:
-    """Raise a ``CirlError`` that names the first parameter that is negative or not finite."""
-    for name, value in parameters.items():
-        if not (math.isfinite(value) and value >= 0.0):
-            raise CirlError(f"{kind}: {name} = {value!r}, but it must be finite and not negative.")
+class Releasing(CompartmentModel):
+    """A model that releases units of its node's stock into batch arcs.
+
+    Attributes:
+        ports: where it releases; each port has a batch arc.
+    """
+
+    __slots__ = ()
+    ports: ClassVar[tuple[str, ...]] = STATED
+
+    @property
+    def unit_kg(self) -> float | None:
+        """Mass of a unit, if the model knows it."""
+        return None
+
+    @property
+    def batch_kg(self) -> float | None:
+        """Mass of a batch, if the model knows it."""
+        return None
+
+    @abstractmethod
+    def released(self, state: Floats) -> Floats:
+        """Return the units released in the last step, shape (ports, B)."""
+
+    @abstractmethod
+    def complete(self, state: Floats) -> Bools:
+        """Return where the last step completed a batch, shape (B,)."""
 
 
-def check_share(kind: str, **parameters: float) -> None:
-    """Raise a ``CirlError`` that names the first parameter that is no share of a whole, in [0, 1]."""
-    for name, value in parameters.items():
-        if not 0.0 <= value <= 1.0:
-            raise CirlError(f"{kind}: {name} = {value!r}, but it must lie in [0, 1].")
+class Vehicle(CompartmentModel):
+    """A model that carries the batches of its arc, and is told where it leaves, loaded or empty."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def boarding(self, state: Floats) -> Bools:
+        """Return where it can be loaded, shape (B,)."""
+
+    @abstractmethod
+    def depart(self, state: Floats, where: Bools) -> Floats:
+        """Return the state, shape (k, B), after it was loaded ``where``, shape (B,)."""
+
+    @abstractmethod
+    def arrived(self, state: Floats) -> Bools:
+        """Return where it is at the recipient with its load, shape (B,)."""
+
+    @abstractmethod
+    def turn_back(self, state: Floats, where: Bools) -> Floats:
+        """Return the state, shape (k, B), after it was unloaded ``where``, shape (B,)."""
+
+
+MOTIONS = (ContinuousModel, OwnStepModel, DiscreteTimeModel)
+"""How a model moves."""
+
+OFFERS = (*MOTIONS, Outflowing, Measuring, Task, GoalTask, Releasing, Vehicle)
+"""All that a model may inherit from."""
+
+
+def model_faults(found: type[Any]) -> Iterator[str]:
+    """Yield why a class is none of compartment models, the methods of an offer that it does not make included."""
+    if not issubclass(found, MOTIONS):
+        yield f"it inherits from none of {', '.join(motion.__name__ for motion in MOTIONS)}"
+    elif isabstract(found):
+        yield f"it lacks {', '.join(sorted(found.__abstractmethods__))}"
+    for offer in OFFERS:
+        given = [name for name in vars(offer) if name in offer.__abstractmethods__ and hasattr(found, name)]
+        if given and not issubclass(found, offer):
+            yield f"it has {', '.join(given)} and does not inherit from {offer.__name__}"

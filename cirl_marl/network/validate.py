@@ -9,7 +9,8 @@ from itertools import pairwise
 
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.declared import bound_problems, default_of
-from cirl_marl.network.elements import MAX_STEPS, TAKEN, Arc, Compartment, ControlKind, Law, Node, ranged_states
+from cirl_marl.network.elements import MAX_STEPS, TAKEN, Arc, Compartment, ControlKind, Law, Node
+from cirl_marl.network.model import Outflowing, Releasing, Vehicle, model_faults
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.units import factor
 from cirl_marl.network.validate_services import service_problems
@@ -33,6 +34,13 @@ def problems(network: Parts) -> Iterator[str]:
             yield f"units.{key}: {error}"
     if not network.nodes:
         yield "nodes: a network needs at least one"
+    kinds = {c.id: type(c.model) for c in (*network.nodes, *network.arcs) if c.model is not None}
+    strange = [
+        f"'{id_}': model {kind.__name__}: {fault}" for id_, kind in kinds.items() for fault in model_faults(kind)
+    ]
+    yield from strange
+    if strange:
+        return  # such models cannot be asked for more
     yield from _name_problems([*(("node", n.id) for n in network.nodes), *(("arc", a.id) for a in network.arcs)])
     yield from _name_problems([("service", service.id) for service in network.services])
     nodes = {node.id: node for node in network.nodes}
@@ -62,7 +70,7 @@ def problems(network: Parts) -> Iterator[str]:
         if len(arcs) > 1:
             yield f"arc '{arcs[1]}': port '{port}' of '{donor}' has the arc '{arcs[0]}' already"
     for node in network.nodes:
-        for port in getattr(node.model, "ports", ()):
+        for port in node.model.ports if isinstance(node.model, Releasing) else ():
             if (node.id, port) not in carrying:
                 yield (
                     f"node '{node.id}': what its model releases to port '{port}' would stay; give it an arc of law "
@@ -147,7 +155,7 @@ def _arc_problems(
 
 def _model_flow_problems(where: str, arc: Arc, everyone: Mapping[str, Compartment]) -> Iterator[str]:
     ends = (arc.donor, arc.recipient, arc.id)
-    giving = [end for end in ends if end in everyone and hasattr(everyone[end].model, "outflow")]
+    giving = [end for end in ends if end in everyone and isinstance(everyone[end].model, Outflowing)]
     if arc.by not in giving:
         yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
 
@@ -183,7 +191,7 @@ def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, No
             yield f"{where}: law 'batch' takes no {what}"
     donor = nodes.get(arc.donor)
     if arc.by and donor is not None:
-        ports = getattr(donor.model, "ports", ())
+        ports = donor.model.ports if isinstance(donor.model, Releasing) else ()
         if arc.by != donor.id or not ports:
             yield f"{where}: by: batches are released by the model of the donor '{donor.id}', which has ports {ports}"
         elif arc.port not in ports:
@@ -196,7 +204,7 @@ def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, No
 
 def _unit_problems(where: str, arc: Arc, mass_unit: str, donor: Node) -> Iterator[str]:
     """Yield it if a model that knows the mass of what it releases knows another than its arc."""
-    unit_kg = getattr(donor.model, "unit_kg", None)
+    unit_kg = donor.model.unit_kg if isinstance(donor.model, Releasing) else None
     try:
         carried_kg = arc.rate * factor(mass_unit, "kg")
     except CirlError:
@@ -206,7 +214,7 @@ def _unit_problems(where: str, arc: Arc, mass_unit: str, donor: Node) -> Iterato
 
 
 def _has_vehicle(arc: Arc) -> bool:
-    return arc.law is Law.BATCH and hasattr(arc.model, "boarding")
+    return arc.law is Law.BATCH and isinstance(arc.model, Vehicle)
 
 
 def _rate_control(arc: Arc) -> str | None:
@@ -215,7 +223,7 @@ def _rate_control(arc: Arc) -> str | None:
 
 def _common_problems(where: str, compartment: Compartment, network: Parts) -> Iterator[str]:
     yield from bound_problems(compartment, f"{where}: ")
-    states = ranged_states(compartment.model) if compartment.model is not None else ()
+    states = compartment.model.ranged_states if compartment.model is not None else ()
     if len(compartment.inner) != len(states):
         yield f"{where}: {len(compartment.inner)} initial ranges for the inner states {list(states)}"
     for low, high in compartment.inner:
@@ -255,10 +263,10 @@ def _context_problems(where: str, compartment: Compartment) -> Iterator[str]:
         told = ("stock_kg",)
     elif isinstance(compartment, Arc) and _has_vehicle(compartment):
         told = ("load_kg",)
-    for name in getattr(compartment.model, "context_names", ()):
-        if name not in told:
-            kind = getattr(compartment.model, "kind", "")
-            yield f"{where}: model '{kind}': context_names: {unknown('quantity told to this model', name, told)}"
+    model = compartment.model
+    for name in () if model is None else model.context_names:
+        if model is not None and name not in told:
+            yield f"{where}: model '{model.kind}': context_names: {unknown('quantity told to this model', name, told)}"
 
 
 def _bound_problems(where: str, compartment: Compartment) -> Iterator[str]:
@@ -266,11 +274,11 @@ def _bound_problems(where: str, compartment: Compartment) -> Iterator[str]:
     model, control = compartment.model, compartment.control
     if model is None:
         return
-    states = ranged_states(model)
+    states = model.ranged_states
     ranges = dict(zip(states, compartment.inner, strict=True)) if len(states) == len(compartment.inner) else {}
     if control is not None:
         ranges |= dict.fromkeys(model.input_names, (control.low, control.high))
-    for name, (low, high) in getattr(model, "bounds", {}).items():
+    for name, (low, high) in model.bounds.items():
         if name in ranges and not (low <= ranges[name][0] and ranges[name][1] <= high):
             given = f"[{ranges[name][0]:g}, {ranges[name][1]:g}]"
             yield f"{where}: model '{model.kind}' holds for {name} in [{low:g}, {high:g}], not for {given}"

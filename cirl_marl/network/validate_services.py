@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from cirl_marl.errors import unknown
 from cirl_marl.network.declared import bound_problems
 from cirl_marl.network.elements import Arc, Compartment, Law, Service
+from cirl_marl.network.model import Measuring
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.validate_settings import repeated
 
@@ -27,7 +28,7 @@ def _providers(network: Parts) -> dict[str, dict[str, None]]:
     found = {
         "flow": [arc.id for arc in network.arcs],
         "stock": [*(node.id for node in nodes), *(arc.id for arc in network.arcs if arc.law is Law.BATCH)],
-        "measure": [c.id for c in everyone if hasattr(c.model, "measures")],
+        "measure": [c.id for c in everyone if isinstance(c.model, Measuring)],
         "outflow": [node.id for node in nodes],
     }
     return {quantity: dict.fromkeys(ids) for quantity, ids in found.items()}
@@ -40,9 +41,9 @@ def _service_problems(
     yield from bound_problems(service, f"{where}: ")
     known = providers.get(service.quantity, providers["outflow"])
     if service.provider in known and service.quantity == "measure":
-        names = getattr(everyone[service.provider].model, "measure_names", ())
-        if service.measure not in names:
-            yield f"{where}: {unknown('measure', service.measure, names)}"
+        model = everyone[service.provider].model
+        if isinstance(model, Measuring) and service.measure not in model.measure_names:
+            yield f"{where}: {unknown('measure', service.measure, model.measure_names)}"
     if service.provider not in known:
         kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
         yield f"{where}: provider: {unknown(kind, service.provider, known)}"

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.declared import bound_problems
 from cirl_marl.network.elements import MAX_STEPS, Compartment, Episode, Law
+from cirl_marl.network.model import ContinuousModel, DiscreteTimeModel, OwnStepModel
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.units import factor
 
@@ -23,7 +24,7 @@ def setting_problems(network: Parts) -> Iterator[str]:
     else:
         if episode.solver_step is not None:
             yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
-        moving = any(c.model is not None and not hasattr(c.model, "interval") for c in (*network.nodes, *network.arcs))
+        moving = any(isinstance(c.model, ContinuousModel | OwnStepModel) for c in (*network.nodes, *network.arcs))
         if moving or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
             yield (
                 "solver 'exact' knows no continuous inner physics: a network with models needs solver 'rk4' or 'euler'"
@@ -60,11 +61,10 @@ def _clock_problems(network: Parts, compartment: Compartment) -> Iterator[str]:
         interval = network.episode.control_interval * factor(network.time_unit, model.time_unit)
     except CirlError:
         return  # a problem of its own, units.time
-    step = getattr(model, "interval", None)
-    if step is not None and not math.isclose(interval, step, rel_tol=1e-9):
+    if isinstance(model, DiscreteTimeModel) and not math.isclose(interval, model.interval, rel_tol=1e-9):
         unit = model.time_unit
         yield (
-            f"'{compartment.id}': model '{model.kind}' moves in steps of {step:g} {unit}; "
+            f"'{compartment.id}': model '{model.kind}' moves in steps of {model.interval:g} {unit}; "
             f"the control interval is {interval:g} {unit}"
         )
 

@@ -1,7 +1,7 @@
 """The best achievable circularity: a proven upper bound, its certificate, its plan, and the best plan found."""
 
 from cirl_marl.optimum.admissible import NoCertificate
-from cirl_marl.optimum.bounds import Bound, Envelope
+from cirl_marl.optimum.bounds import Bound, Envelope, gap
 from cirl_marl.optimum.certificate import Certificate, Verification
 from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, standard_candidates
 from cirl_marl.optimum.improve import improved
@@ -19,6 +19,7 @@ __all__ = [
     "achieved",
     "bound",
     "envelope",
+    "gap",
     "improved",
     "search",
     "search_each",

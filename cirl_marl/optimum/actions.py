@@ -40,6 +40,7 @@ def normalised_actions(admissible: Admissible, layout: Layout, planned: Floats) 
             valve[:, donor] = _ratio(flow[:, k], unit, valve[:, donor])
     for z, node in enumerate(layout.valves):
         valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
+    # what is left of f̄_k after the valve is the arc's own factor, w_k = f̄_k/(a_k·v·X̄_p)
     valve = np.clip(valve, admissible.valve[0], admissible.valve[1])
     driving = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
     own = _ratio(
@@ -69,5 +70,4 @@ def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
 
 
 def _ratio(amount: Floats, unit: Floats, otherwise: Floats) -> Floats:
-    ratio: Floats = np.divide(amount, unit, out=otherwise.copy(), where=unit > 1e-12 * np.abs(amount))
-    return ratio
+    return np.divide(amount, unit, out=otherwise.copy(), where=unit > 1e-12 * np.abs(amount))

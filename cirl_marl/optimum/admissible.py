@@ -80,14 +80,12 @@ class Admissible:
     @property
     def scheduled(self) -> NDArray[np.bool_]:
         """Arcs that flow by schedule, as far as their donor holds enough, shape (arcs,)."""
-        scheduled: NDArray[np.bool_] = self.driver < 0
-        return scheduled
+        return self.driver < 0
 
     @property
     def factor(self) -> Floats:
         """Lowest and highest v·w_k or v·u_k, shape (2, arcs)."""
-        factor: Floats = self.own * self.valve[:, self.network.donors]
-        return factor
+        return self.own * self.valve[:, self.network.donors]
 
     def rate(self, step: int) -> Floats:
         """Return the lowest and highest coefficient of each arc in one interval, shape (2, arcs).

@@ -16,6 +16,22 @@ from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis
 
 
+def relative(difference: ArrayLike, reference: ArrayLike) -> Floats:
+    """Return ``difference``/|``reference``| in the broadcast shape, NaN where the reference is 0."""
+    top, bottom = np.broadcast_arrays(np.asarray(difference, dtype=float), np.asarray(reference, dtype=float))
+    ratio: Floats = np.divide(top, np.abs(bottom), out=np.full(top.shape, np.nan), where=bottom != 0)
+    return ratio
+
+
+def gap(bound: ArrayLike, achieved: ArrayLike) -> Floats:
+    """Return (bound − achieved)/|bound| in the broadcast shape, NaN where the bound is 0.
+
+    >>> float(gap(-10.0, -12.0))
+    0.2
+    """
+    return relative(np.subtract(bound, achieved), bound)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bound:
     """An upper bound of an objective for one start, its certificate, and the plan that suggests itself.
@@ -101,8 +117,7 @@ class Bound:
         if self.service_weight is not None:
             scale = self.network.objective.circularity_scale
             achieved = achieved / scale + self.service_weight * np.asarray(service, dtype=float)
-        difference = np.asarray(self.objective - achieved)
-        return difference / abs(self.objective) if self.objective else np.full_like(difference, np.nan)
+        return gap(self.objective, achieved)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from cirl_marl.controllers.basic import Arrays
+from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.bounds import Bound
@@ -18,13 +18,12 @@ BOUND = 0.3
 """About the share of solving for the bound in the work on a plan; the rest is to improve it."""
 
 
-class Optimum:
+class Optimum(Planner):
     """Open-loop optimal control: once started, every copy has a plan of its own for the whole episode.
 
     Attributes:
-        ahead: see ``Planner``.
         plans: once started, whose plan each copy carries out: bounds, or incumbents where nothing is proved.
-        note: once started, what is to be said beside its figures; empty if the plans are those of bounds.
+        note: empty if the plans are those of bounds.
     """
 
     ahead = 0.99
@@ -33,12 +32,7 @@ class Optimum:
         """Choose the objective; see ``bound``."""
         self._min_service, self._service_weight = min_service, service_weight
         self.plans: list[Bound] | list[Incumbent] = []
-        self.note = ""
         self._plan = Plan(())
-
-    def start(self, env: VectorEnv, seed: int) -> None:
-        """Solve a program for the start of every copy and improve its plan; see ``plan``."""
-        self.plan(env, seed, lambda share: None)
 
     def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Solve a program for the start of every copy and improve its plan; ``seed`` has no effect.

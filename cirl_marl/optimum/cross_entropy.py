@@ -37,7 +37,7 @@ exact where more service costs less than that; a steeper one lets the draws hug 
 KNOTS = 16
 """Stretches of an episode with deviations of their own, unless another number is asked for."""
 
-Progress = Callable[[float, Floats], None]
+SearchReport = Callable[[float, Floats], None]
 """Takes the share of all episodes that is simulated and the best merit from each start so far, shape (starts,)."""
 
 
@@ -89,7 +89,7 @@ def search(
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
-    progress: Progress = lambda share, merit: None,
+    progress: SearchReport = lambda share, merit: None,
 ) -> Incumbent:
     """Look for the actions that do best over one episode, for any network; nothing is proved about the result.
 
@@ -151,27 +151,13 @@ def search_each(
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
-    progress: Progress = lambda share, merit: None,
+    progress: SearchReport = lambda share, merit: None,
 ) -> list[Incumbent]:
     """Look for the best actions from several starts at once, which costs less than one after the other.
 
-    All starts share the draws, so each plan is the one that ``search`` finds from that start alone.
-
-    Args:
-        network: under its scenario and horizon.
-        initial: stocks and inner states, the first of ``VectorEnv.state_names``, shape (starts, rows).
-        service_weight: see ``search``.
-        min_service: see ``search``.
-        agents: see ``search``.
-        candidates: see ``search``.
-        knots: see ``search``.
-        population: plans tried from each start in an iteration.
-        iterations: see ``search``.
-        seed: see ``search``.
-        progress: see ``search``.
-
-    Raises:
-        CirlError: see ``search``.
+    All starts share the draws, so each plan is the one that ``search`` finds from that start alone. Arguments and
+    errors are those of ``search``, but for ``network``, under its scenario and horizon, and ``initial``, stocks and
+    inner states, the first of ``VectorEnv.state_names``, shape (starts, rows).
     """
     check_options(service_weight, min_service, DEGREE)
     for name, value, least in (("population", population, 8), ("iterations", iterations, 0), ("knots", knots, 1)):

@@ -89,6 +89,7 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     inputs = np.concatenate([stock, bound.actions], axis=1)
     width = np.concatenate([np.maximum(stock.max(axis=0), 1.0), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound
+    # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
     shift = np.where(np.arange(nodes + entries) < nodes, 1.0, -np.where(inputs >= 0, 1.0, -1.0)) * width
     columns = np.repeat(inputs[:, :, None], nodes + entries + 1, axis=2)
     columns[:, np.arange(nodes + entries), np.arange(nodes + entries)] += shift
@@ -115,6 +116,7 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats:
     outputs = nodes + arcs
     size = outputs + entries + services + 1
     level, imbalance = outputs + entries, size - 1
+    # δ(x', f̄)_t − J_x δx'_{t−1} − J_a δa_t = 0, block row t of the equations
     once = sparse.identity(steps)
     carry = sparse.csr_array(_diagonal(-by_stock, (outputs, nodes)))
     carried = carry @ sparse.kron(sparse.eye_array(steps, k=-1), sparse.eye_array(nodes, size))
@@ -125,6 +127,7 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats:
     measure, imbalances = _measures(bound)
     realised = np.concatenate([run.stock, run.flow], axis=1)
     low = np.array([service.low for service in network.services])
+    # low·level − δq ≤ q, and ±(φ + δφ) ≤ imbalance, with q and φ those of the simulated episode
     rows = np.zeros((services + 2, size))
     rows[:services, :outputs], rows[:services, level:imbalance] = -measure, np.diag(low)
     rows[services:, :outputs], rows[services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0

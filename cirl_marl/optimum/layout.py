@@ -12,8 +12,8 @@ from scipy import sparse
 
 from cirl_marl.network import Floats, Integers, Network
 
-Row = list[tuple[int, float]]
-Link = tuple[Row, Row]
+MatrixRow = list[tuple[int, float]]
+Link = tuple[MatrixRow, MatrixRow]
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ class Layout:
 
     def stock(self, moment: int) -> int:
         """Return the first of the weighted mean stocks X."""
+        # each piece: d + 1 blocks of (X, F, Z), equally long, then the stocks at its end
         piece, i = divmod(moment, self.degree + 1)
         return piece * self.piece + i * ((self.piece - len(self.network.nodes)) // (self.degree + 1))
 
@@ -111,7 +112,7 @@ def start_of(layout: Layout, piece: int, node: int, factor: float) -> Link:
     return (entry, []) if piece > 0 else ([], entry)
 
 
-def matrix_of(rows: Sequence[Row], layout: Layout) -> Any:
+def matrix_of(rows: Sequence[MatrixRow], layout: Layout) -> Any:
     """Return the sparse matrix of rows over the variables of one interval."""
     entries = [(i, column, value) for i, row in enumerate(rows) for column, value in row]
     if not entries:

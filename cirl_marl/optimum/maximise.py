@@ -89,22 +89,9 @@ def envelope(
     The first is for the mean of the starts, each further one for the start where those before prove least: the best
     objective is a nearly concave function of the start, so what is proved from elsewhere is weakest where it is worst.
 
-    Args:
-        network: see ``bound``.
-        initial: stocks at the starts, shape (episodes, nodes), mass.
-        solves: how many programs to solve, at most 1 + episodes.
-        service_weight: see ``bound``.
-        min_service: in [0, 1], one for all episodes or one for each, shape (episodes,).
-        agents: see ``bound``.
-        scenario: see ``bound``.
-        horizon: see ``bound``.
-        degree: see ``bound``.
-        near: see ``bound``.
-        progress: called with the number of programs solved.
-
-    Raises:
-        NoCertificate: see ``bound``.
-        CirlError: see ``bound``.
+    Arguments and errors are those of ``bound``, but for ``initial``, stocks of shape (episodes, nodes), mass;
+    ``min_service``, one level for all or one for each, shape (episodes,); ``solves``, how many programs to solve, at
+    most 1 + episodes; and ``progress``, called with the number of those that are solved.
     """
     if not isinstance(solves, int | np.integer) or isinstance(solves, bool) or solves < 1:
         raise CirlError(f"solves must be a whole number of at least 1, got {solves!r}")

@@ -17,7 +17,7 @@ from scipy import special
 
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout, Link, Row, start_of
+from cirl_marl.optimum.layout import Layout, Link, MatrixRow, start_of
 
 
 def falls(admissible: Admissible, layout: Layout) -> list[Link]:
@@ -90,15 +90,16 @@ class _Chain:
         links: list[Link] = [(now, before)]
         links.extend((row, []) for row in self.between([(layout.stock(0) + node, 1.0)], 1.0))
         d = layout.degree
-        ratio = self.means[d + 1] / self.means[d]
-        end: Row = [(layout.stock(self.first + d) + node, ratio), (layout.end(self.piece) + node, -1.0)]
+        ratio = self.means[d + 1] / self.means[d]  # (X_d + U η_d)/ω_d ≤ (x_end + U η_end)/e^{−kδ}, times e^{−kδ}
+        end: MatrixRow = [(layout.stock(self.first + d) + node, ratio), (layout.end(self.piece) + node, -1.0)]
         links.append(([*end, *self._orders(ratio * self.delays[d] - self.delays[d + 1])], []))
         return links
 
-    def between(self, row: list[tuple[int, float]], spread: float) -> list[Row]:
+    def between(self, row: list[tuple[int, float]], spread: float) -> list[MatrixRow]:
         """Return ω_{i+1}/ω_i·q_i − q_{i+1} − spread·U·(…) for the combination q that ``row`` describes."""
-        rows: list[Row] = []
+        rows: list[MatrixRow] = []
         for i in range(self.layout.degree):
+            # (q_i + U η_i)/ω_i ≤ (q_{i+1} + U η_{i+1})/ω_{i+1}, times ω_{i+1}
             ratio = self.means[i + 1] / self.means[i]
             here, there = (self.layout.stock(self.first + i + step) for step in (0, 1))
             terms = [(here + column, ratio * weight) for column, weight in row]
@@ -106,5 +107,5 @@ class _Chain:
             rows.append([*terms, *self._orders(spread * (ratio * self.delays[i] - self.delays[i + 1]))])
         return rows
 
-    def _orders(self, weight: float) -> Row:
+    def _orders(self, weight: float) -> MatrixRow:
         return [(self.layout.flow(self.first) + k, weight) for k in self.orders]

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Arrays
+from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats
@@ -65,8 +65,7 @@ class _Plan:
         """Return the planned mean service level of each interval, shape (intervals,)."""
         layout = self.problem.layout
         levels = self.solution.plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
-        mean: Floats = levels.mean(axis=1) if levels.size else np.ones(len(levels))
-        return mean
+        return levels.mean(axis=1) if levels.size else np.ones(len(levels))
 
     def prices(self) -> Floats:
         """Return what the rows of the next interval charge for the stocks at the end of each, shape (intervals, nodes).
@@ -78,6 +77,7 @@ class _Plan:
         layout = problem.layout
         charged = np.zeros(len(problem.cost))
         for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
+            # entry (row, column): the row belongs to the last interval that it touches, the column to its own
             entries = matrix.tocoo()
             own = entries.col // layout.size
             ends = entries.col - own * layout.size
@@ -88,16 +88,13 @@ class _Plan:
         return priced * self.unit
 
 
-class MPC:
+class MPC(Planner):
     """Plans again and again from the current stocks; each copy has its own plan.
 
     The objective is λ̄ of the episode; with ``service_weight`` w, λ̄/circularity_scale + w·service. With ``min_service``
     the mean level over the whole episode is held at the demanded level or above: what the past intervals lacked the
     planned ones have to make up for. If that is out of reach, w = SERVICE_FIRST takes the place of the demand in that
     plan, which then comes as close as it can.
-
-    Attributes:
-        ahead: see ``Planner``.
     """
 
     ahead = 0.1  # a first plan takes longer than the later ones, which start from it
@@ -131,10 +128,6 @@ class MPC:
             raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
         self._horizon, self._replan = horizon, replan
         self._demanded, self._weight, self._degree = min_service, service_weight, degree
-
-    def start(self, env: VectorEnv, seed: int) -> None:
-        """Make the first plan of every copy; see ``plan``."""
-        self.plan(env, seed, lambda share: None)
 
     def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Make the first plan of every copy; ``seed`` has no effect.

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from cirl_marl.network import Floats
-from cirl_marl.optimum.layout import Layout, Row
+from cirl_marl.optimum.layout import Layout, MatrixRow
 
 
-def measures(layout: Layout) -> Iterator[Row]:
+def measures(layout: Layout) -> Iterator[MatrixRow]:
     """Yield low·level − q ≤ 0 for each service, and ±Δ·σ_env·f̄ − imbalance ≤ 0.
 
     The level is at most min(1, q/low): a finite upper end of the band could only lower it further.
@@ -22,7 +22,7 @@ def measures(layout: Layout) -> Iterator[Row]:
         else:
             arcs = network.metered(service)
             measured = [(layout.flow(i) + int(k), -1.0 / count) for i in layout.moments for k in arcs]
-        yield [(layout.level + s, service.low), *measured]
+        yield [(layout.level + s, service.low), *measured]  # level ≤ q/low; level ≤ 1 is a box
     weights = -network.circularity_weights[1]
     counted = [(i, int(k)) for i in layout.moments for k in np.flatnonzero(weights)]
     for sign in (1.0, -1.0):

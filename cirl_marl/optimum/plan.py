@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Arrays
+from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import ControlError
@@ -40,7 +40,7 @@ class Planned(Protocol):
         """Normalised actions, shape (steps, entries)."""
 
 
-class Plan:
+class Plan(Controller):
     """Replays the actions of a plan, whatever it observes; each copy may have its own."""
 
     def __init__(self, plans: Planned | Sequence[Planned]) -> None:

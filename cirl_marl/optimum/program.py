@@ -16,10 +16,10 @@ from scipy import sparse
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout, Link, Row, matrix_of, start_of
+from cirl_marl.optimum.layout import Layout, Link, MatrixRow, matrix_of, start_of
 from cirl_marl.optimum.monotone import falls
 from cirl_marl.optimum.objective import measures, objective
-from cirl_marl.optimum.reach import Comparison, Reach
+from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.scheduled import deliveries, openings
 
 
@@ -51,8 +51,7 @@ class Program:
 
     def interval_of_rows(self, matrix: Any) -> Integers:
         """Return the last interval whose variables each row of A or G is about, shape (rows,)."""
-        intervals: Integers = np.maximum.reduceat(matrix.indices, matrix.indptr[:-1]) // self.layout.size
-        return intervals
+        return np.maximum.reduceat(matrix.indices, matrix.indptr[:-1]) // self.layout.size
 
 
 class Programs:
@@ -76,8 +75,8 @@ class Programs:
                 and bounds nothing.
         """
         self.admissible = admissible
-        self._comparison = Comparison(admissible)
-        self.layout = layout = _layout(admissible, self._comparison.substeps, degree)
+        self._system = ComparisonSystem(admissible)
+        self.layout = layout = _layout(admissible, self._system.substeps, degree)
         equal, under = _laws(admissible, layout)
         if held:
             equal += _held(admissible, layout)
@@ -100,7 +99,7 @@ class Programs:
         layout, network = self.layout, self.admissible.network
         when = range(network.episode.horizon) if intervals is None else intervals
         steps = len(when)
-        reached = self._comparison.reach(initial, when)
+        reached = self._system.reach(initial, when)
         equal, equal_to = self._equal.over(steps, initial)
         under, under_to = self._under.over(steps, initial)
         opened, opened_to = openings(self.admissible, reached, layout, when)
@@ -138,7 +137,7 @@ def _layout(admissible: Admissible, pieces: int, degree: int) -> Layout:
 class _Chained:
     """Rows that are repeated in every interval, some of which link it to the interval before."""
 
-    def __init__(self, linked: Sequence[Link], alone: Sequence[Row], layout: Layout) -> None:
+    def __init__(self, linked: Sequence[Link], alone: Sequence[MatrixRow], layout: Layout) -> None:
         """Take the rows of an interval.
 
         Args:
@@ -155,9 +154,11 @@ class _Chained:
     def over(self, steps: int, initial: Floats) -> tuple[Any, Floats]:
         """Return the matrix over ``steps`` intervals, interval after interval, and the right-hand side."""
         if steps not in self._known:
+            # block (t, t) holds the rows of interval t, block (t, t − 1) reaches back for the stocks it starts from
             once, shifted = sparse.eye_array(steps), sparse.eye_array(steps, k=-1)
             linked = sparse.kron(once, self._now) + sparse.kron(shifted, self._before)
             self._known[steps] = sparse.vstack([linked, sparse.kron(once, self._alone)], format="csr")
+        # there is no interval before the first: its entries meet known stocks and go to the right-hand side
         layout, matrix = self._layout, self._known[steps]
         first = np.zeros(layout.size)
         first[layout.end(-1) : layout.level] = initial
@@ -177,8 +178,8 @@ def _balances(layout: Layout) -> list[Link]:
     for j in layout.moments:
         piece, i = divmod(j, d + 1)
         for node in range(len(network.nodes)):
-            row = _lower_degree(layout, j, node, 1.0)
-            before: Row = []
+            row = _lower_degree(layout, j, node, 1.0)  # Y_i − Y_{i−1} = δ/(d + 1)·S F_i (theorem 1)
+            before: MatrixRow = []
             if i > 0:
                 row += _lower_degree(layout, j - 1, node, -1.0)
             else:
@@ -191,6 +192,7 @@ def _balances(layout: Layout) -> list[Link]:
 
 
 def _lower_degree(layout: Layout, moment: int, node: int, sign: float) -> list[tuple[int, float]]:
+    """Return sign·Y_i, the mean weighted with B_i^{d−1}, raised to degree d; Y_d is the stock at the end."""
     d = layout.degree
     piece, i = divmod(moment, d + 1)
     if i == d:
@@ -201,12 +203,12 @@ def _lower_degree(layout: Layout, moment: int, node: int, sign: float) -> list[t
     ]
 
 
-def _laws(admissible: Admissible, layout: Layout) -> tuple[list[Row], list[Row]]:
+def _laws(admissible: Admissible, layout: Layout) -> tuple[list[MatrixRow], list[MatrixRow]]:
     """Return the rows of the flow laws: those equal to 0 and those at most 0."""
     network = admissible.network
     position = {int(node): z for z, node in enumerate(layout.valves)}
-    equal: list[Row] = []
-    under: list[Row] = []
+    equal: list[MatrixRow] = []
+    under: list[MatrixRow] = []
 
     def hold(column: int, driver: int, low: float, high: float) -> None:
         """Hold low·driver ≤ column ≤ high·driver."""
@@ -217,13 +219,14 @@ def _laws(admissible: Admissible, layout: Layout) -> tuple[list[Row], list[Row]]
 
     for i in layout.moments:
         first = i - i % (layout.degree + 1)
-        if i > first:
+        if i > first:  # a scheduled flow is constant in its piece: F_i = F_0
             for k in np.flatnonzero(admissible.scheduled):
                 equal.append([(layout.flow(i) + int(k), 1.0), (layout.flow(first) + int(k), -1.0)])
         for node, z in position.items():
             hold(layout.valve(i) + z, layout.stock(i) + node, *admissible.valve[:, node])
         for k in np.flatnonzero(~admissible.scheduled):
             donor, driver = int(network.donors[k]), int(admissible.driver[k])
+            # behind a valve that several outflows share F_i = w·a·Z_i with Z_i = v·X_i; else F_i = v·w·a·X_i
             through_valve = donor == driver and donor in position
             factor = admissible.own[:, k] if through_valve else admissible.factor[:, k]
             column = layout.valve(i) + position[donor] if through_valve else layout.stock(i) + driver
@@ -231,7 +234,7 @@ def _laws(admissible: Admissible, layout: Layout) -> tuple[list[Row], list[Row]]
     return equal, under
 
 
-def _held(admissible: Admissible, layout: Layout) -> list[Row]:
+def _held(admissible: Admissible, layout: Layout) -> list[MatrixRow]:
     """Return F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z.
 
     For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.
@@ -258,6 +261,7 @@ def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: rang
     low, high = np.zeros((2, len(intervals), layout.size))
     scheduled = admissible.scheduled
     rates = admissible.factor[:, None] * admissible.base[intervals.start : intervals.stop]
+    # no weighted mean exceeds the supremum: F ≤ r̄·x̄_p, and U ≤ ū; U ≥ u̲ only where nothing is ever cut
     most = rates[1] * np.where(scheduled, 1.0, reached.upper[:, admissible.driver])
     least = np.where(scheduled & reached.uncut, rates[0], 0.0)
     for i in layout.moments:

@@ -37,7 +37,7 @@ class Reach:
     uncut: NDArray[np.bool_]
 
 
-class Comparison:
+class ComparisonSystem:
     """The comparison system, advanced by the substeps of the simulator, in which scheduled flows are constant.
 
     Attributes:
@@ -57,6 +57,8 @@ class Comparison:
         low, high = admissible.rate(0)
         driven = ~admissible.scheduled
         self.pulled = driven & (admissible.driver != network.donors)
+        # rows and columns: x̲ of all nodes, then x̄. x̲ gains the least inflow and loses the greatest outflow, x̄ the
+        # opposite; growth has no outflow at all
         system, growth = np.zeros((2 * nodes, 2 * nodes)), np.zeros((nodes, nodes))
         self.pull = np.zeros((nodes, nodes))
         for k in np.flatnonzero(driven):
@@ -93,6 +95,7 @@ class Comparison:
                 # without any outflow no stock ends a substep lower than it began, so this bounds it throughout
                 peak = np.minimum(self.growth @ upper + self.surge @ (self.incoming @ most), mass) * (1 + ROUNDING)
                 highest[step] = np.maximum(highest[step], peak)
+                # what may be asked in this piece, against what is left at the least: nothing is cut where it suffices
                 asked = (self.outgoing @ most + self.pull @ peak) * self.substep
                 enough = asked <= lower * self.share * (1 - ROUNDING)
                 if (pulled_from & ~enough).any():
@@ -119,6 +122,7 @@ class Comparison:
 def _held(matrix: Floats, interval: float) -> tuple[Floats, Floats]:
     """Return exp(M h) and its integral over [0, h], which answer the state and a constant input."""
     size = len(matrix)
+    # exp of [[M, I], [0, 0]]·h has both in its upper blocks (Van Loan 1978)
     extended = np.zeros((2 * size, 2 * size))
     extended[:size, :size], extended[:size, size:] = matrix, np.eye(size)
     solved = linalg.expm(extended * interval)

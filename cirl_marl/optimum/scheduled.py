@@ -9,7 +9,7 @@ from scipy import sparse
 
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout, Link, Row, matrix_of, start_of
+from cirl_marl.optimum.layout import Layout, Link, MatrixRow, matrix_of, start_of
 from cirl_marl.optimum.reach import Reach
 
 
@@ -23,6 +23,7 @@ def deliveries(admissible: Admissible, layout: Layout) -> list[Link]:
     by_donor = admissible.driver == network.donors
     least = np.bincount(network.donors, weights=admissible.rate(0)[0] * by_donor, minlength=len(network.nodes))
     turned_over = least * layout.length
+    # U·δ ≤ x_start·z/(e^z − 1); the factor falls with z, so the least rate of the exits gives the weakest, valid row
     share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(len(least)), where=turned_over > 1e-9)
     links: list[Link] = []
     for piece in range(layout.pieces):
@@ -41,11 +42,11 @@ def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: 
     (v − v̲)(x̄ − X) ≥ 0 gives Z − v̲ X − x̄ v ≤ −v̲ x̄ (McCormick 1976).
     """
     network, steps = admissible.network, len(intervals)
-    fixed: list[Row] = []
+    fixed: list[MatrixRow] = []
     columns: list[int] = []
     weights, limits = [np.zeros((steps, 0))], [np.zeros((steps, 0))]
 
-    def hold(row: Row, opening: int, weight: Floats, to: Floats) -> None:
+    def hold(row: MatrixRow, opening: int, weight: Floats, to: Floats) -> None:
         """Hold row + weight_t·v ≤ to_t in each interval t."""
         fixed.append(row)
         columns.append(opening)
@@ -65,6 +66,7 @@ def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: 
             for piece in range(layout.pieces):
                 flow = layout.flow(piece * (layout.degree + 1)) + int(k)
                 hold([(flow, 1.0)], opening, -capacity, np.zeros(steps))
+    # x̄ and ū differ from interval to interval: the entries of v are laid in one by one, row (t, r), column of v in t
     varying = np.concatenate(weights, axis=1)
     entries = layout.size * np.arange(steps)[:, None] + np.array(columns, dtype=np.intp)
     shape = (varying.size, steps * layout.size)

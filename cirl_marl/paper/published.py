@@ -38,7 +38,7 @@ class Published:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Optimum:
+class BestKnown:
     """The best return that is known of an environment.
 
     Attributes:
@@ -68,7 +68,7 @@ class PaperEnvironment:
     name: str
     steps: int
     runs: Mapping[str, Published]
-    optima: tuple[Optimum, ...] = ()
+    optima: tuple[BestKnown, ...] = ()
     success_episodes: int = 0
     published_ends: bool = False
     comparable: bool = True
@@ -118,8 +118,8 @@ _ALL = (
         _run(-1.03e11, -1.02e11, "14:34"),
         _run(-9.8e10, -1.3e11, "88:18"),
         optima=(
-            Optimum(value=-1.167e8, how="almost no force, mean over positions drawn from 0 to 500 m, as here"),
-            Optimum(value=-1.99992e8, how="from the released position 0: at most 0.015 N"),
+            BestKnown(value=-1.167e8, how="almost no force, mean over positions drawn from 0 to 500 m, as here"),
+            BestKnown(value=-1.99992e8, how="from the released position 0: at most 0.015 N"),
         ),
     ),
     _box(
@@ -131,9 +131,9 @@ _ALL = (
         _run(-3.51e5, -3.58e5, "7:30"),
         _run(-3.37e5, -3.41e5, "43:20"),
         optima=(
-            Optimum(value=-3.00e5, how="mean over freeboard temperatures drawn from 900 to 1100 °C, as here"),
-            Optimum(value=-2.96e5, how="mean over freeboard temperatures drawn from 900 to 1000 °C"),
-            Optimum(value=-9.52e7, how="from the released 20 °C: full authority moves it by 0.083 °C a step"),
+            BestKnown(value=-3.00e5, how="mean over freeboard temperatures drawn from 900 to 1100 °C, as here"),
+            BestKnown(value=-2.96e5, how="mean over freeboard temperatures drawn from 900 to 1000 °C"),
+            BestKnown(value=-9.52e7, how="from the released 20 °C: full authority moves it by 0.083 °C a step"),
         ),
     ),
     _box(
@@ -145,9 +145,9 @@ _ALL = (
         _run(116.8, 135.4, "7:19"),
         _run(117.4, 137.4, "43:22"),
         optima=(
-            Optimum(value=143.92, how="no light, mean over nutrient drawn from 1 to 5, as here"),
-            Optimum(value=103.4, how="no light, from the released start without nutrient"),
-            Optimum(value=144.0, how="bound: the reward is below 0.72 a step"),
+            BestKnown(value=143.92, how="no light, mean over nutrient drawn from 1 to 5, as here"),
+            BestKnown(value=103.4, how="no light, from the released start without nutrient"),
+            BestKnown(value=144.0, how="bound: the reward is below 0.72 a step"),
         ),
     ),
     _box(
@@ -159,8 +159,8 @@ _ALL = (
         _run(526.5, 446.3, "7:07"),
         _run(343.3, 459.6, "44:17"),
         optima=(
-            Optimum(value=454.0, how="mean over nutrient drawn from 0 to 5, as here; sd 129 an episode, any action"),
-            Optimum(value=98.62, how="full light from the released start without nutrient; no light gives 98.52"),
+            BestKnown(value=454.0, how="mean over nutrient drawn from 0 to 5, as here; sd 129 an episode, any action"),
+            BestKnown(value=98.62, how="full light from the released start without nutrient; no light gives 98.52"),
         ),
     ),
     _box(
@@ -171,7 +171,7 @@ _ALL = (
         _run(-4.10e7, -7.08e7, "24:07"),
         _run(-1.13e7, -1.17e7, "6:43"),
         _run(-2.66e7, -7.08e7, "39:27"),
-        optima=(Optimum(value=-1.0723e5, how=BOUNDED_LEAST_SQUARES),),
+        optima=(BestKnown(value=-1.0723e5, how=BOUNDED_LEAST_SQUARES),),
         published_ends=True,
     ),
     _box(
@@ -182,7 +182,7 @@ _ALL = (
         _run(-2.57e8, -4.43e8, "22:56"),
         _run(-9.32e7, -8.50e7, "6:38"),
         _run(-2.67e8, -4.43e8, "41:25"),
-        optima=(Optimum(value=-4.6044e7, how=BOUNDED_LEAST_SQUARES),),
+        optima=(BestKnown(value=-4.6044e7, how=BOUNDED_LEAST_SQUARES),),
         published_ends=True,
     ),
     PaperEnvironment(
@@ -219,29 +219,13 @@ def environment_of(name: str) -> PaperEnvironment:
     return ENVIRONMENTS[name]
 
 
-def check_algorithm(environment: PaperEnvironment, algorithm: str) -> None:
-    """Refuse an algorithm that the paper did not run on ``environment``.
-
-    Raises:
-        CirlError: naming those that it did run.
-    """
-    if algorithm not in environment.runs:
-        raise CirlError(
-            f"the paper did not run {algorithm} on {environment.name}; it ran {', '.join(environment.runs)}"
-        )
-
-
 def chosen(environment: str | None, algorithm: str | None) -> Iterator[tuple[PaperEnvironment, str]]:
     """Yield the runs of the paper that the names choose; None chooses all.
 
     Raises:
-        CirlError: for a name that the paper does not have.
+        CirlError: for a name that the paper does not have, or an algorithm that it did not run on ``environment``.
     """
-    if environment is None:
-        for found in ENVIRONMENTS.values():
-            yield from ((found, name) for name in found.runs if algorithm in (None, name))
-        return
-    found = environment_of(environment)
-    if algorithm is not None:
-        check_algorithm(found, algorithm)
-    yield from ((found, name) for name in found.runs if algorithm in (None, name))
+    for found in ENVIRONMENTS.values() if environment is None else [environment_of(environment)]:
+        if environment is not None and algorithm not in (None, *found.runs):
+            raise CirlError(f"the paper did not run {algorithm} on {found.name}; it ran {', '.join(found.runs)}")
+        yield from ((found, name) for name in found.runs if algorithm in (None, name))

@@ -23,31 +23,31 @@ WINDOW = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
+class PaperRow:
     """One training run: what, with which settings, how long.
 
     Attributes:
         environment: name in the paper.
         algorithm: name in the paper; of a tuned row, that of its recipe, with ``-HER`` where it learns in hindsight.
-        recipe: ``published`` for the paper's settings, ``tuned`` for ``agents/paper_*.toml``.
+        settings: ``published`` for the paper's own, ``tuned`` for ``agents/paper_*.toml``.
         steps: environment steps, summed over the copies.
         seed: of model and environment.
     """
 
     environment: str
     algorithm: str
-    recipe: str = "published"
+    settings: str = "published"
     steps: int
     seed: int = 0
 
     def __str__(self) -> str:
         """Name the row in a line of text."""
-        return f"{self.environment} {self.algorithm} ({self.recipe}, {self.steps:,} steps, seed {self.seed})"
+        return f"{self.environment} {self.algorithm} ({self.settings}, {self.steps:,} steps, seed {self.seed})"
 
     @property
     def stem(self) -> str:
         """Name of its files."""
-        return f"{self.environment}-{self.algorithm}-{self.recipe}-{self.steps}-seed{self.seed}"
+        return f"{self.environment}-{self.algorithm}-{self.settings}-{self.steps}-seed{self.seed}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +90,7 @@ class Result:
             here, or not known.
     """
 
-    row: Row
+    row: PaperRow
     steps_done: int
     seconds: float
     episodes: int
@@ -124,7 +124,9 @@ class Result:
     def from_dict(cls, plain: dict[str, Any]) -> Result:
         """Read what ``asdict`` returned, after a detour through JSON."""
         given = {key: value for key, value in plain.items() if key not in ("gain", "gain_per_step")}
-        given["row"] = Row(**given["row"])
+        row = dict(given["row"])
+        row.setdefault("settings", row.pop("recipe", "published"))  # what files of 0.1 call it
+        given["row"] = PaperRow(**row)
         for key in ("evaluation", "published_ends"):
             given[key] = Evaluation(**given[key]) if given.get(key) is not None else None
         given["curve"] = [(int(step), float(value)) for step, value in given["curve"]]
@@ -142,19 +144,15 @@ class Results:
         """Refer to a directory; it is made when the first result is written."""
         self.path = Path(path)
 
-    def file(self, row: Row) -> Path:
+    def file(self, row: PaperRow) -> Path:
         """Return where the result of ``row`` is kept."""
         return self.path / f"{row.stem}.json"
 
-    def log(self, row: Row) -> Path:
-        """Return where a process that runs ``row`` may write its log."""
-        return self.path / "logs" / f"{row.stem}.log"
-
-    def has(self, row: Row) -> bool:
+    def has(self, row: PaperRow) -> bool:
         """Return whether ``row`` is done."""
         return self.file(row).is_file()
 
-    def read(self, row: Row) -> Result:
+    def read(self, row: PaperRow) -> Result:
         """Return the result of ``row``.
 
         Raises:

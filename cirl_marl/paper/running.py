@@ -17,19 +17,19 @@ from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.training import one_torch_thread
-from cirl_marl.paper.evaluation import Report, evaluate, evaluation_episodes
-from cirl_marl.paper.plan import tuned_recipe
+from cirl_marl.paper.final_policy import Report, evaluate, evaluation_episodes
 from cirl_marl.paper.published import PaperEnvironment, environment_of
-from cirl_marl.paper.results import WINDOW, Result, Row, thinned
-from cirl_marl.paper.training import check_registered, described, train_published
+from cirl_marl.paper.results import WINDOW, PaperRow, Result, thinned
+from cirl_marl.paper.selection import tuned_recipe
 from cirl_marl.paper.tuned import train_tuned
+from cirl_marl.paper.untuned import check_registered, described, train_published
 from cirl_marl.records.machine import processor, versions
 
 PACKAGES = ("gymnasium-robotics", "mujoco")
 """On which the two robots depend, beside what every training run records."""
 
 
-def run_row(row: Row, *, report: Report | None = None, episodes: int | None = None) -> Result:
+def run_row(row: PaperRow, *, report: Report | None = None, episodes: int | None = None) -> Result:
     """Train and evaluate one row.
 
     Args:
@@ -46,7 +46,7 @@ def run_row(row: Row, *, report: Report | None = None, episodes: int | None = No
         _check_success(environment)
     report = report or _silent
     with one_torch_thread():
-        if row.recipe == "published":
+        if row.settings == "published":
             trained = train_published(environment, row, report)
         else:
             trained = train_tuned(environment, row, report)
@@ -100,7 +100,7 @@ def outdated(result: Result, episodes: int | None = None) -> str:
     recorded = settings.get("definition_sha256")
     if recorded is not None and recorded != described(environment).get("definition_sha256"):
         return "the definition of the environment is another now"
-    name = tuned_recipe(environment.name) if result.row.recipe == "tuned" else None
+    name = tuned_recipe(environment.name) if result.row.settings == "tuned" else None
     if name is not None and not _is_recipe(settings["recipe"], load_recipe(name)):
         return f"the recipe '{name}' is another now"
     return ""

@@ -10,18 +10,20 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from cirl_marl.errors import CirlError
-from cirl_marl.paper.evaluation import Report
-from cirl_marl.paper.plan import overview
+from cirl_marl.paper.final_policy import Report
 from cirl_marl.paper.published import ENVIRONMENTS
-from cirl_marl.paper.results import Results, Row
+from cirl_marl.paper.results import PaperRow, Results
 from cirl_marl.paper.running import outdated, run_row
+from cirl_marl.paper.selection import overview
 from cirl_marl.paper.table import environment_table, result_line
-from cirl_marl.paper.training import check_registered
+from cirl_marl.paper.untuned import check_registered
 
 REFRESH_S = 0.2
 
 
-def run_session(rows: Sequence[Row], results: Results, console: Console, *, episodes: int | None) -> list[Row]:
+def run_session(
+    rows: Sequence[PaperRow], results: Results, console: Console, *, episodes: int | None
+) -> list[PaperRow]:
     """Run the rows that are not done, show the tables of their environments, and return the rows that failed.
 
     Raises:
@@ -35,7 +37,7 @@ def run_session(rows: Sequence[Row], results: Results, console: Console, *, epis
     changed = {row: outdated(results.read(row), episodes) for row in rows if results.has(row)}
     left = [row for row in rows if row not in changed or changed[row]]
     console.print(f"{overview(rows, left)}; results in {results.path}", soft_wrap=True, highlight=False)
-    failed: list[Row] = []
+    failed: list[PaperRow] = []
     for i, row in enumerate(rows):
         if changed.get(row):
             console.print(f"{row}: once more, as {changed[row]}", soft_wrap=True, highlight=False)
@@ -50,9 +52,9 @@ def run_session(rows: Sequence[Row], results: Results, console: Console, *, epis
                 continue
         console.print(result_line(results.read(row)), soft_wrap=True, highlight=False)
     for environment in environments:
-        asked = {(row.algorithm, row.recipe) for row in rows if row.environment == environment.name}
+        asked = {(row.algorithm, row.settings) for row in rows if row.environment == environment.name}
         shown = [
-            each for each in results.all() if each.row in rows or (each.row.algorithm, each.row.recipe) not in asked
+            each for each in results.all() if each.row in rows or (each.row.algorithm, each.row.settings) not in asked
         ]
         console.print(environment_table(environment, shown))
     return failed

@@ -45,28 +45,15 @@ def table_rows(environment: PaperEnvironment, results: Iterable[Result]) -> list
     rows = []
     for algorithm, published in environment.runs.items():
         rows.append(_paper_row(environment, algorithm, published))
-        found = [r for r in own if (r.row.algorithm, r.row.recipe) == (algorithm, "published")]
+        found = [r for r in own if (r.row.algorithm, r.row.settings) == (algorithm, "published")]
         rows.append(_our_row(environment, algorithm, "ours", found))
-    tuned = {result.row.algorithm: None for result in own if result.row.recipe == "tuned"}
+    tuned = {result.row.algorithm: None for result in own if result.row.settings == "tuned"}
     for algorithm in tuned:
-        found = [r for r in own if (r.row.algorithm, r.row.recipe) == (algorithm, "tuned")]
+        found = [r for r in own if (r.row.algorithm, r.row.settings) == (algorithm, "tuned")]
         rows.append(_our_row(environment, algorithm, "tuned", found))
     if not tuned:
         rows.append(_our_row(environment, "", "tuned", []))
     return rows
-
-
-def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Write a table in Markdown.
-
-    >>> print(markdown_table(("a", "b"), [("1", "2")]))
-    | a | b |
-    |-|-|
-    | 1 | 2 |
-    """
-    lines = ("| " + " | ".join(cells) + " |" for cells in (columns, *rows))
-    head, *body = lines
-    return "\n".join([head, "|" + "-|" * len(columns), *body])
 
 
 def number(value: float | None) -> str:
@@ -169,7 +156,7 @@ def notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
     best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
     mine = [result for result in results if result.row.environment == environment.name]
     evaluations = [result.evaluation for result in mine if result.evaluation is not None]
-    tuned = [result for result in mine if result.row.recipe == "tuned"]
+    tuned = [result for result in mine if result.row.settings == "tuned"]
     sentences = []
     if evaluations:
         episodes = " or ".join(distinct(evaluation.episodes for evaluation in evaluations))

@@ -18,16 +18,18 @@ from cirl_marl.errors import CirlError, RecipeError
 from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
-from cirl_marl.learners.learner import derived_seed
-from cirl_marl.learners.recipe import Learner
-from cirl_marl.paper.evaluation import Report, predictor
-from cirl_marl.paper.plan import tuned_recipe
+from cirl_marl.learners.learner import derived_seed, normalised
+from cirl_marl.learners.recipe import LearnerSettings
+from cirl_marl.paper.final_policy import Report, predictor
 from cirl_marl.paper.published import PaperEnvironment
-from cirl_marl.paper.results import Row
-from cirl_marl.paper.training import Trained, Watch, check_registered, described, episodes_of, stopwatch
+from cirl_marl.paper.results import PaperRow
+from cirl_marl.paper.selection import tuned_recipe
+from cirl_marl.paper.untuned import PaperTraining, Watch, check_registered, described, episodes_of, stopwatch
 
 
-def train_tuned(environment: PaperEnvironment, row: Row, report: Report, recipe: Recipe | None = None) -> Trained:
+def train_tuned(
+    environment: PaperEnvironment, row: PaperRow, report: Report, recipe: Recipe | None = None
+) -> PaperTraining:
     """Train by the environment's recipe: networks with batched physics, goal tasks and others in a batch of copies.
 
     Args:
@@ -48,7 +50,7 @@ def train_tuned(environment: PaperEnvironment, row: Row, report: Report, recipe:
     if recipe.learner.algorithm != row.algorithm.removesuffix("-HER"):
         raise RecipeError(f"recipe '{recipe.name}' uses {recipe.learner.algorithm}, but the row says {row.algorithm}")
     _check_comparable(recipe)
-    recipe.check_demonstrations(row.steps)
+    recipe.check(row.steps)
     run = _train_network if _is_plain_network(environment) else _train_copies
     return run(environment, recipe, row, report)
 
@@ -70,7 +72,7 @@ def _check_comparable(recipe: Recipe) -> None:
         raise RecipeError(f"recipe '{recipe.name}': one agent learns, so [[match]] has no place")
 
 
-def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, report: Report) -> Trained:
+def _train_network(environment: PaperEnvironment, recipe: Recipe, row: PaperRow, report: Report) -> PaperTraining:
     """Train the one agent of a network in its paper scenario."""
     arguments = check_registered(environment).kwargs
     agent = arguments.get("agent")
@@ -94,13 +96,13 @@ def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, repo
         assert training.run is not None
         metrics = training.run.metrics()
     agent = training.env.agents[0]
-    trainee, copies = training.trainees[agent], training.env.num_envs
+    learner, copies = training.learners[agent], training.env.num_envs
     # the copies of a network end together, and a row of the metrics is the mean over them
     returns = np.repeat(metrics[f"return:{agent}"], copies).tolist()
     ends = np.repeat(np.asarray(metrics["env_steps"], dtype=int), copies).tolist()
-    normalise = trainee.env.normalize_obs if isinstance(trainee.env, VecNormalize) else _unchanged
-    return Trained(
-        predict=predictor(trainee.model, normalise),
+    normalise = learner.env.normalize_obs if isinstance(learner.env, VecNormalize) else _unchanged
+    return PaperTraining(
+        predict=predictor(learner.model, normalise),
         ends=ends,
         returns=returns,
         steps=training.joint_steps * copies,
@@ -111,10 +113,10 @@ def _train_network(environment: PaperEnvironment, recipe: Recipe, row: Row, repo
     )
 
 
-def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, report: Report) -> Trained:
+def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: PaperRow, report: Report) -> PaperTraining:
     """Train in copies of the Gymnasium environment; a goal task gets hindsight, as in the paper."""
     learner, copies = recipe.learner, recipe.run.envs
-    plain = Learner(algorithm=learner.algorithm)
+    plain = LearnerSettings(algorithm=learner.algorithm)
     unused = [key for key in ("scheme", "share_of_steps", "bootstrap") if getattr(learner, key) != getattr(plain, key)]
     if recipe.environment or unused:
         left_out = ", ".join([*(["environment"] if recipe.environment else []), *unused])
@@ -122,17 +124,7 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, repor
     monitors: list[Monitor[Any, Any]] = [Monitor(gymnasium.make(environment.id)) for _ in range(copies)]
     env: VecEnv = DummyVecEnv([lambda monitor=monitor: monitor for monitor in monitors])  # type: ignore[misc]
     goal = isinstance(env.observation_space, gymnasium.spaces.Dict)
-    normalise = learner.normalise
-    if normalise.any:
-        env = VecNormalize(
-            env,
-            norm_obs=normalise.observation,
-            norm_reward=normalise.reward,
-            clip_obs=normalise.clip_observation,
-            clip_reward=normalise.clip_reward,
-            gamma=learner.parameters.get("gamma", 0.99),
-            norm_obs_keys=["observation"] if goal else None,  # hindsight swaps goals, so they keep one scale
-        )
+    env = normalised(env, learner, ["observation"] if goal else None)  # hindsight swaps goals, which keep one scale
     parameters = learner.parameters | ({"replay_buffer_class": HerReplayBuffer} if goal else {})
     policy = learner.policy.replace("Mlp", "MultiInput") if goal else learner.policy
     model = build(learner.algorithm, policy, env, parameters, seed=row.seed, device="cpu")
@@ -153,7 +145,7 @@ def _train_copies(environment: PaperEnvironment, recipe: Recipe, row: Row, repor
     seconds, cpu_seconds = elapsed()
     ends, returns = episodes_of(monitors)
     settings = _settings(environment, recipe, copies)
-    return Trained(
+    return PaperTraining(
         predict=predictor(model, env.normalize_obs if isinstance(env, VecNormalize) else _unchanged),
         ends=ends,
         returns=returns,

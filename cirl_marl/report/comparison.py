@@ -14,7 +14,7 @@ from cirl_marl.evaluation.comparison import FIGURES, Comparison, Entry
 from cirl_marl.evaluation.provenance import provenance
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, defined
 from cirl_marl.records.files import published, write_json, write_table
-from cirl_marl.report.fronts import Series, save_fronts
+from cirl_marl.report.fronts import PointSeries, save_fronts
 
 FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
 
@@ -55,7 +55,7 @@ def comparison_notes(comparison: Comparison) -> list[str]:
     if any(row.few for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
     if comparison.yardstick.envelope is not None:
-        notes.append("bound: the highest λ̄ of any episode from the same start with at least the same service")
+        notes.append("bound: no episode from the same start with at least the same service has a higher λ̄")
     elif comparison.yardstick.reason:
         notes.append(f"gap to bound: {comparison.yardstick.reason}")
         if any(row.name == "optimum" for row in comparison.rows):
@@ -75,7 +75,7 @@ def _aggregate(found: Aggregate | None, form: str) -> str:
 def save_comparison(path: str | Path, comparison: Comparison) -> Path:
     """Save where each policy and controller of a comparison is, training seed by training seed."""
     series = [
-        Series(
+        PointSeries(
             row.name,
             np.array([entry.service.mean() for entry in row.entries]),
             np.array([entry.circularity.mean() for entry in row.entries]),

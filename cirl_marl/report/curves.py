@@ -27,13 +27,9 @@ SHOWN = 10
 
 
 def save_circularity(
-    path: str | Path,
-    network: Network,
-    time: Floats,
-    runs: Mapping[str, Floats],
-    services: Mapping[str, Floats],
+    path: str | Path, network: Network, time: Floats, runs: Mapping[str, Floats], services: Mapping[str, Floats]
 ) -> Path:
-    """Save λ(t) and, below it, the service level of several controls as a PNG.
+    """Save λ(t) and, below it, the service level of several controls as a PNG and return its path.
 
     Lines are means over episodes; bands are the 95 % confidence intervals of the means (Student's t), where
     there are at least two episodes.
@@ -44,9 +40,6 @@ def save_circularity(
         time: shape (steps,), time.
         runs: λ by control, shape (episodes, steps) each, mass.
         services: service level by control, shape (episodes, steps) each.
-
-    Returns:
-        The path.
 
     Raises:
         CirlError: if an array has the wrong shape.
@@ -70,7 +63,7 @@ def save_circularity(
 
 
 def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, Floats]) -> Path:
-    """Save the episode returns of each agent while it learned as a PNG, one panel per agent.
+    """Save the episode returns of each agent while it learned as a PNG, one panel per agent; return its path.
 
     Raw returns are light, their centred moving average over a fifteenth of the episodes is bold. Of more
     than 20 agents the first 20 are shown.
@@ -79,9 +72,6 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
         path: file to write; its folder is made.
         steps: environment steps at the end of each episode, shape (episodes,).
         returns: episode returns by agent, shape (episodes,) each.
-
-    Returns:
-        The path.
 
     Raises:
         CirlError: if an array has the wrong shape.
@@ -119,7 +109,7 @@ def save_trajectory(
     service: Floats | None = None,
     title: str = "",
 ) -> Path:
-    """Save stocks, flows, λ and service level over time as a PNG.
+    """Save stocks, flows, λ and service level over time as a PNG and return its path.
 
     Of more than 10 compartments in a panel, those that change most are shown.
 
@@ -134,9 +124,6 @@ def save_trajectory(
         load: masses on batch arcs, shape (batch arcs, steps), mass; None leaves them out.
         service: service level, shape (steps,); None leaves it out.
         title: heading.
-
-    Returns:
-        The path.
 
     Raises:
         CirlError: if an array has the wrong shape.
@@ -212,16 +199,7 @@ def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, 
 
 def _draw_returns(axes: Axes, steps: Floats, values: Floats) -> None:
     if values.size == 0:
-        axes.text(
-            0.5,
-            0.5,
-            "no episodes",
-            transform=axes.transAxes,
-            ha="center",
-            va="center",
-            color=MUTED,
-            fontsize=8,
-        )
+        axes.text(0.5, 0.5, "no episodes", transform=axes.transAxes, ha="center", va="center", color=MUTED, fontsize=8)
         return
     marker = "o" if values.size < 5 else ""
     axes.plot(steps, values, color=SERIES[5], linewidth=0.7, alpha=0.7, marker=marker, markersize=4)

@@ -21,7 +21,7 @@ MARKERS = "osD^vP*X"
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class PointSeries:
     """Points of one kind in the plane of service and circularity.
 
     Attributes:
@@ -37,8 +37,10 @@ class Series:
     joined: bool = False
 
 
-def save_fronts(path: str | Path, network: Network, series: Sequence[Series], bound: Floats, *, title: str) -> Path:
-    """Save λ̄ against the service level as a PNG.
+def save_fronts(
+    path: str | Path, network: Network, series: Sequence[PointSeries], bound: Floats, *, title: str
+) -> Path:
+    """Save λ̄ against the service level as a PNG and return its path.
 
     Args:
         path: file to write; its folder is made.
@@ -46,9 +48,6 @@ def save_fronts(path: str | Path, network: Network, series: Sequence[Series], bo
         series: policies, plans or controllers.
         bound: service level and bound on λ̄, shape (points, 2), by service; what lies above is shaded. Empty for none.
         title: of the picture.
-
-    Returns:
-        The path.
     """
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()

@@ -12,7 +12,7 @@ from cirl_marl.evaluation.provenance import provenance
 from cirl_marl.evaluation.statistics import interquartile_mean
 from cirl_marl.evaluation.sweep import Sweep
 from cirl_marl.records.files import published, write_json, write_table
-from cirl_marl.report.fronts import Series, save_fronts
+from cirl_marl.report.fronts import PointSeries, save_fronts
 
 FILES = ("pareto.csv", "pareto.json", "pareto.png")
 
@@ -31,7 +31,7 @@ def write_sweep(sweep: Sweep, folder: Path, **options: Any) -> list[Path]:
     return [folder / name for name in FILES]
 
 
-def _series(sweep: Sweep) -> Iterator[Series]:
+def _series(sweep: Sweep) -> Iterator[PointSeries]:
     """Yield what is drawn: of several seeds the interquartile mean at each weight."""
     weights = sorted({each.weight for each in sweep.of("trained") if each.weight is not None})
     alike = {
@@ -45,4 +45,4 @@ def _series(sweep: Sweep) -> Iterator[Series]:
         if groups:
             service = np.array([interquartile_mean([each.service for each in group]) for group in groups])
             mean = np.array([interquartile_mean([each.circularity for each in group]) for group in groups])
-            yield Series(name, service, mean, joined=len(groups) > 1)
+            yield PointSeries(name, service, mean, joined=len(groups) > 1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.compartments.robots.engine import Engine, one_per_thread
-from cirl_marl.network.model import RewardState, check_step
+from cirl_marl.network.model import DiscreteTimeModel, GoalTask, RewardState
 from cirl_marl.network.rowsum import Floats
 
 with redirect_stderr(StringIO()):  # the package prints a notice about its robot hands, which are not used here
@@ -72,7 +72,7 @@ engine = one_per_thread(FetchEngine)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fetch:
+class Fetch(DiscreteTimeModel, GoalTask):
     """FetchWasteSorting: gymnasium-robotics' Fetch pick-and-place with the target fixed on the table.
 
     Inputs in [−1, 1]: displacement of the gripper in x, y, z, in 5 cm, and the fingers. Reward: 0 while the object is
@@ -102,13 +102,8 @@ class Fetch:
         """Return a start as gymnasium-robotics draws it, shape (k,)."""
         return engine().start(stream)
 
-    def advance(self, state: Floats, inputs: Floats, interval: float) -> Floats:
-        """Return the state after twenty steps of the simulator, shape (k, B).
-
-        Raises:
-            CirlError: if ``interval``, s, is not the model's own.
-        """
-        check_step(self.kind, interval, self.interval)
+    def advance(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the state after twenty steps of the simulator, shape (k, B)."""
         return engine().step(state, inputs)
 
     def goal_reward(self, achieved: Floats, desired: Floats) -> Floats:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.compartments.robots.engine import Engine, one_per_thread
-from cirl_marl.network.model import RewardState, check_step
+from cirl_marl.network.model import DiscreteTimeModel, RewardState, Task
 from cirl_marl.network.rowsum import Floats
 
 OBSERVED = (
@@ -46,7 +46,7 @@ engine = one_per_thread(ReacherEngine)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reacher:
+class Reacher(DiscreteTimeModel, Task):
     """Gymnasium's Reacher-v5, unchanged, as in the paper.
 
     Inputs are the control signals of both joints in [−1, 1], which Gymnasium documents as torques in N·m; the model
@@ -83,13 +83,8 @@ class Reacher:
         """Return a start as Gymnasium draws it, shape (k,)."""
         return engine().start(stream)
 
-    def advance(self, state: Floats, inputs: Floats, interval: float) -> Floats:
-        """Return the state after two steps of the simulator, shape (k, B).
-
-        Raises:
-            CirlError: if ``interval``, s, is not the model's own.
-        """
-        check_step(self.kind, interval, self.interval)
+    def advance(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the state after two steps of the simulator, shape (k, B)."""
         return engine().step(state, inputs)
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.compartments.parameters import check_form, check_positive
 from cirl_marl.compartments.robots.fetch import Fetch
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import RewardState, check_form, check_positive, check_step
+from cirl_marl.network.model import DiscreteTimeModel, Releasing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 ROBOTS: dict[str, Fetch | Reacher] = {"fetch": Fetch(), "reacher": Reacher()}
@@ -20,7 +21,7 @@ BUSY, STEP, DONE, SORTED, MISSED, COMPLETE, KEY, ATTEMPT = range(len(BOOKS))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SortingStation:
+class SortingStation(DiscreteTimeModel, Releasing):
     """A robot makes one attempt at each item; what it does not finish in time is missed.
 
     While the node holds an item and the robot is free, one control interval presents the item: the robot takes the
@@ -39,6 +40,7 @@ class SortingStation:
     """
 
     kind: ClassVar[str] = "sorting_station"
+    input_unit: ClassVar[str] = "1"
     time_unit: ClassVar[str] = "s"
     reward_state: ClassVar[RewardState] = "after"
     context_names: ClassVar[tuple[str, ...]] = ("stock_kg",)
@@ -69,7 +71,7 @@ class SortingStation:
                 raise CirlError(f"{self.kind}: {name} = {value!r}, but it must be a whole number of at least 1.")
 
     @property
-    def robot(self) -> Any:
+    def robot(self) -> Fetch | Reacher:
         """The robot's own model."""
         return ROBOTS[self.form]
 
@@ -81,14 +83,7 @@ class SortingStation:
     @property
     def input_names(self) -> tuple[str, ...]:
         """The robot's inputs."""
-        names: tuple[str, ...] = self.robot.input_names
-        return names
-
-    @property
-    def input_unit(self) -> str:
-        """That of the robot's inputs."""
-        unit: str = self.robot.input_unit
-        return unit
+        return self.robot.input_names
 
     @property
     def observed(self) -> tuple[str, ...]:
@@ -98,8 +93,7 @@ class SortingStation:
     @property
     def interval(self) -> float:
         """The robot's control interval, s."""
-        interval: float = self.robot.interval
-        return interval
+        return self.robot.interval
 
     def start(self, stream: np.random.Generator) -> Floats:
         """Return an idle station with a random key, the robot at the start of an attempt, shape (k,)."""
@@ -108,13 +102,8 @@ class SortingStation:
         books[KEY] = stream.integers(2**32)
         return np.concatenate([books, robot])
 
-    def advance(self, state: Floats, inputs: Floats, interval: float, *, stock_kg: Floats) -> Floats:
-        """Return the state one interval later, shape (k, B); ``stock_kg`` is what the node holds, shape (B,).
-
-        Raises:
-            CirlError: if ``interval``, s, is not the model's own.
-        """
-        check_step(self.kind, interval, self.interval)
+    def advance(self, state: Floats, inputs: Floats, *, stock_kg: Floats) -> Floats:
+        """Return the state one interval later, shape (k, B); ``stock_kg`` is what the node holds, shape (B,)."""
         after = state.copy()
         books = after[: len(BOOKS)]
         busy = books[BUSY] > 0
@@ -124,7 +113,7 @@ class SortingStation:
             stream = np.random.default_rng([int(books[KEY, i]), int(books[ATTEMPT, i])])
             after[len(BOOKS) :, i] = self.robot.start(stream)
         working = np.flatnonzero(busy)
-        moved = self.robot.advance(state[len(BOOKS) :, working], inputs[:, working], interval)
+        moved = self.robot.advance(state[len(BOOKS) :, working], inputs[:, working])
         after[len(BOOKS) :, working] = moved
         succeeded = np.zeros_like(busy)
         succeeded[working] = self.robot.success(moved, inputs[:, working])

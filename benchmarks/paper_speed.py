@@ -6,14 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.document import markdown_table
 from cirl_marl.learners import load_recipe
 from cirl_marl.learners.training import one_torch_thread
-from cirl_marl.paper.evaluation import Report
+from cirl_marl.paper.final_policy import Report
 from cirl_marl.paper.published import HARDWARE, environment_of
-from cirl_marl.paper.results import WINDOW, Row
-from cirl_marl.paper.table import markdown_table, number
-from cirl_marl.paper.training import Trained, train_published
+from cirl_marl.paper.results import WINDOW, PaperRow
+from cirl_marl.paper.table import number
 from cirl_marl.paper.tuned import train_tuned
+from cirl_marl.paper.untuned import PaperTraining, train_published
 
 ENVIRONMENT = "CopperNet"
 RECIPES = (("A2C", "independent_a2c"), ("PPO", "independent_ppo"), ("PPO", "paper_copper_net"))
@@ -32,7 +33,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
+class Timing:
     """One algorithm, trained both ways for as many environment steps.
 
     Attributes:
@@ -46,8 +47,8 @@ class Comparison:
     algorithm: str
     recipe: str
     copies: int
-    published: Trained
-    ours: Trained
+    published: PaperTraining
+    ours: PaperTraining
 
     @property
     def wall_ratio(self) -> float:
@@ -60,19 +61,19 @@ class Comparison:
         return (self.published.cpu_seconds / self.published.steps) / (self.ours.cpu_seconds / self.ours.steps)
 
 
-def compare(steps: int, report: Report) -> list[Comparison]:
+def compare(steps: int, report: Report) -> list[Timing]:
     """Train A2C and PPO on CopperNet both ways, one after the other."""
     environment = environment_of(ENVIRONMENT)
-    published: dict[str, Trained] = {}
+    published: dict[str, PaperTraining] = {}
     found = []
     with one_torch_thread():
         for algorithm, name in RECIPES:
-            row, recipe = Row(environment=ENVIRONMENT, algorithm=algorithm, steps=steps), load_recipe(name)
+            row, recipe = PaperRow(environment=ENVIRONMENT, algorithm=algorithm, steps=steps), load_recipe(name)
             if algorithm not in published:
                 published[algorithm] = train_published(environment, row, report)
             ours = train_tuned(environment, row, report, recipe)
             found.append(
-                Comparison(
+                Timing(
                     algorithm=algorithm,
                     recipe=name,
                     copies=recipe.run.envs,
@@ -83,12 +84,12 @@ def compare(steps: int, report: Report) -> list[Comparison]:
     return found
 
 
-def speed_table(comparisons: list[Comparison]) -> str:
+def speed_table(timings: list[Timing]) -> str:
     """Return a Markdown table: seconds, what was learnt, and how many times as fast a step is."""
-    return markdown_table(COLUMNS, map(_line, comparisons))
+    return markdown_table(COLUMNS, map(_line, timings))
 
 
-def _line(row: Comparison) -> tuple[str, ...]:
+def _line(row: Timing) -> tuple[str, ...]:
     minutes = environment_of(ENVIRONMENT).runs[row.algorithm].minutes
     return (
         row.algorithm,
@@ -102,7 +103,7 @@ def _line(row: Comparison) -> tuple[str, ...]:
     )
 
 
-def _run(trained: Trained) -> str:
+def _run(trained: PaperTraining) -> str:
     end = float(np.mean(trained.returns[-WINDOW:]))
     return (
         f"{trained.seconds:.1f} s ({trained.cpu_seconds:.1f} s processor), {trained.steps:,} steps, r_e {number(end)}"

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from benchmarks.document import markdown_table
+from benchmarks.paper_summary import summary
 from cirl_marl.paper.published import ENVIRONMENTS, HARDWARE, SOURCE
 from cirl_marl.paper.results import WINDOW, Result
-from cirl_marl.paper.summary import summary
-from cirl_marl.paper.table import COLUMNS, distinct, markdown_table, notes, table_rows
+from cirl_marl.paper.table import COLUMNS, distinct, notes, table_rows
 
 INTRODUCTION = f"""# The paper's tables, repeated
 

@@ -19,13 +19,13 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.writing import fingerprint
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.algorithms import build
-from cirl_marl.paper.evaluation import Predict, Report, predictor
+from cirl_marl.paper.final_policy import Predict, Report, predictor
 from cirl_marl.paper.published import PaperEnvironment
-from cirl_marl.paper.results import Row
+from cirl_marl.paper.results import PaperRow
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trained:
+class PaperTraining:
     """What a training hands over to be measured.
 
     Attributes:
@@ -61,7 +61,7 @@ def check_registered(environment: PaperEnvironment) -> gymnasium.envs.registrati
     return found
 
 
-def train_published(environment: PaperEnvironment, row: Row, report: Report) -> Trained:
+def train_published(environment: PaperEnvironment, row: PaperRow, report: Report) -> PaperTraining:
     """Train with the paper's settings: the library's default hyperparameters, one copy; hindsight for goal tasks.
 
     A learner whose weights become NaN ends there, and that is what these settings give: the same seed gives it again.
@@ -85,7 +85,7 @@ def train_published(environment: PaperEnvironment, row: Row, report: Report) -> 
         settings["replay_buffer_class"] = "HerReplayBuffer, defaults of the library"
     ends, returns = episodes_of([env])
     env.close()
-    return Trained(
+    return PaperTraining(
         predict=None if diverged else predictor(model),
         ends=ends,
         returns=returns,

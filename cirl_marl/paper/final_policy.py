@@ -39,14 +39,7 @@ def predictor(model: BaseAlgorithm, normalise: Callable[[Any], Any] = lambda obs
 
 
 def evaluate(
-    id_: str,
-    predict: Predict,
-    episodes: int,
-    seed: int,
-    report: Report,
-    options: dict[str, Any],
-    *,
-    warm_up: int = 0,
+    id_: str, predict: Predict, episodes: int, seed: int, report: Report, options: dict[str, Any], *, warm_up: int = 0
 ) -> Evaluation:
     """Return mean return and share of successes of ``episodes`` fresh episodes.
 

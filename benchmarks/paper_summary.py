@@ -8,9 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from benchmarks.document import markdown_table
 from cirl_marl.paper.published import ENVIRONMENTS, PaperEnvironment
 from cirl_marl.paper.results import Result
-from cirl_marl.paper.table import NOT_RUN, markdown_table, number, over_seeds
+from cirl_marl.paper.table import NOT_RUN, number, over_seeds
 
 COLUMNS = (
     "environment",
@@ -73,7 +74,7 @@ def _line(environment: PaperEnvironment, results: Sequence[Result]) -> tuple[str
     tuned = [
         result
         for result in results
-        if (result.row.environment, result.row.recipe, result.row.steps)
+        if (result.row.environment, result.row.settings, result.row.steps)
         == (environment.name, "tuned", environment.steps)
     ]
     paper, asked = f"{number(best)} ({ends[best]})", str(goal) if goal is not None else ""

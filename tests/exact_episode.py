@@ -1,0 +1,168 @@
+"""An episode of the exact simulator, computed a second time from matrix exponentials and Gauss-Legendre quadrature.
+
+Nothing here is taken from the solver or from the linear program: the laws are read off the network, the trajectory
+within a substep is that of ẋ = M x + U, and its weighted means are integrals of it. Used to hold the rows and boxes of
+the program against what an episode does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from cirl_marl import Arc, Control, ControlKind, Law, Network
+
+Floats = NDArray[np.float64]
+Controls = Mapping[str, float]
+POINTS, WEIGHTS = (0.5 * np.polynomial.legendre.leggauss(14)[0] + 0.5, 0.5 * np.polynomial.legendre.leggauss(14)[1])
+"""Nodes and weights on [0, 1]; no node turns over more than its stock in a substep, so 14 points leave round-off."""
+SCHEDULED = (Law.CONTROLLED, Law.EXOGENOUS)
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One substep.
+
+    Attributes:
+        stock: at the quadrature points, shape (points, nodes).
+        flow: at the quadrature points, shape (points, arcs).
+        end: stocks at its end, shape (nodes,).
+        cut: whether a scheduled flow was cut to what its donor held.
+    """
+
+    stock: Floats
+    flow: Floats
+    end: Floats
+    cut: bool
+
+    def means(self, degree: int) -> tuple[Floats, Floats]:
+        """Return the stocks and flows weighted with the Bernstein polynomials, (degree + 1, nodes | arcs)."""
+        i = np.arange(degree + 1)[:, None]
+        binomial = np.array([[math.comb(degree, int(each))] for each in i[:, 0]])
+        density = (degree + 1) * binomial * POINTS**i * (1 - POINTS) ** (degree - i) * WEIGHTS
+        return density @ self.stock, density @ self.flow
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """One control interval.
+
+    Attributes:
+        controls: the value of every control, by compartment.
+        pieces: its substeps.
+        flow: mean flows, shape (arcs,).
+        levels: of the services, shape (services,).
+        circularity: λ of the mean flows.
+    """
+
+    controls: Controls
+    pieces: tuple[Piece, ...]
+    flow: Floats
+    levels: Floats
+    circularity: float
+
+
+def control_of(network: Network, compartment: str) -> Control:
+    """Return the control of a compartment that has one."""
+    control = network.compartments[compartment].control
+    assert control is not None
+    return control
+
+
+def valve_of(network: Network, node: str, controls: Controls) -> float:
+    """Return the factor with which a node's valve acts on all that leaves it; 1 if it has none."""
+    control = network.compartments[node].control
+    return controls[node] if control is not None and control.kind is ControlKind.RATE else 1.0
+
+
+def series_mean(arc: Arc, start: float, end: float) -> float:
+    """Return the mean of a step function over [start, end]; its last value holds on."""
+    if not arc.times:
+        return arc.flow[0]
+    edges = [*arc.times[1:], math.inf]
+    overlap = [max(0.0, min(end, b) - max(start, a)) for a, b in zip(arc.times, edges, strict=True)]
+    return sum(value * length for value, length in zip(arc.flow, overlap, strict=True)) / (end - start)
+
+
+def coefficient(network: Network, arc: Arc, controls: Controls, step: int) -> float:
+    """Return r of f = r·x_driver, 1/time, or of f = r for scheduled arcs, mass/time, before any cut."""
+    donor = network.compartments[arc.donor]
+    sets_flow = donor.control is not None and donor.control.kind is ControlKind.FLOW
+    if arc.law is Law.CONTROLLED:
+        own = controls[arc.donor if sets_flow else arc.id]
+    else:
+        own = controls[arc.id] if arc.control is not None else 1.0
+        h = network.episode.control_interval
+        own *= series_mean(arc, step * h, (step + 1) * h) if arc.law is Law.EXOGENOUS else arc.rate
+    return own * valve_of(network, arc.donor, controls)
+
+
+def intervals(network: Network, start: Floats, controls: list[Controls], substeps: int) -> Iterator[Interval]:
+    """Yield what happens in each interval from ``start``, shape (nodes,), on."""
+    arcs, nodes = network.arcs, len(network.nodes)
+    donor = [network.node_index[arc.donor] for arc in arcs]
+    recipient = [network.node_index[arc.recipient] for arc in arcs]
+    driver = [r if arc.law is Law.RECIPIENT else d for arc, d, r in zip(arcs, donor, recipient, strict=True)]
+    incidence = np.zeros((nodes, len(arcs)))
+    incidence[donor, np.arange(len(arcs))] = -1.0
+    incidence[recipient, np.arange(len(arcs))] = 1.0
+    scheduled = np.array([arc.law in SCHEDULED for arc in arcs], dtype=bool)
+    length = network.episode.control_interval / substeps
+    stock = start.astype(float)
+    for step, held in enumerate(controls):
+        rate = np.array([coefficient(network, arc, held, step) for arc in arcs])
+        law = np.zeros((len(arcs), nodes))
+        for k in np.flatnonzero(~scheduled):
+            law[k, driver[k]] = rate[k]
+        extended = np.zeros((2 * nodes, 2 * nodes))
+        extended[:nodes, :nodes], extended[:nodes, nodes:] = incidence @ law, np.eye(nodes)
+        times = np.append(POINTS, 1.0)[:, None, None] * length
+        solved = linalg.expm(extended * times)[:, :nodes]
+        pieces = []
+        for _ in range(substeps):
+            order = np.where(scheduled, rate, 0.0)
+            factor = np.ones(nodes)
+            for node in set(np.array(donor, dtype=int)[scheduled].tolist()):
+                mine = np.array(donor) == node
+                exits = sum(rate[k] for k in np.flatnonzero(mine) if arcs[k].law is Law.DONOR) * length
+                most = stock[node] * (exits / math.expm1(exits) if exits > 1e-12 else 1.0) / length
+                asked = order[mine].sum()
+                factor[node] = min(1.0, most / asked) if asked > 0 else 1.0
+            order = order * factor[donor]
+            at = solved @ np.concatenate([stock, incidence @ order])
+            flow = at @ law.T + order
+            stock = at[-1]
+            pieces.append(Piece(at[:-1], flow[:-1], at[-1], bool((factor < 1 - 1e-9).any())))
+        mean = np.mean([WEIGHTS @ piece.flow for piece in pieces], axis=0)
+        yield Interval(held, tuple(pieces), mean, _levels(network, stock, mean), _circularity(network, mean))
+
+
+def imbalance(network: Network, flow: Floats) -> float:
+    """Return |Δ·σ_env·f|, f over the arcs that touch the environment."""
+    weights = network.sustainability * network.environmental
+    return abs(float(network.objective.reference_interval * weights @ flow))
+
+
+def _circularity(network: Network, flow: Floats) -> float:
+    weights = network.objective.reference_interval * network.sustainability
+    rest = float(weights[~network.environmental] @ flow[~network.environmental])
+    through = float(weights[network.environmental] @ flow[network.environmental])
+    return -rest - (abs(through) if network.objective.net_zero == "abs" else through)
+
+
+def _levels(network: Network, stock: Floats, flow: Floats) -> Floats:
+    levels = []
+    for service in network.services:
+        if service.quantity == "stock":
+            q = stock[network.node_index[service.provider]]
+        elif service.quantity == "flow":
+            q = flow[network.arc_index[service.provider]]
+        else:
+            q = sum(f for f, arc in zip(flow, network.arcs, strict=True) if arc.donor == service.provider)
+        levels.append(max(0.0, min(1.0, q / service.low, service.high / q if q > 0 else 1.0)))
+    return np.array(levels)

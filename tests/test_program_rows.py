@@ -1,0 +1,419 @@
+"""Every row and box of the program holds for every simulated episode, and its objective is the episode's.
+
+The values that an episode gives the variables come from ``exact_episode``, an oracle of its own; it is held against the
+simulator in each test. A row that is too tight for one of these episodes would make the bound wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from exact_episode import Controls, Interval, control_of, imbalance, intervals, valve_of
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, VectorEnv
+from cirl_marl.optimum import NoCertificate, bound
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.layout import Layout
+from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.solver import solve
+
+Floats = NDArray[np.float64]
+RELATIVE = 1e-9
+"""Tolerance relative to the magnitude of a row or box: the program's own widening of what is computed in floats."""
+ROUND_OFF = 1e-12
+"""Tolerance relative to the mass in the network, as the simulator rounds relative to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """An episode and what the program needs to know of it.
+
+    Attributes:
+        network: with its one start.
+        agents: who acted.
+        start: stocks at the start.
+        intervals: what happened.
+        circularity: λ̄ in the simulator.
+        service: mean service level in the simulator.
+    """
+
+    network: Network
+    agents: tuple[str, ...]
+    start: Floats
+    intervals: list[Interval]
+    circularity: float
+    service: float
+
+    @property
+    def cut(self) -> bool:
+        """Whether a donor ran short of what was scheduled."""
+        return any(piece.cut for each in self.intervals for piece in each.pieces)
+
+
+def certifiable(network: Network, interval: float, pulls: bool) -> Network:
+    """Return the network without batches, which become constant demands, and with the exact solver."""
+    arcs = []
+    for arc in network.arcs:
+        if arc.law is Law.BATCH:
+            arc = replace(arc, law=Law.EXOGENOUS, flow=(80.0,), batches=(), delay=0.0)
+        elif arc.law is Law.RECIPIENT:
+            law = Law.RECIPIENT if pulls else Law.DONOR
+            arc = replace(arc, law=law, rate=arc.rate * (0.02 if pulls else 1.0))
+        arcs.append(arc)
+    nodes = [replace(node, initial=(node.initial[1],) * 2) for node in network.nodes]
+    episode = replace(network.episode, control_interval=interval, solver="exact", solver_step=None)
+    return replace(network, nodes=tuple(nodes), arcs=tuple(arcs), episode=episode)
+
+
+def play(
+    network: Network,
+    rng: np.random.Generator,
+    style: str,
+    agents: Sequence[str] | None = None,
+    fixed: Mapping[str, float] | None = None,
+) -> Played:
+    """Return an episode with controls drawn for each interval, at the ends of their ranges or anywhere in them.
+
+    Args:
+        network: with one start.
+        rng: of the actions.
+        style: ``inside``, ``ends``, or mostly ``low`` or ``high``.
+        agents: who acts; None is the network's own choice.
+        fixed: actions of some agents that are not drawn.
+
+    Raises:
+        AssertionError: if the oracle and the simulator disagree.
+    """
+    env = VectorEnv(network, num_envs=1, agents=agents)
+    env.reset(seed=0)
+    start = env.physical.stock[: len(network.nodes), 0].copy()
+    held: list[Controls] = []
+    circularity = service = 0.0
+    for _ in range(network.episode.horizon):
+        action = rng.uniform(-1, 1, len(env.agents))
+        if style != "inside":
+            action = np.where(rng.random(len(action)) < {"low": 0.9, "high": 0.1, "ends": 0.5}[style], -1.0, 1.0)
+        action = np.array([(fixed or {}).get(agent, each) for agent, each in zip(env.agents, action, strict=True)])
+        values = {each: control_of(network, each).neutral for each in network.controllable}
+        for agent, chosen in zip(env.agents, action.tolist(), strict=True):
+            control = control_of(network, agent)
+            values[agent] = control.low + (chosen + 1) / 2 * (control.high - control.low)
+        held.append(values)
+        outcome = env.advance(action[:, None])
+        circularity += float(outcome.circularity_mean[0]) / network.episode.horizon
+        service += float(outcome.service_level[0]) / network.episode.horizon
+    happened = list(intervals(network, start, held, env.dynamics.substeps))
+    mass, delta = start.sum(), network.objective.reference_interval
+    end = env.physical.stock[: len(network.nodes), 0]
+    np.testing.assert_allclose(happened[-1].pieces[-1].end, end, rtol=1e-9, atol=1e-11 * mass)
+    size = delta * max(float(each.flow.sum()) for each in happened)
+    assert abs(circularity - np.mean([each.circularity for each in happened])) <= 1e-10 * size + 1e-12 * mass
+    if network.services:
+        assert service == pytest.approx(np.mean([each.levels for each in happened]), abs=1e-6)
+    return Played(network, env.agents, start, happened, circularity, service)
+
+
+def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
+    """Return v of an episode: for each piece X_i, F_i, Z_i and the stocks at its end; levels, imbalance, valves."""
+    network = layout.network
+    names = [node.id for node in network.nodes]
+    found: list[Floats] = []
+    for each in happened:
+        valve = np.array([valve_of(network, name, each.controls) for name in names])
+        for piece in each.pieces:
+            for stock, flow in zip(*piece.means(layout.degree), strict=True):
+                found += [stock, flow, (valve * stock)[layout.valves]]
+            found.append(piece.end)
+        found += [each.levels, np.array([imbalance(network, each.flow)]), valve[layout.openings]]
+    return np.concatenate(found)
+
+
+def assert_satisfies(problem: Program, v: Floats, mass: float) -> None:
+    """A v = b, G v ≤ g, l ≤ v ≤ u, each to a tolerance relative to its own terms."""
+    for matrix, to, both in ((problem.equal, problem.equal_to, True), (problem.under, problem.under_to, False)):
+        size = abs(matrix) @ np.abs(v) + np.abs(to)
+        largest = np.asarray(abs(matrix).max(axis=1).todense()).ravel() if matrix.shape[0] else np.zeros(0)
+        excess = matrix @ v - to
+        excess = np.abs(excess) if both else excess
+        wrong = excess > RELATIVE * size + ROUND_OFF * mass * largest
+        row = int(wrong.argmax()) if wrong.any() else -1
+        assert not wrong.any(), f"{'A' if both else 'G'}, row {row} of {len(to)}: off by {excess[row]}, of {size[row]}"
+    slack = RELATIVE * np.maximum(np.abs(problem.low), np.abs(problem.high)) + ROUND_OFF * mass
+    for wrong, of in ((v < problem.low - slack, "l"), (v > problem.high + slack, "u")):
+        column = int(wrong.argmax())
+        place = divmod(column, problem.layout.size)
+        assert not wrong.any(), f"{of}: variable {place} is {v[column]}, out of its box"
+
+
+def assert_holds(played: Played, degree: int, weight: float | None = None) -> None:
+    """All rows hold for the episode and for its second half, and the objective is the simulator's.
+
+    Raises:
+        NoCertificate: if recipients may empty their donors from the start.
+    """
+    network, steps = played.network, played.network.episode.horizon
+    programs = Programs(Admissible.of(network, played.agents or None), degree, weight)
+    layout, mass = programs.layout, float(played.start.sum())
+    v = variables(layout, played.intervals)
+    problem = programs.program(played.start, None if weight is not None else played.service * (1 - 1e-12))
+    assert_satisfies(problem, v, mass)
+    objective = played.circularity
+    if weight is not None:
+        objective = objective / network.objective.circularity_scale + weight * played.service
+    found = problem.constant - float(problem.cost @ v)
+    assert abs(found - objective) <= 1e-9 * float(np.abs(problem.cost) @ np.abs(v)) + 1e-6 * (weight or 0.0)
+    half = steps // 2
+    if half:
+        later = programs.program(played.intervals[half - 1].pieces[-1].end, None, range(half, steps))
+        assert_satisfies(later, v[half * layout.size :], mass)
+
+
+@given(
+    network=st.from_type(Network),
+    interval=st.floats(0.02, 0.6),
+    pulls=st.booleans(),
+    seed=st.integers(0, 1000),
+    style=st.sampled_from(["inside", "ends", "low", "high"]),
+    degree=st.integers(1, 3),
+    weight=st.sampled_from([None, 0.7]),
+)
+def test_random_networks(
+    network: Network, interval: float, pulls: bool, seed: int, style: str, degree: int, weight: float | None
+) -> None:
+    """Random networks with orders, valves, series and pulls, under random admissible controls."""
+    network = certifiable(network, interval, pulls)
+    rng = np.random.default_rng(seed)
+    agents = [agent for agent in network.agents if rng.random() < 0.8] or None
+    try:
+        Programs(Admissible.of(network, agents), 1, None).program(np.array([n.initial[1] for n in network.nodes]))
+    except NoCertificate:
+        assume(False)
+    assert_holds(play(network, rng, style, agents), degree, weight)
+
+
+def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int, int], Network]) -> None:
+    """Among thirty of them are cut flows, valves on scheduled flows, series, several substeps, |net flow|, service."""
+    met = dict.fromkeys(("cut", "valve", "series", "substeps", "abs", "service"), 0)
+    for seed in range(30):
+        network = certifiable(make_network(seed, 3 + seed % 6, 4 + seed % 9), 0.3, pulls=False)
+        rng = np.random.default_rng(seed)
+        played = play(network, rng, ["inside", "ends", "low", "high"][seed % 4])
+        assert_holds(played, 1 + seed % 2, [None, 0.7][seed % 2])
+        layout = Programs(Admissible.of(network), 1, None).layout
+        met["cut"] += played.cut
+        met["valve"] += len(layout.openings) > 0
+        met["series"] += any(arc.times for arc in network.arcs)
+        met["substeps"] += layout.pieces > 1
+        met["abs"] += network.objective.net_zero == "abs" and any(imbalance(network, e.flow) for e in played.intervals)
+        met["service"] += 0 < played.service < 1
+    assert min(met.values()) >= 5, met
+
+
+def rate_control(low: float, high: float) -> Control:
+    """Return a valve that is neutral in the middle."""
+    return Control(kind=ControlKind.RATE, low=low, high=high, neutral=(low + high) / 2)
+
+
+def order(name: str, donor: str, recipient: str, high: float) -> Arc:
+    """Return an arc whose flow is set between a tenth of ``high`` and ``high``."""
+    control = Control(kind=ControlKind.FLOW, low=0.1 * high, high=high, neutral=0.5 * high)
+    return Arc(id=name, donor=donor, recipient=recipient, law=Law.CONTROLLED, control=control)
+
+
+def works(
+    stock: float = 12.0,
+    *,
+    valve: tuple[float, float] | None = None,
+    asked: float = 60.0,
+    interval: float = 0.8,
+    net_zero: str = "abs",
+) -> Network:
+    """Return a store that runs empty, with a free exit, an order and a series; and what becomes of it.
+
+    In an interval of 0.8 there are several substeps, in one of 0.35 a single one.
+
+    Args:
+        stock: in the store at the start.
+        valve: range of the valve on all that leaves the store; None for none.
+        asked: most that can be ordered from it.
+        interval: between two decisions.
+        net_zero: of the objective.
+    """
+    nodes = (
+        Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(9000.0, 9000.0), control=rate_control(0.5, 1.5)),
+        Node(id="store", initial=(stock, stock), control=None if valve is None else rate_control(*valve)),
+        Node(id="use", initial=(30.0, 30.0), control=rate_control(0.2, 1.0)),
+        Node(id="sort", initial=(5.0, 5.0), control=rate_control(0.4, 1.2)),
+        Node(id="air", role=Role.ENVIRONMENT, initial=(40.0, 40.0)),
+        Node(id="tip", role=Role.LANDFILL),
+    )
+    arcs = (
+        order("mining", "mine", "store", 20.0),
+        Arc(id="free", donor="store", recipient="use", rate=1.2, control=rate_control(0.1, 1.6)),
+        order("supply", "store", "use", asked),
+        Arc(
+            id="demand",
+            donor="store",
+            recipient="use",
+            law=Law.EXOGENOUS,
+            flow=(10.0, 25.0, 3.0),
+            times=(0.0, 0.5, 1.3),
+            control=rate_control(0.5, 1.0),
+        ),
+        Arc(id="loss", donor="use", recipient="sort", rate=0.5),
+        Arc(id="waste", donor="sort", recipient="tip", rate=0.8),
+        Arc(id="leak", donor="mine", recipient="tip", rate=0.02),
+        Arc(id="pull", donor="mine", recipient="use", law=Law.RECIPIENT, rate=0.05),
+        Arc(id="emission", donor="use", recipient="air", rate=0.9, control=rate_control(0.3, 1.0)),
+        Arc(id="repair", donor="use", recipient="store", law=Law.EXOGENOUS, flow=(2.0,)),
+        order("capture", "air", "use", 9.0),
+    )
+    services = (
+        Service(id="held", provider="use", quantity="stock", low=40.0, high=60.0),
+        Service(id="sent", provider="store", quantity="outflow", low=30.0),
+        Service(id="met", provider="demand", quantity="flow", low=10.0),
+    )
+    return Network(
+        name="works",
+        nodes=nodes,
+        arcs=arcs,
+        services=services,
+        episode=Episode(control_interval=interval, horizon=4),
+        objective=Objective(reference_interval=1.3, net_zero=net_zero, circularity_scale=20.0),
+    )
+
+
+DRAINING = {"free": 1.0, "supply": 1.0, "demand": 1.0, "store": 1.0, "mining": -1.0, "mine": -1.0}
+"""Actions that leave least in the store."""
+MIXED = {"free": -1.0, "supply": 1.0, "demand": -1.0, "store": 1.0, "mining": -1.0}
+"""One order at its most, another at its least, and a cut that is shared by both."""
+
+
+@pytest.mark.parametrize("style", ["inside", "ends", "low", "high", "draining", "mixed"])
+@pytest.mark.parametrize("valve", [None, (0.3, 1.4), (0.0, 1.0)])
+@pytest.mark.parametrize(("stock", "asked"), [(12.0, 60.0), (0.0, 60.0), (700.0, 5.0)])
+@pytest.mark.parametrize("interval", [0.8, 0.35])
+def test_a_store_that_runs_empty(
+    interval: float, stock: float, asked: float, valve: tuple[float, float] | None, style: str
+) -> None:
+    """A store that runs empty, or never, with exits in proportion and by schedule, behind a valve or not."""
+    network = works(stock, valve=valve, asked=asked, interval=interval)
+    rng = np.random.default_rng(7)
+    fixed = {"draining": DRAINING, "mixed": MIXED}.get(style, {})
+    cut = False
+    for degree, weight in ((1, None), (2, 0.4)):
+        played = play(network, rng, "ends" if fixed else style, fixed=fixed)
+        assert_holds(played, degree, weight)
+        cut |= played.cut
+    assert cut or stock == 700.0 or style == "low"
+    programs = Programs(Admissible.of(network), 1, None)
+    layout, supply = programs.layout, network.arc_index["supply"]
+    least = programs.program(np.array([node.initial[1] for node in network.nodes])).low[layout.flow(0) + supply]
+    assert (least > 0) == (stock == 700.0 and (valve is None or valve[0] > 0))  # nothing is cut at first
+    assert (network.node_index["store"] in layout.openings) == (valve is not None)
+    assert (layout.pieces > 1) == (interval == 0.8)
+
+
+def test_a_stock_that_gathers_all_there_is() -> None:
+    """What two nodes held ends in a third, more than the largest had at first; its bound must allow that."""
+    nodes = (*(Node(id=name, initial=(50.0, 50.0)) for name in "ab"), Node(id="c", initial=(10.0, 10.0)))
+    arcs = tuple(Arc(id=f"{name}c", donor=name, recipient="c", rate=3.0) for name in "ab")
+    agent = Arc(id="back", donor="c", recipient="a", rate=0.01, control=rate_control(0.0, 1.0))
+    network = Network(name="funnel", nodes=nodes, arcs=(*arcs, agent), episode=Episode(control_interval=0.3, horizon=6))
+    played = play(network, np.random.default_rng(0), "low")
+    assert played.intervals[-1].pieces[-1].end[2] > 100.0
+    assert_holds(played, 2)
+
+
+@pytest.mark.parametrize(
+    ("stock", "feed", "asked", "cut"),
+    [(10.0, 0.0, 8.0, True), (10.0, 0.0, 6.0, False), (0.0, 10.0, 1.0, True)],
+    ids=["held", "deliverable", "later"],
+)
+def test_a_demand_without_a_choice(stock: float, feed: float, asked: float, cut: bool) -> None:
+    """A demand that nobody sets is what is asked where the program says so, in every substep.
+
+    Beside an exit of 0.8 per substep a store of 10 delivers 10·0.8/(e^0.8 − 1) = 6.5, though it holds 10.
+    """
+    nodes = (
+        Node(id="ample", role=Role.ENVIRONMENT, initial=(500.0, 500.0), control=rate_control(0.9, 1.0)),
+        Node(id="store", initial=(stock, stock)),
+        Node(id="use", initial=(1.0, 1.0)),
+        Node(id="end"),
+    )
+    arcs = (
+        Arc(id="feed", donor="ample", recipient="store", law=Law.EXOGENOUS, flow=(feed,)),
+        Arc(id="exit", donor="store", recipient="end", rate=0.8),
+        Arc(id="demand", donor="store", recipient="use", law=Law.EXOGENOUS, flow=(asked,)),
+        Arc(id="through", donor="use", recipient="end", rate=1.0),
+    )
+    for interval in (1.0, 3.0):
+        episode = Episode(control_interval=interval, horizon=2)
+        objective = Objective(reference_interval=1.3, net_zero="abs")
+        network = Network(name="shop", nodes=nodes, arcs=arcs, episode=episode, objective=objective)
+        played = play(network, np.random.default_rng(0), "high")
+        first = played.intervals[0].pieces[0]
+        assert first.cut == cut
+        assert_holds(played, 1)
+
+
+def test_pulls_are_bounded_with_the_most_that_may_pull() -> None:
+    """A node that may be filled pulls more than it now could: without proof that its donor bears it, none is given."""
+    nodes = (
+        Node(id="reserve", initial=(5.0, 5.0)),
+        Node(id="use", initial=(1.0, 1.0)),
+        Node(id="ample", initial=(500.0, 500.0)),
+    )
+    arcs = (
+        Arc(id="pull", donor="reserve", recipient="use", law=Law.RECIPIENT, rate=0.5),
+        order("feed", "ample", "use", 100.0),
+    )
+    network = Network(name="pulled", nodes=nodes, arcs=arcs, episode=Episode(control_interval=0.5, horizon=1))
+    with pytest.raises(NoCertificate, match="more from node 'reserve' than it holds"):
+        Programs(Admissible.of(network), 1, None).program(np.array([5.0, 1.0, 500.0]))
+
+
+@pytest.mark.parametrize(("agents", "least"), [(["mine"], 0.3), (["mining"], 0.6), (["mine", "mining"], 0.2)])
+def test_who_does_not_act_is_neutral(agents: list[str], least: float) -> None:
+    """The least that can be mined is v·w·a·x with the neutral factor of whoever does not act, not with its least."""
+    mine = Control(kind=ControlKind.RATE, low=0.25, neutral=0.75, high=1.0)
+    mining = Control(kind=ControlKind.RATE, low=0.8, neutral=1.2, high=2.0)
+    network = Network(
+        name="mine",
+        nodes=(
+            Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(100.0, 100.0), control=mine),
+            Node(id="use"),
+        ),
+        arcs=(Arc(id="mining", donor="mine", recipient="use", rate=1.0, control=mining),),
+        episode=Episode(control_interval=0.5, horizon=3),
+    )
+    found = bound(network, agents=agents, degree=4).objective
+    assert found == pytest.approx(100 * math.expm1(-1.5 * least) / 1.5, rel=1e-6)
+
+
+def test_the_most_that_is_delivered() -> None:
+    """The program allows just what the simulator delivers with the free exit at its least and all of the store ordered.
+
+    With z = a·δ it is x_0·z/(e^z − 1); a greater z, that of the greatest exit, would allow less.
+    """
+    network = works().with_options(episode={"control_interval": 0.4, "horizon": 1})
+    start = np.array([node.initial[1] for node in network.nodes])
+    lowest = {each: control_of(network, each).low for each in network.controllable}
+    (happened,) = intervals(network, start, [{**lowest, "supply": 60.0}], 1)
+    ordered = [network.arc_index["supply"], network.arc_index["demand"]]
+    z = 1.2 * 0.1 * 0.4
+    assert happened.pieces[0].cut
+    delivered = happened.flow[ordered].sum()
+    assert delivered * 0.4 == pytest.approx(12.0 * z / math.expm1(z), rel=1e-12)
+    problem = Programs(Admissible.of(network), 1, None).program(start)
+    cost = np.zeros_like(problem.cost)
+    cost[problem.layout.flow(0) + np.array(ordered)] = -1.0
+    most = -float(cost @ solve(replace(problem, cost=cost)).plan)
+    assert most == pytest.approx(delivered, rel=1e-7)
