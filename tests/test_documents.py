@@ -244,6 +244,7 @@ def test_reference_example_of_one_agent_runs() -> None:
     assert names["model"].num_timesteps == 2_048
 
 
+@pytest.mark.medium
 def test_getting_started_prints_what_it_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
