@@ -218,7 +218,7 @@ def test_tuned_row_counts_its_demonstrations(monkeypatch: pytest.MonkeyPatch) ->
             super().__init__(*arguments, **options)
             normalisers.append(self)
 
-    monkeypatch.setattr("cirl_marl.paper.tuned.VecNormalize", Kept)
+    monkeypatch.setattr("cirl_marl.learners.learner.VecNormalize", Kept)
     row = PaperRow(environment="FetchWasteSorting", algorithm="TQC", settings="tuned", steps=300)
     found = train_tuned(ENVIRONMENTS["FetchWasteSorting"], row, lambda *_: None, small)
     statistics: Any = normalisers[0].obs_rms
