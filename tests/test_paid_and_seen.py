@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, VectorEnv
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Service, VectorEnv
 from cirl_marl.learners.lockstep import Lockstep
 from cirl_marl.learners.streams import Streams
 
@@ -128,3 +128,17 @@ def test_a_second_episode_has_a_return_of_its_own() -> None:
             infos = [info["episode"] for info in told[end - 1][3]]
             assert [info["l"] for info in infos] == [4, 4]
             np.testing.assert_allclose([info["r"] for info in infos], rewards, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("stock", "low", "level"), [(0.25, 0.0, 1.0), (16.0, 0.0, 0.5), (0.25, 0.5, 0.5)])
+def test_a_band_from_nothing_has_no_lower_end(stock: float, low: float, level: float) -> None:
+    """Little is enough where the band begins at 0; above the band the level is high/q."""
+    network = Network(
+        name="band",
+        nodes=(Node(id="heap", initial=(stock, stock)),),
+        arcs=(),
+        services=(Service(id="kept", provider="heap", quantity="stock", low=low, high=8.0),),
+    )
+    env = VectorEnv(network, num_envs=1)
+    env.reset(0)
+    assert env.advance(np.zeros((0, 1))).service_level[0] == pytest.approx(level)
