@@ -43,7 +43,7 @@ def format_guide() -> str:
 def _part(name: str, table: type[BaseModel], place: str) -> str:
     keys = "".join(_key(field.alias or key, field) for key, field in table.model_fields.items())
     summary = str(table.__doc__).partition("\n")[0].replace("``", "`")
-    return f"\n## {name}\n\n{place}. {summary}\n\n{keys}"
+    return f"\n## {name}\n\n{_wrapped(f'{place}. {summary}', indent=0)}\n{keys}"
 
 
 def _key(key: str, field: FieldInfo) -> str:
@@ -54,5 +54,7 @@ def _key(key: str, field: FieldInfo) -> str:
     return _wrapped(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in taken), needed])}){about}.")
 
 
-def _wrapped(line: str) -> str:
-    return textwrap.fill(line, 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False) + "\n"
+def _wrapped(line: str, indent: int = 2) -> str:
+    return (
+        textwrap.fill(line, 120, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False) + "\n"
+    )
