@@ -21,7 +21,7 @@ from cirl_marl.definitions.reading import Definition
 from cirl_marl.learners import load_recipe, train
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")])
+DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("[a-z]*/README.md")])
 WRITTEN = [path for path in DOCUMENTS if path.name != "paper_tables.md"]
 """Documents that a benchmark does not write whole."""
 WIDTH = 120
