@@ -53,7 +53,7 @@ class Bound:
         problem: the linear program.
         solution: its variables under the plan.
         certificate: the multipliers.
-        basis: from which the program of another start may be solved.
+        basis: from which the program of another start may be solved; None if it was solved without.
     """
 
     network: Network
@@ -72,7 +72,7 @@ class Bound:
     problem: Program
     solution: Floats
     certificate: Certificate
-    basis: Basis
+    basis: Basis | None
 
     def __str__(self) -> str:
         """Say what is proved, in one line."""

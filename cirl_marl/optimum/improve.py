@@ -12,15 +12,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import optimize, sparse
+from scipy import sparse
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.environments.actuators import Actuators
-from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.plan import achieved
+from cirl_marl.optimum.program import LinearProgram
+from cirl_marl.optimum.solver import best_values
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
@@ -40,25 +41,25 @@ def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None
         bound: with the actions to start from.
         rounds: most linear programs to solve.
         progress: called with the share of them that is solved; 1 when no more are needed.
-
-    Raises:
-        CirlError: if the solver fails.
     """
     price = _price(bound)
     best, run = bound, achieved(bound)
     merit, trust = _merit(bound, run, price), TRUST
     for done in range(rounds):
+        if trust < SMALLEST:
+            break
         step = _step(best, run, price, trust)
+        progress((done + 1) / rounds)
+        if step is None:  # a smaller region is another program
+            trust /= 4
+            continue
         candidate = replace(best, actions=np.clip(best.actions + step, -1.0, 1.0))
         tried = achieved(candidate)
-        progress((done + 1) / rounds)
         gained = _merit(bound, tried, price) - merit
         if gained > 0:
             best, run, merit, trust = candidate, tried, merit + gained, min(1.0, 2 * trust)
         else:
             trust /= 4
-        if trust < SMALLEST:
-            break
     progress(1.0)
     return best
 
@@ -87,7 +88,8 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     dynamics = Dynamics(network)
     stock = np.concatenate([bound.initial[None], run.stock[:-1]])
     inputs = np.concatenate([stock, bound.actions], axis=1)
-    width = np.concatenate([np.maximum(stock.max(axis=0), 1.0), np.ones(entries)]) * DIFFERENCE
+    scale = np.array([node.scale for node in network.nodes])
+    width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
     shift = np.where(np.arange(nodes + entries) < nodes, 1.0, -np.where(inputs >= 0, 1.0, -1.0)) * width
@@ -104,8 +106,10 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     return slopes[:, :, :nodes], slopes[:, :, nodes:]
 
 
-def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats:
+def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | None:
     """Return the best change of the actions within the trust region to first order, shape (steps, entries).
+
+    None if HiGHS finds none.
 
     Variables of an interval: δx', δf̄, δa, the levels, the imbalance; after the last, missing service.
     """
@@ -149,19 +153,22 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats:
     )
     bounds[:, level:imbalance] = [0.0, 1.0]
     bounds[:, imbalance, 0] = 0.0
-    found = optimize.linprog(
-        np.append(np.tile(cost, steps), price if demanded else 0.0),
-        A_ub=under,
-        b_ub=np.append(limits.ravel(), -demanded),
-        A_eq=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, 1))], format="csr"),
-        b_eq=np.zeros(steps * outputs),
-        bounds=np.concatenate([bounds.reshape(-1, 2), [[0.0, np.inf]]]),
-        method="highs-ipm",
+    low, high = np.concatenate([bounds.reshape(-1, 2), [[0.0, np.inf]]]).T
+    problem = LinearProgram(
+        cost=np.append(np.tile(cost, steps), price if demanded else 0.0),
+        equal=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, 1))], format="csr"),
+        equal_to=np.zeros(steps * outputs),
+        under=under,
+        under_to=np.append(limits.ravel(), -demanded),
+        low=low,
+        high=high,
     )
-    if found.status != 0:
-        raise CirlError(f"network '{network.name}': HiGHS did not solve the improvement of a plan: {found.message}")
-    step: Floats = found.x[:-1].reshape(steps, size)[:, outputs:level]
-    return step
+    # states and flows change by shares of their largest values, the others by shares of 1
+    largest = np.maximum(np.abs(realised).max(axis=0), [c.scale for c in network.compartments.values()])
+    net = max(float(np.abs(realised @ imbalances).max()), network.objective.circularity_scale)
+    sizes = np.concatenate([largest, np.ones(entries + services), [net]])
+    found = best_values(problem, np.append(np.tile(sizes, steps), 1.0))
+    return None if found is None else found[:-1].reshape(steps, size)[:, outputs:level]
 
 
 def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:

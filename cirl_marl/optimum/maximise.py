@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from cirl_marl.optimum.bounds import Bound, Envelope, check_service, check_stock
 from cirl_marl.optimum.certificate import verified
 from cirl_marl.optimum.objective import circularity_weights
 from cirl_marl.optimum.program import Program, Programs
-from cirl_marl.optimum.solver import Basis, Infeasible, Solution, solve
+from cirl_marl.optimum.solver import Basis, Infeasible, solve
 
 DEGREE = 2
 """Degree of the test polynomials; docs/bound.md has the gap against it."""
@@ -176,7 +175,7 @@ def _bounded(
     admissible, layout = programs.admissible, programs.layout
     problem = programs.program(start, min_service)
     try:
-        solution = _solved(problem, basis, "the program of the bound" + _asked(service_weight, min_service))
+        solution = solve(problem, basis, what="the program of the bound" + _asked(service_weight, min_service))
     except Infeasible:
         raise CirlError(_unreachable(problem, min_service)) from None
     proof = verified(problem, solution.certificate, solution.plan)
@@ -208,14 +207,6 @@ def _asked(service_weight: float | None, min_service: float | None) -> str:
     if min_service is not None:
         return f" with a mean service level of {min_service:.6g}"
     return "" if service_weight is None else f" with a service weight of {service_weight:.6g}"
-
-
-def _solved(problem: Program, basis: Basis | None, what: str) -> Solution:
-    """Solve from ``basis`` if there is one; that there is no solution is for the steadier methods to say."""
-    if basis is not None:
-        with suppress(Infeasible):
-            return solve(problem, basis, what=what)
-    return solve(problem, what=what)
 
 
 def _unreachable(problem: Program, min_service: float | None) -> str:

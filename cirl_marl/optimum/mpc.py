@@ -27,7 +27,7 @@ from cirl_marl.optimum.actions import normalised_actions
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.maximise import check_options
 from cirl_marl.optimum.program import Program, Programs
-from cirl_marl.optimum.solver import Basis, Infeasible, Solution, solve
+from cirl_marl.optimum.solver import Basis, Infeasible, Solution, Unsolved, solve
 
 SERVICE_FIRST = 1000.0
 """Weight of the mean service level, against λ̄/circularity_scale, where the demanded level is out of reach."""
@@ -40,29 +40,33 @@ class _Plan:
     Attributes:
         episode: of the copy, by its number.
         intervals: of the episode.
-        problem: the program.
-        solution: its optimum.
+        problem: the program; None if nothing could be planned.
+        solution: its optimum, likewise.
         actions: of the first intervals, shape (decisions, entries).
         unit: what 1 of its objective is in the objective of plans that meet the demand.
     """
 
     episode: int
     intervals: range
-    problem: Program
-    solution: Solution
+    problem: Program | None
+    solution: Solution | None
     actions: Floats
     unit: float
 
     def basis(self, intervals: range) -> Basis | None:
         """Return the basis from which to plan ``intervals``; None if they are neither as many nor the last of these."""
+        if self.problem is None or self.solution is None:
+            return None
         if len(intervals) == len(self.intervals):
             return self.solution.basis
         if intervals.stop != self.intervals.stop or intervals.start < self.intervals.start:
             return None
-        return self.solution.basis.without_first(self.problem, intervals.start - self.intervals.start)
+        basis = self.solution.basis
+        return None if basis is None else basis.without_first(self.problem, intervals.start - self.intervals.start)
 
     def levels(self) -> Floats:
         """Return the planned mean service level of each interval, shape (intervals,)."""
+        assert self.problem is not None and self.solution is not None
         layout = self.problem.layout
         levels = self.solution.plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
         return levels.mean(axis=1) if levels.size else np.ones(len(levels))
@@ -73,6 +77,7 @@ class _Plan:
         They are the terms of c − Aᵀy − Gᵀμ, for those stocks, of rows that belong to the interval after, in the
         objective of plans that meet the demand.
         """
+        assert self.problem is not None and self.solution is not None
         problem, certificate = self.problem, self.solution.certificate
         layout = problem.layout
         charged = np.zeros(len(problem.cost))
@@ -134,9 +139,9 @@ class MPC(Planner):
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
-            CirlError: if HiGHS fails.
         """
         network = env.network
+        self.note = ""
         self._env = env
         self._admissible = Admissible.of(network, env.agents or None)
         self._programs = Programs(self._admissible, self._degree, self._weight, held=True)
@@ -152,7 +157,6 @@ class MPC(Planner):
 
         Raises:
             ControlError: after the end of the episode.
-            CirlError: if HiGHS fails.
         """
         env = self._env
         actions = []
@@ -173,16 +177,42 @@ class MPC(Planner):
             raise ControlError(f"MPC: the episode is over after {steps} steps: call reset()")
         rest = range(step, steps)
         window = rest if self._horizon is None else rest[: self._horizon]
+        try:
+            return self._solved(copy, rest, window, last)
+        except Unsolved as missing:
+            self.note = f"MPC goes on as it planned before, or neutrally, where a plan is missing: {missing}"
+            return self._older(copy, window, last)
+
+    def _solved(self, copy: int, rest: range, window: range, last: _Plan | None) -> _Plan:
+        """Plan the ``window`` of what is left of the episode, the ``rest``."""
+        state, steps = self._env.physical, self._env.network.episode.horizon
         missing = None if self._demanded is None else self._demanded * steps - float(state.service[copy])
         if len(window) == len(rest):
             return self._plan(copy, window, missing, last.basis(window) if last else None)
         if last is None:
+            self._outlooks.pop(copy, None)
+        if copy not in self._outlooks:
             self._outlooks[copy] = self._plan(copy, rest, missing, None)
         outlook = self._outlooks[copy]
         after = window.stop - outlook.intervals.start
         if missing is not None:
             missing -= float(outlook.levels()[after:].sum())
         return self._plan(copy, window, missing, last.basis(window) if last else None, outlook.prices()[after - 1])
+
+    def _older(self, copy: int, window: range, last: _Plan | None) -> _Plan:
+        """Return the last plan, to be carried out for longer, or one to be neutral where it has come to its end."""
+        known = last is not None and window.start in last.intervals
+        if known and last is not None and last.problem is not None and last.solution is not None:
+            done = window.start - last.intervals.start + self._replan
+            planned = last.solution.plan.reshape(len(last.intervals), -1)[:done]
+            return replace(last, actions=self._actions(last.problem, last.intervals, planned))
+        neutral = np.concatenate([*self._env.neutral_action.values()])
+        return _Plan(int(self._env.episodes[copy]), window, None, None, np.tile(neutral, (self._replan, 1)), 1.0)
+
+    def _actions(self, problem: Program, intervals: range, planned: Floats) -> Floats:
+        """Return the actions of planned intervals, the first of ``intervals``, shape (decisions, entries)."""
+        base = self._admissible.base[intervals.start : intervals.stop][: len(planned)]
+        return normalised_actions(replace(self._admissible, base=base), problem.layout, planned)
 
     def _plan(
         self, copy: int, intervals: range, missing: float | None, basis: Basis | None, prices: Floats | None = None
@@ -202,17 +232,16 @@ class MPC(Planner):
         what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
             problem = self._priced(self._programs, stock, intervals, demanded, prices)
-            solution = solve(problem, basis, what=what)
+            solution = solve(problem, basis, what=what, certified=False)
         except Infeasible:
             if demanded is None:
                 raise
             unit = self._env.network.objective.circularity_scale
             prices = None if prices is None else prices / unit
             problem = self._priced(self._urgent, stock, intervals, 0.0, prices)
-            solution = solve(problem, basis, what=what)
+            solution = solve(problem, basis, what=what, certified=False)
         planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
-        base = self._admissible.base[intervals.start : intervals.stop][: self._replan]
-        actions = normalised_actions(replace(self._admissible, base=base), problem.layout, planned)
+        actions = self._actions(problem, intervals, planned)
         return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)
 
     def _priced(

@@ -24,30 +24,39 @@ from cirl_marl.optimum.scheduled import deliveries, openings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Program:
-    """Minimise cᵀv subject to A v = b, G v ≤ g, l ≤ v ≤ u; v has shape (steps · layout.size,).
+class LinearProgram:
+    """Minimise cᵀv subject to A v = b, G v ≤ g, l ≤ v ≤ u.
 
     Attributes:
-        layout: what v is.
-        cost: c; the objective to maximise is −cᵀv + ``constant``.
-        constant: what no plan changes.
+        cost: c.
         equal: A, sparse.
         equal_to: b.
         under: G, sparse.
         under_to: g.
-        low: l, finite.
-        high: u, finite.
+        low: l.
+        high: u.
     """
 
-    layout: Layout
     cost: Floats
-    constant: float
     equal: Any
     equal_to: Floats
     under: Any
     under_to: Floats
     low: Floats
     high: Floats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Program(LinearProgram):
+    """The program of an episode, or a part of it, with finite bounds l and u; v has shape (steps · layout.size,).
+
+    Attributes:
+        layout: what v is.
+        constant: what no plan changes; the objective to maximise is −cᵀv + ``constant``.
+    """
+
+    layout: Layout
+    constant: float
 
     def interval_of_rows(self, matrix: Any) -> Integers:
         """Return the last interval whose variables each row of A or G is about, shape (rows,)."""

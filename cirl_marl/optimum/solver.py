@@ -5,6 +5,8 @@ References: Huangfu and Hall 2018, Mathematical Programming Computation 10, 119 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import highspy
@@ -13,8 +15,9 @@ from scipy import sparse
 
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers
-from cirl_marl.optimum.certificate import Certificate
-from cirl_marl.optimum.program import Program
+from cirl_marl.optimum.admissible import NoCertificate
+from cirl_marl.optimum.certificate import Certificate, verified
+from cirl_marl.optimum.program import LinearProgram, Program
 
 STATUS = tuple(highspy.HighsBasisStatus(i) for i in range(len(highspy.HighsBasisStatus.__members__)))
 """HiGHS's basis statuses by their numbers."""
@@ -24,10 +27,30 @@ WARM_ITERATIONS = 2000
 """Simplex iterations from a given basis after which interior points, which need none, are the faster way."""
 NO_PLAN = (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible)
 """As every variable is bounded, the latter means the former."""
+SETTINGS: tuple[Mapping[str, str], ...] = (
+    {"solver": "ipm"},
+    {"solver": "ipm", "run_crossover": "off"},
+    {"solver": "simplex", "presolve": "off"},
+)
+"""Tried in turn, from nothing, until the certificate of an answer says that it is good.
+
+Crossover, which finds a basis for later programs, and presolve fail now and then: where residence times are a fraction
+of a control interval, rows fix a stock several times over. Interior points without them do not, and leave no basis.
+"""
+FEASIBLE = 1e-6
+"""Largest amount by which the rows of a plan may be missed, relative to their largest term."""
+OPTIMAL = 1e-5
+"""Relative distance of a plan from its certificate, up to which nothing else is tried."""
+USABLE = 1e-2
+"""The same for the best answer of all, beyond which there is no bound."""
 
 
 class Infeasible(CirlError):
     """A program without solution."""
+
+
+class Unsolved(NoCertificate):
+    """A program that HiGHS does not solve, whatever is tried; the message says which, and how it ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,76 +78,147 @@ class Solution:
     Attributes:
         plan: the variables v.
         certificate: the multipliers.
-        basis: from which a similar program may start.
+        basis: from which a similar program may start; None if it was found without.
     """
 
     plan: Floats
     certificate: Certificate
-    basis: Basis
+    basis: Basis | None
 
 
-def solve(problem: Program, basis: Basis | None = None, *, what: str = "the program") -> Solution:
+def solve(
+    problem: Program, basis: Basis | None = None, *, what: str = "the program", certified: bool = True
+) -> Solution:
     """Minimise cᵀv over the program.
 
-    Without a basis interior points and crossover find one; from a basis the dual simplex method goes on.
+    From a basis the dual simplex method goes on; else ``SETTINGS`` are tried in turn. What counts is not what HiGHS
+    says of its answer but what its multipliers prove: any multipliers are a certificate, good ones a tight one.
 
     Args:
         problem: the program.
         basis: from which to start.
         what: is solved, for the message of an error.
+        certified: whether multipliers must prove the answer good; else a plan that satisfies the rows will do.
 
     Raises:
         Infeasible: if there is no solution.
-        CirlError: if HiGHS fails for another reason; names the network, what was not solved, and HiGHS's status.
+        Unsolved: if HiGHS finds no usable answer; names the network, what was not solved, and HiGHS's status.
     """
-    scale = float(np.abs(problem.cost).max(initial=0.0)) or 1.0  # the solver's tolerances are absolute
-    highs = highspy.Highs()  # type: ignore[no-untyped-call]
-    highs.setOptionValue("output_flag", False)
-    highs.setOptionValue("solver", "ipm" if basis is None else "simplex")
-    highs.passModel(_model(problem, scale))
-    if basis is not None:
-        highs.setBasis(_highs_basis(basis))
-        highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
-    highs.run()
-    if basis is not None and highs.getModelStatus() not in (highspy.HighsModelStatus.kOptimal, *NO_PLAN):
-        return solve(problem, what=what)
-    if basis is None and highs.getModelStatus() != highspy.HighsModelStatus.kOptimal:
-        highs.setOptionValue("solver", "simplex")  # slower and steadier
-        highs.setOptionValue("presolve", "off")  # its own tolerance is too small for rows that fix a stock twice over
-        highs.clearSolver()
+    name, found, best, status = problem.layout.network.name, None, math.inf, ""
+    scaled = _Scaled(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
+    for settings in (None, *SETTINGS) if basis is not None else SETTINGS:
+        highs = scaled.run(settings, basis if settings is None else None)
+        ended = highs.getModelStatus()
+        if ended in NO_PLAN:
+            if settings is None:  # for the steadier methods to say
+                continue
+            raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {what}")
+        status = highs.modelStatusToString(ended)
+        if not scaled.is_feasible(highs):
+            continue
+        solution = scaled.solution(highs)
+        if not certified:
+            return solution
+        distance = scaled.distance(problem, solution)
+        if distance < best:
+            found, best = solution, distance
+        if best <= OPTIMAL:
+            break
+    if found is None or best > USABLE:
+        raise Unsolved(f"network '{name}': HiGHS did not solve {what}: {status}")
+    return found
+
+
+def best_values(problem: LinearProgram, size: Floats) -> Floats | None:
+    """Return values that minimise a program near enough, for those who try them out; None if nothing is found.
+
+    Args:
+        problem: the program.
+        size: of each variable, such as the largest that it will be.
+    """
+    scaled = _Scaled(problem, size)
+    for settings in SETTINGS:
+        highs = scaled.run(settings, None)
+        if scaled.is_feasible(highs):
+            return scaled.solution(highs).plan
+    return None
+
+
+class _Scaled:
+    """A program in its own measures: every variable a share of the box that it lies in, every row of its largest term.
+
+    So the units of mass and time of a network, and stocks that differ by orders of magnitude, make no difference to the
+    solver, whose tolerances are absolute. With v = D v', R A D v' = R b; multipliers of the rows are R·y'·scale(c).
+    """
+
+    def __init__(self, problem: LinearProgram, size: Floats) -> None:
+        self.problem = problem
+        self._size = np.where(size > 0, size, 1.0)
+        rows = sparse.vstack([problem.equal, problem.under], format="csr") @ sparse.diags_array(self._size)
+        largest = abs(rows).max(axis=1).toarray().ravel()
+        self._row = 1.0 / np.where(largest > 0, largest, 1.0)
+        self._rows = sparse.csr_array(sparse.diags_array(self._row) @ rows)
+        cost = problem.cost * self._size
+        self._scale = float(np.abs(cost).max(initial=0.0)) or 1.0
+        self._cost = cost / self._scale
+        self._equal = len(problem.equal_to)
+        self._to = np.concatenate([problem.equal_to, problem.under_to]) * self._row
+
+    def run(self, settings: Mapping[str, str] | None, basis: Basis | None) -> highspy.Highs:
+        """Return HiGHS after a run with ``settings``, or of the dual simplex method from ``basis``."""
+        highs = highspy.Highs()  # type: ignore[no-untyped-call]
+        highs.setOptionValue("output_flag", False)
+        for option, value in (settings or {"solver": "simplex"}).items():
+            highs.setOptionValue(option, value)
+        highs.passModel(self._model())
+        if basis is not None:
+            highs.setBasis(_highs_basis(basis))
+            highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
         highs.run()
-    status = highs.getModelStatus()
-    name = problem.layout.network.name
-    if status in NO_PLAN:
-        raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {what}")
-    if status != highspy.HighsModelStatus.kOptimal:
-        raise CirlError(f"network '{name}': HiGHS did not solve {what}: {highs.modelStatusToString(status)}")
-    found, final = highs.getSolution(), highs.getBasis()
-    rows = np.array(found.row_dual) * scale
-    equal = len(problem.equal_to)
-    return Solution(
-        plan=np.array(found.col_value),
-        certificate=Certificate(equal=rows[:equal], under=rows[equal:]),
-        basis=Basis(
-            np.array([int(each) for each in final.col_status], dtype=np.intp),
-            np.array([int(each) for each in final.row_status], dtype=np.intp),
-        ),
-    )
+        return highs
 
+    def _model(self) -> highspy.HighsLp:
+        problem, model = self.problem, highspy.HighsLp()
+        model.num_row_, model.num_col_ = self._rows.shape
+        model.col_cost_ = self._cost
+        model.col_lower_, model.col_upper_ = problem.low / self._size, problem.high / self._size
+        model.row_lower_ = np.where(np.arange(len(self._to)) < self._equal, self._to, -np.inf)
+        model.row_upper_ = self._to
+        matrix = model.a_matrix_
+        matrix.format_ = highspy.MatrixFormat.kRowwise
+        matrix.num_row_, matrix.num_col_ = self._rows.shape
+        matrix.start_, matrix.index_, matrix.value_ = self._rows.indptr, self._rows.indices, self._rows.data
+        return model
 
-def _model(problem: Program, scale: float) -> highspy.HighsLp:
-    rows = sparse.vstack([problem.equal, problem.under], format="csr")
-    model = highspy.HighsLp()
-    model.num_row_, model.num_col_ = rows.shape
-    model.col_cost_ = problem.cost / scale
-    model.col_lower_, model.col_upper_ = problem.low, problem.high
-    model.row_lower_ = np.concatenate([problem.equal_to, np.full(len(problem.under_to), -np.inf)])
-    model.row_upper_ = np.concatenate([problem.equal_to, problem.under_to])
-    matrix = model.a_matrix_
-    matrix.format_ = highspy.MatrixFormat.kRowwise
-    matrix.num_row_, matrix.num_col_ = rows.shape
-    matrix.start_, matrix.index_, matrix.value_ = rows.indptr, rows.indices, rows.data
-    return model
+    def is_feasible(self, highs: highspy.Highs) -> bool:
+        """Whether HiGHS has values that satisfy every row, whatever it says of them."""
+        found = np.array(highs.getSolution().col_value)
+        if found.shape != self._size.shape or not np.isfinite(found).all():
+            return False
+        missed = self._rows @ found - self._to
+        missed[: self._equal] = np.abs(missed[: self._equal])
+        return bool(missed.max(initial=0.0) <= FEASIBLE)
+
+    def solution(self, highs: highspy.Highs) -> Solution:
+        """Return what HiGHS found, in the units of the network; of a run that failed there is no basis."""
+        found, final, basis = highs.getSolution(), highs.getBasis(), None
+        multipliers = np.array(found.row_dual) * self._row * self._scale
+        if final.valid and highs.getModelStatus() == highspy.HighsModelStatus.kOptimal:
+            status = ([int(each) for each in part] for part in (final.col_status, final.row_status))
+            basis = Basis(*(np.array(each, dtype=np.intp) for each in status))
+        return Solution(
+            plan=np.array(found.col_value) * self._size,
+            certificate=Certificate(equal=multipliers[: self._equal], under=multipliers[self._equal :]),
+            basis=basis,
+        )
+
+    def distance(self, problem: Program, solution: Solution) -> float:
+        """Return how far the multipliers leave the plan from the bound that they prove, relative to the bound."""
+        if not np.isfinite(solution.certificate.equal).all() or not np.isfinite(solution.certificate.under).all():
+            return math.inf
+        proof = verified(problem, solution.certificate, solution.plan)
+        # an objective near 0 is measured by the solver's tolerance on its largest term
+        return (proof.bound - proof.objective) / max(abs(proof.bound), self._scale * FEASIBLE / OPTIMAL)
 
 
 def _highs_basis(basis: Basis) -> highspy.HighsBasis:

@@ -1,0 +1,142 @@
+"""The planner where its solver has a hard time: other units of mass, residence times of a fraction of a step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import highspy
+import pytest
+
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, load_network
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.definitions.catalogue import folder
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.optimum import NoCertificate, achieved, bound, improved, solver
+from cirl_marl.optimum.mpc import MPC
+
+KILOTONNES = {"kg": 1e6, "kt": 1.0, "Gt": 1e-6}
+
+
+def valve(low: float, high: float) -> Control:
+    """Return a valve that is neutral at 1."""
+    return Control(kind=ControlKind.RATE, low=low, neutral=1.0, high=high)
+
+
+def yearly(residence: float = 0.25, horizon: int = 12, shortest: float = 1.0) -> Network:
+    """Return a cycle of metal with yearly decisions, whose plants hold it for a fraction of a year."""
+    fast = 1.0 / residence
+    nodes = [
+        Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR, initial=(5e6, 5e6), scale=1e6),
+        *(Node(id=name, initial=(6e4 / fast, 6e4 / fast), scale=6e4 / fast) for name in ("smelter", "works", "waste")),
+        Node(id="cans", initial=(2e4, 2e4), scale=2e4),
+        Node(id="buildings", initial=(1e6, 1e6), scale=1e6),
+        Node(id="landfill", role=Role.LANDFILL, initial=(1e5, 1e5), scale=1e5),
+    ]
+    sets = Control(kind=ControlKind.FLOW, low=1e4, neutral=6e4, high=1.2e5)
+    arcs = [
+        Arc(id="mining", donor="mine", recipient="smelter", law=Law.CONTROLLED, control=sets),
+        Arc(id="casting", donor="smelter", recipient="works", rate=fast),
+        Arc(id="canning", donor="works", recipient="cans", rate=0.25 * fast),
+        Arc(id="building", donor="works", recipient="buildings", rate=0.75 * fast, control=valve(0.5, 1.2)),
+        Arc(id="cans_waste", donor="cans", recipient="waste", rate=1.0 / shortest),
+        Arc(id="demolition", donor="buildings", recipient="waste", rate=1.0 / 25.0),
+        Arc(id="recycling", donor="waste", recipient="smelter", rate=0.6 * fast, control=valve(0.2, 1.5)),
+        Arc(id="dumping", donor="waste", recipient="landfill", rate=0.4 * fast, control=valve(0.1, 1.0)),
+    ]
+    return Network(
+        name="yearly",
+        nodes=tuple(nodes),
+        arcs=tuple(arcs),
+        services=(
+            Service(id="housing", provider="buildings", quantity="stock", low=1.05e6),
+            Service(id="drinks", provider="cans", quantity="stock", low=1.8e4),
+        ),
+        episode=Episode(control_interval=1.0, horizon=horizon),
+        objective=Objective(circularity_scale=1e5),
+        mass_unit="kt",
+        time_unit="year",
+    )
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("residence", [0.5, 0.1])
+def test_residence_times_of_a_fraction_of_a_step(residence: float) -> None:
+    """The certificate closes, and a plan comes within a percent of the bound at the demanded service."""
+    found = bound(yearly(residence), min_service=0.97)
+    proof = found.verify()
+    assert proof.bound - proof.objective <= 1e-5 * abs(proof.bound)
+    episode = achieved(improved(found, rounds=6))
+    assert episode.episode_service[0] >= 0.97 - 1e-4
+    assert 0.0 <= float(found.gap(episode.episode_circularity)[0]) < 0.01
+
+
+@pytest.mark.medium
+def test_the_unit_of_mass_does_not_matter(tmp_path: Path) -> None:
+    """In kg, kt and Gt: the same bound, plan, and episodes of the plan and of MPC."""
+    text = (folder("envs") / "copper_net.toml").read_text(encoding="utf-8")
+    assert 'mass = "kt"' in text
+    shown = []
+    for unit, factor in KILOTONNES.items():
+        path = tmp_path / f"{unit}.toml"
+        path.write_text(text.replace('mass = "kt"', f'mass = "{unit}"'), encoding="utf-8")
+        network = load_network(path)
+        found = bound(network, min_service=0.98, horizon=10, degree=1)
+        planned = achieved(improved(found))
+        env = VectorEnv(network, num_envs=1, horizon=6)
+        controlled = rollout(env, MPC(min_service=0.98), seed=3)
+        masses = [found.objective, planned.episode_circularity[0], controlled.episode_circularity[0]]
+        services = [found.service, planned.episode_service[0], controlled.episode_service[0]]
+        shown.append([*(float(mass) / factor for mass in masses), *map(float, services)])
+    assert shown[0] == pytest.approx(shown[1], rel=1e-6)
+    assert shown[2] == pytest.approx(shown[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("failing", [0, 1, 2])
+def test_other_settings_are_tried(failing: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of the settings finds the bound alone; what HiGHS says of its answer does not count, what it proves does."""
+    network = yearly(0.5, horizon=3)
+    usual = bound(network).objective
+    others = [settings for i, settings in enumerate(solver.SETTINGS) if i != failing]
+    hurried = {**solver.SETTINGS[failing], "time_limit": 0.0}
+    monkeypatch.setattr(solver, "SETTINGS", (hurried, *others))
+    assert bound(network).objective == pytest.approx(usual, rel=1e-5)
+    monkeypatch.setattr(highspy.Highs, "getModelStatus", lambda self: highspy.HighsModelStatus.kNotset)
+    monkeypatch.setattr(solver, "SETTINGS", others)
+    assert bound(network).objective == pytest.approx(usual, rel=1e-5)
+    monkeypatch.setattr(solver, "SETTINGS", (hurried,))
+    with pytest.raises(NoCertificate, match="network 'yearly': HiGHS did not solve the program of the bound: Not Set"):
+        bound(network)
+
+
+def test_mpc_goes_on_where_a_plan_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its older plan, then neutrally; it says so, and plans anew once it can."""
+    network = load_network("copper_net")
+    env = VectorEnv(network, num_envs=1, horizon=12)
+    usual = rollout(env, MPC(min_service=0.9), seed=1)
+    controller, asked = MPC(min_service=0.9), 0
+    solve = MPC._solved
+
+    def hindered(self: MPC, *arguments: object) -> object:
+        nonlocal asked
+        asked += 1
+        if asked == 2:
+            raise solver.Unsolved("here")
+        return solve(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(MPC, "_solved", hindered)
+    found = rollout(env, controller, seed=1)
+    assert "here" in controller.note
+    assert found.episode_circularity[0] == pytest.approx(usual.episode_circularity[0], rel=0.1)
+    asked = 1
+    rollout(env, controller, seed=1)
+    assert controller.note
+    monkeypatch.setattr(MPC, "_solved", solve)
+    rollout(env, controller, seed=1)
+    assert not controller.note
+
+
+def test_scales_leave_the_programs_answer() -> None:
+    """Multipliers come back in the units of the network: they prove what the plan does."""
+    found = bound(replace(yearly(0.5, horizon=2), mass_unit="Mt"), service_weight=0.5)
+    assert found.verify().bound == pytest.approx(found.verify().objective, rel=1e-6)
