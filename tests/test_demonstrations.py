@@ -26,7 +26,7 @@ from cirl_marl.learners.views import View
 from cirl_marl.optimum.named import CONTROLLERS, named_controller
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import PaperRow
-from cirl_marl.paper.tuned import train_tuned
+from cirl_marl.paper.training import train_tuned
 
 HORIZON, COPIES, SEED = 4, 2, 5
 AGENTS = ("mine", "use", "use_to_collection")
@@ -213,7 +213,7 @@ def test_tuned_row_counts_its_demonstrations(monkeypatch: pytest.MonkeyPatch) ->
             super().__init__(*arguments, **options)
             normalisers.append(self)
 
-    monkeypatch.setattr("cirl_marl.paper.tuned.VecNormalize", Kept)
+    monkeypatch.setattr("cirl_marl.learners.learner.VecNormalize", Kept)
     row = PaperRow(environment="FetchWasteSorting", algorithm="TQC", settings="tuned", steps=300)
     found = train_tuned(ENVIRONMENTS["FetchWasteSorting"], row, lambda *_: None, small)
     statistics: Any = normalisers[0].obs_rms

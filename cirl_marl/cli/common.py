@@ -72,7 +72,7 @@ def bar(what: str) -> Iterator[Callable[[float], None]]:
 def shares() -> Iterator[Callable[[str, float], None]]:
     """Progress bar of several things; the yielded function takes what is being done and the share of all done."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("preparing", total=1.0)
         yield lambda what, share: progress.update(task, description=what, completed=share)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from cirl_marl.errors import RunError
 from cirl_marl.records.files import write_atomically
@@ -120,18 +121,6 @@ class Result:
         """ψ = ζ / steps done."""
         return self.gain / self.steps_done
 
-    @classmethod
-    def from_dict(cls, plain: dict[str, Any]) -> Result:
-        """Read what ``asdict`` returned, after a detour through JSON."""
-        given = {key: value for key, value in plain.items() if key not in ("gain", "gain_per_step")}
-        row = dict(given["row"])
-        row.setdefault("settings", row.pop("recipe", "published"))  # what files of 0.1 call it
-        given["row"] = PaperRow(**row)
-        for key in ("evaluation", "published_ends"):
-            given[key] = Evaluation(**given[key]) if given.get(key) is not None else None
-        given["curve"] = [(int(step), float(value)) for step, value in given["curve"]]
-        return cls(**given)
-
 
 class Results:
     """A directory of results.
@@ -198,8 +187,10 @@ def _one_line_each(plain: dict[str, Any]) -> str:
 
 def _read(path: Path) -> Result:
     try:
-        return Result.from_dict(json.loads(path.read_text()))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        plain = json.loads(path.read_text())
+        plain["row"].setdefault("settings", plain["row"].pop("recipe", "published"))  # what files of 0.1 call it
+        return TypeAdapter(Result).validate_python(plain)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RunError(f"{path}: is not the result of a row: {error!r}; delete it to run the row again") from error
 
 
