@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -50,24 +50,14 @@ def train(
     directory = resume or out
     if directory is None:
         directory = Path("runs") / f"{load_network(str(network)).name}-{Path(recipe).stem}-seed{seed}"
+    options: dict[str, Any] = {"steps": steps, "envs": envs, "seed": seed, "scenario": scenario, "reward": reward}
+    options |= {"observe": observe, "agents": None if agents is None else listed(agents)}
     with training_bar() as report:
         try:
             if resume is not None:
                 training = learners.resume(resume, steps=steps, report=report)
             else:
-                training = learners.train(
-                    str(network),
-                    recipe,
-                    directory=directory,
-                    steps=steps,
-                    envs=envs,
-                    seed=seed,
-                    agents=None if agents is None else listed(agents),
-                    scenario=scenario,
-                    reward=reward,
-                    observe=observe,
-                    report=report,
-                )
+                training = learners.train(str(network), recipe, directory=directory, report=report, **options)
         except KeyboardInterrupt:
             console.print(f"\nstopped; {_kept(directory)}", soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 
-from cirl_marl.drawing.places import Pitch, place
+from cirl_marl.drawing.places import place
 from cirl_marl.drawing.routing import LABEL, Routes, route
 from cirl_marl.drawing.style import spoken
 from cirl_marl.network import Floats, Network
@@ -21,13 +22,9 @@ LINE_LETTERS = 12
 
 @dataclass(frozen=True, slots=True)
 class Arrangement:
-    """Where everything of one network goes, in em.
+    """Where everything of one network goes, in em: ``positions`` are the centres of the nodes, shape (nodes, 2).
 
-    Attributes:
-        positions: centres of the nodes, shape (nodes, 2).
-        routes: courses of the arcs; None for networks too large to label.
-        box: width and height of a node.
-        names: label of each node, in lines.
+    ``routes`` are None for networks too large to label; ``names`` are the labels of the nodes, in lines.
     """
 
     positions: Floats
@@ -69,7 +66,7 @@ def _layout(structure: _Structure, aspect: float) -> Arrangement:
     names = tuple(_lines(node.id) for node in network.nodes)
     letters = max(len(line) for name in names for line in name)
     box = np.array([max(5.5, 0.62 * letters + 1.0), 1.2 * (max(map(len, names)) + 1) + 0.6])
-    positions = place(network, Pitch(box[0] + 4.8, box[1] + 3.7), aspect)
+    positions = place(network, box + np.array([4.8, 3.7]), aspect)
     labelled = len(network.nodes) <= LABELLED_NODES and len(network.arcs) <= LABELLED_ARCS
     routes = route(positions, network.donors, network.recipients, box) if labelled else None
     return Arrangement(positions, routes, box, names)
@@ -77,11 +74,5 @@ def _layout(structure: _Structure, aspect: float) -> Arrangement:
 
 def _lines(identifier: str) -> tuple[str, ...]:
     """Break an id into lines at its spaces."""
-    lines = [""]
-    for word in spoken(identifier).split():
-        joined = f"{lines[-1]} {word}".strip()
-        if len(joined) <= LINE_LETTERS or not lines[-1]:
-            lines[-1] = joined
-        else:
-            lines.append(word)
-    return tuple(lines)
+    lines = textwrap.wrap(spoken(identifier), LINE_LETTERS, break_long_words=False, break_on_hyphens=False)
+    return tuple(lines) or ("",)

@@ -28,11 +28,7 @@ class Canvas:
     """
 
     def __init__(self, network: Network, *, window: bool) -> None:
-        """Prepare the picture.
-
-        Args:
-            network: what to draw.
-            window: whether to show each picture in a window too.
+        """Prepare pictures of ``network``, to be shown in a window too if ``window``.
 
         Raises:
             CirlError: if a window is wanted and pygame is not installed.
@@ -47,11 +43,7 @@ class Canvas:
     def draw(self, stock: Floats, flow: Floats, time: float, circularity: float | None = None) -> NDArray[np.uint8]:
         """Return the picture, shape (height, width, 3), and show it if there is a window.
 
-        Args:
-            stock: stocks, shape (nodes,), mass.
-            flow: flows, shape (arcs,), mass/time.
-            time: time of the stocks, for the heading.
-            circularity: λ, mass; see ``draw_network``.
+        ``time`` is that of the stocks, for the heading; for the others see ``draw_network``.
         """
         network = self._network
         reference = max(self._reference, largest_flow(flow))
@@ -75,16 +67,7 @@ def save_network(
 ) -> Path:
     """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide, and return its path.
 
-    Args:
-        path: file to write; its folder is made.
-        network: the network.
-        stock: stocks, shape (nodes,), mass.
-        flow: flows, shape (arcs,), mass/time.
-        title: heading; empty takes that of the network.
-        circularity: λ, mass; see ``draw_network``.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
+    Its folder is made; without a title it has that of the network. For the other arguments see ``draw_network``.
     """
     figure = Figure(figsize=FRAME_INCHES)
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.87))
@@ -109,9 +92,6 @@ def save_before_after(
         after: the same, later or under other control.
         labels: headings of the two.
         circularity: λ of the two, mass; see ``draw_network``.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
     """
     figure = Figure(figsize=(9.0, 5.6))
     reference = max(largest_flow(np.asarray(flow)) for _, flow in (before, after))

@@ -22,12 +22,7 @@ SHARES = (0.5, 0.42, 0.58, 0.34, 0.66, 0.26, 0.74, 0.18, 0.82)
 
 @dataclass(frozen=True, slots=True)
 class Routes:
-    """The course of every arc.
-
-    Attributes:
-        curves: visible part of each arc from donor to recipient, shape (arcs, points, 2), em.
-        labels: centre of each label, shape (arcs, 2), em.
-    """
+    """The visible course of each arc from donor to recipient, shape (arcs, points, 2), and its label's centre, em."""
 
     curves: Floats
     labels: Floats
@@ -45,11 +40,7 @@ def bezier(start: Floats, end: Floats, bend: Floats, points: int) -> Floats:
 def route(positions: Floats, donors: Integers, recipients: Integers, box: Floats) -> Routes:
     """Choose, arc by arc, the least bent course that is free of boxes and of the arcs before it.
 
-    Args:
-        positions: centres of the nodes, shape (nodes, 2), em.
-        donors: donor of each arc, shape (arcs,).
-        recipients: recipient of each arc, shape (arcs,).
-        box: width and height of a node, em.
+    Nodes have their centres at ``positions``, shape (nodes, 2), and width and height ``box``, em.
     """
     pairs = Counter(zip(donors.tolist(), recipients.tolist(), strict=True))
     length = np.hypot(*(positions[recipients] - positions[donors]).T)
@@ -84,9 +75,8 @@ def _clipped(curve: Floats, donor: Floats, recipient: Floats, box: Floats) -> Fl
 
 def _inside(trials: Floats, centres: Floats, box: Floats) -> Floats:
     """Price of running through boxes, shape (trials,)."""
-    gap = np.abs(trials[:, :, None] - centres) < box / 2
-    price: Floats = gap.all(axis=-1).sum(axis=(1, 2)) * 0.5
-    return price
+    inside = (np.abs(trials[:, :, None] - centres) < box / 2).all(axis=-1)
+    return np.asarray(inside.sum(axis=(1, 2)) * 0.5)
 
 
 def _crowded(trials: Floats, done: Floats) -> Floats:
@@ -95,8 +85,7 @@ def _crowded(trials: Floats, done: Floats) -> Floats:
         return np.zeros(len(trials))
     others = done[:, ::3].reshape(-1, 2)
     away = np.hypot(*np.moveaxis(trials[:, ::3, None] - others, -1, 0))
-    price: Floats = np.clip(1.3 - away, 0, None).sum(axis=(1, 2)) * 0.25
-    return price
+    return np.asarray(np.clip(1.3 - away, 0, None).sum(axis=(1, 2)) * 0.25)
 
 
 def _labels(curves: Floats, positions: Floats, box: Floats) -> Floats:
@@ -104,11 +93,10 @@ def _labels(curves: Floats, positions: Floats, box: Floats) -> Floats:
     placed = np.zeros((len(curves), 2))
     for arc, curve in enumerate(curves):
         centres, price = _beside(curve)
-        price = price + _overlap(centres, positions, box + LABEL) * 15
-        price = price + _overlap(centres, placed[:arc], 2 * LABEL) * 8
+        price += _overlap(centres, positions, box + LABEL) * 15 + _overlap(centres, placed[:arc], 2 * LABEL) * 8
         others = np.delete(curves, arc, axis=0)[:, ::2]
         covered = (np.abs(centres[:, None, None] - others) < LABEL / 2 + 0.5).all(axis=-1)
-        price = price + covered.sum(axis=(1, 2)) * 0.6
+        price += covered.sum(axis=(1, 2)) * 0.6
         placed[arc] = centres[int(np.argmin(price))]
     return placed
 
@@ -131,5 +119,4 @@ def _beside(curve: Floats) -> tuple[Floats, Floats]:
 def _overlap(centres: Floats, others: Floats, size: Floats) -> Floats:
     """Shared area, in labels, of boxes whose half sizes sum to half of ``size``, shape (centres,)."""
     shared = np.clip(size / 2 - np.abs(centres[:, None] - others), 0, LABEL)
-    area: Floats = shared.prod(axis=-1).sum(axis=1) / float(LABEL.prod())
-    return area
+    return np.asarray(shared.prod(axis=-1).sum(axis=1) / LABEL.prod())

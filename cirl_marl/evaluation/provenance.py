@@ -16,13 +16,7 @@ from cirl_marl.records.machine import versions
 
 
 def provenance(network: Network, runs: Sequence[RunDirectory] = (), **options: Any) -> dict[str, Any]:
-    """Return what a result depends on, ready for JSON.
-
-    Args:
-        network: under its scenario.
-        runs: training runs that it draws on.
-        **options: what else was asked for.
-    """
+    """Return what a result depends on, ready for JSON: network, training runs, and what else was asked for."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "versions": versions(),

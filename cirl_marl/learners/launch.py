@@ -88,11 +88,7 @@ def prepared(
     agents: Sequence[str] | None = None,
     **options: Any,
 ) -> Training:
-    """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written.
-
-    Raises:
-        CirlError: for input that cannot be used.
-    """
+    """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
     found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     steps = found.run.steps if steps is None else _whole("steps", steps, 1)
     found.check(steps)

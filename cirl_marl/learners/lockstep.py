@@ -44,14 +44,10 @@ class Lockstep:
     def __init__(
         self, env: VectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None, *, done: int = 0
     ) -> None:
-        """Reset ``env`` with one seed per copy and seat its learners.
+        """Reset ``env`` with one of ``seeds`` per copy and seat its learners, after ``done`` joint steps before.
 
-        Args:
-            env: the joint environment.
-            seeds: of its copies.
-            views: what each learner sees, by its name; together they act for every agent once. None: every agent has
-                a learner of its own.
-            done: joint steps done before.
+        ``views`` are what each learner sees, by its name; together they act for every agent once. None gives every
+        agent a learner of its own.
         """
         self.env = env
         self.joint_steps = done

@@ -151,13 +151,10 @@ class Run(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Agents that one learner learns for.
+    """Agents that one learner learns for, in the order of the environment, and how it learns.
 
-    Attributes:
-        name: the agent's of an independent learner, else ``shared-learner`` or ``joint-learner``; of several with the
-            number of the match, 0 for the common one.
-        agents: in the order of the environment.
-        spec: how it learns.
+    An independent learner has the name of its agent, others are ``shared-learner`` or ``joint-learner``; of several
+    with the number of the match, 0 for the common one.
     """
 
     name: str
@@ -215,19 +212,11 @@ class Recipe(Settings):
         return tuple(found.values())
 
     def check(self, steps: int) -> None:
-        """Refuse what is wrong whatever the network, in a run of ``steps``.
-
-        Raises:
-            RecipeError: naming every mistake.
-        """
+        """Raise a ``RecipeError`` that names all that is wrong whatever the network, in a run of ``steps``."""
         self._refuse(self.mistakes(steps))
 
     def check_agents(self, agents: Sequence[str]) -> None:
-        """Refuse matches that name agents which do not act.
-
-        Raises:
-            RecipeError: naming the match, the agent and the nearest that acts.
-        """
+        """Raise a ``RecipeError`` for matches that name agents which do not act; it names the nearest that acts."""
         self._refuse(
             f"match.{i}.agents: {unknown('agent', agent, agents)}"
             for i, match in enumerate(self.match)

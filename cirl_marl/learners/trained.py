@@ -19,17 +19,11 @@ from cirl_marl.learners.views import View, unseen_state
 class Trained(Controller):
     """Acts by the deterministic policies of a run's newest checkpoint, with their normalisers frozen.
 
-    Attributes:
-        run: the run.
-        checkpoint: the folder from which the policies were loaded; a run that is being trained has others later.
+    ``checkpoint`` is the folder from which they were loaded; a run that is being trained has others later.
     """
 
     def __init__(self, run: str | Path | RunDirectory) -> None:
-        """Load every policy.
-
-        Raises:
-            RunError: if the run is incomplete or a file of it cannot be read.
-        """
+        """Load every policy; a ``RunError`` if the run is incomplete or a file of it cannot be read."""
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
         self.checkpoint = folder = self.run.checkpoint
         groups = self.run.groups()
@@ -52,11 +46,7 @@ class Trained(Controller):
             raise RunError(f"{folder}: the policy or normaliser of '{name}' is for other observations or actions")
 
     def start(self, env: VectorEnv, seed: int) -> None:
-        """Forget the last episode.
-
-        Raises:
-            RunError: if ``env`` has other agents than the run, or shows them something else.
-        """
+        """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
         if set(env.agents) != set(self._seen):
             raise RunError(f"{self.run.path}: trained {sorted(self._seen)}, not {sorted(env.agents)}")
         for agent, seen in self._seen.items():

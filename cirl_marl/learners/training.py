@@ -140,7 +140,7 @@ class Training:
             if self._metrics is not None:
                 self._metrics.close()
             for learner in self.learners.values():
-                learner.close()
+                learner.model.logger.close()
 
     def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
         """Raise a ``CirlError`` for callbacks of learners that there are not."""

@@ -31,12 +31,7 @@ EVALUATION_COPIES = 20
 
 
 def run_row(row: PaperRow, *, report: Report = lambda what, done, total: None, episodes: int | None = None) -> Result:
-    """Train and evaluate one row.
-
-    Args:
-        row: what to run.
-        report: called now and then.
-        episodes: that the final policy plays; None takes 100, or the paper's number where it counts successes.
+    """Train and evaluate one row; the final policy plays 100 ``episodes``, or the paper's where it counts successes.
 
     Raises:
         CirlError: if the environment is missing in this version, or no training episode ended.
@@ -59,6 +54,7 @@ def run_row(row: PaperRow, *, report: Report = lambda what, done, total: None, e
                 options = trained.options | {"legacy_episode": True}  # its first episode is longer than all others
                 published_ends = evaluate(environment.id, trained.predict, episodes, seed, report, options, warm_up=1)
         threads = torch.get_num_threads()
+    machine = {"cpus": os.cpu_count(), "model": processor(), "torch_threads": threads, "device": "cpu"}
     window = max(1, min(WINDOW, len(trained.returns) // 2))
     return Result(
         row=row,
@@ -71,13 +67,7 @@ def run_row(row: PaperRow, *, report: Report = lambda what, done, total: None, e
         evaluation=evaluation,
         settings=trained.settings,
         versions=versions() | {package: metadata.version(package) for package in PACKAGES},
-        machine={
-            "cpus": os.cpu_count(),
-            "model": processor(),
-            "torch_threads": threads,
-            "load": os.getloadavg()[0],
-            "device": "cpu",
-        },
+        machine=machine | {"load": os.getloadavg()[0]},
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
         cpu_seconds=trained.cpu_seconds,
         published_ends=published_ends,

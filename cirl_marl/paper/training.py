@@ -45,11 +45,8 @@ class PaperTraining:
         predict: the final policy; None if its weights became NaN.
         ends: environment steps at which each training episode ended.
         returns: undiscounted return of each.
-        steps: environment steps done.
-        seconds: wall time.
-        cpu_seconds: processor time.
         settings: what the row depends on.
-        options: options of the environment to evaluate in.
+        options: of the environment to evaluate in.
     """
 
     predict: Predict | None
@@ -63,15 +60,10 @@ class PaperTraining:
 
 
 def check_registered(environment: PaperEnvironment) -> gymnasium.envs.registration.EnvSpec:
-    """Return the Gymnasium specification of an environment of the paper.
-
-    Raises:
-        RunError: if this version does not have it.
-    """
-    found = gymnasium.registry.get(environment.id)
-    if found is None:
+    """Return the Gymnasium specification of an environment of the paper; a ``RunError`` if this version lacks it."""
+    if environment.id not in gymnasium.registry:
         raise RunError(f"{environment.id}: this version of cirl_marl does not register it")
-    return found
+    return gymnasium.registry[environment.id]
 
 
 def described(environment: PaperEnvironment) -> dict[str, Any]:
@@ -103,13 +95,9 @@ def train_published(environment: PaperEnvironment, row: PaperRow, report: Report
 def train_tuned(
     environment: PaperEnvironment, row: PaperRow, report: Report, recipe: Recipe | None = None
 ) -> PaperTraining:
-    """Train by the environment's recipe: networks with batched physics, goal tasks and others in a batch of copies.
+    """Train by a recipe: networks with batched physics, goal tasks and others in a batch of copies.
 
-    Args:
-        environment: of the paper.
-        row: what to run; its steps and its seed override the recipe's.
-        report: called now and then.
-        recipe: None takes that of the catalogue.
+    Without a recipe it is the catalogue's; steps and seed are those of the row.
 
     Raises:
         CirlError: if there is no recipe.
@@ -151,18 +139,11 @@ def _train_network(
     def watch(now: Progress) -> None:
         report("training", min(now.env_steps, now.total), now.total)
 
+    options: dict[str, Any] = {"steps": row.steps, "seed": row.seed, "scenario": arguments.get("scenario")}
+    options |= {"agents": None if agent is None else [agent]}
     with tempfile.TemporaryDirectory() as folder:
         elapsed = _stopwatch()
-        training = train(
-            arguments["network"],
-            recipe,
-            directory=Path(folder) / "run",
-            steps=row.steps,
-            seed=row.seed,
-            agents=None if agent is None else [agent],
-            scenario=arguments.get("scenario"),
-            report=watch,
-        )
+        training = train(arguments["network"], recipe, directory=Path(folder) / "run", report=watch, **options)
         seconds, cpu_seconds = elapsed()
         assert training.run is not None
         metrics = training.run.metrics()

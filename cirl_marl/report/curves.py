@@ -34,15 +34,8 @@ def save_circularity(
     Lines are means over episodes; bands are the 95 % confidence intervals of the means (Student's t), where
     there are at least two episodes.
 
-    Args:
-        path: file to write; its folder is made.
-        network: gives the units.
-        time: shape (steps,), time.
-        runs: λ by control, shape (episodes, steps) each, mass.
-        services: service level by control, shape (episodes, steps) each.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
+    ``runs`` are λ, mass, and ``services`` service levels by control, of shape (episodes, steps), ``time`` (steps,);
+    other shapes raise a ``CirlError``.
     """
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
@@ -55,10 +48,8 @@ def save_circularity(
     below.set_ylim(-0.03, 1.06)
     _set_time(below, time, network)
     if names:
-        source = above if runs else below
-        figure.legend(
-            *source.get_legend_handles_labels(), loc="outside upper right", ncols=4, frameon=False, fontsize=9
-        )
+        lines, labels = (above if runs else below).get_legend_handles_labels()
+        figure.legend(lines, labels, loc="outside upper right", ncols=4, frameon=False, fontsize=9)
     return save(figure, path)
 
 
@@ -66,15 +57,8 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
     """Save the episode returns of each agent while it learned as a PNG, one panel per agent; return its path.
 
     Raw returns are light, their centred moving average over a fifteenth of the episodes is bold. Of more
-    than 20 agents the first 20 are shown.
-
-    Args:
-        path: file to write; its folder is made.
-        steps: environment steps at the end of each episode, shape (episodes,).
-        returns: episode returns by agent, shape (episodes,) each.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
+    than 20 agents the first 20 are shown. ``steps`` are environment steps at the end of each episode, and ``returns``
+    those of episodes by agent, shape (episodes,) each; other shapes raise a ``CirlError``.
     """
     shown = list(returns.items())[:AGENT_PANELS]
     columns = max(1, min(len(shown), 3 if len(shown) <= 9 else 4))

@@ -22,14 +22,7 @@ MARKERS = "osD^vP*X"
 
 @dataclass(frozen=True, slots=True)
 class PointSeries:
-    """Points of one kind in the plane of service and circularity.
-
-    Attributes:
-        name: in the legend.
-        service: mean service levels, shape (points,).
-        circularity: λ̄, shape (points,), mass.
-        joined: whether a line goes through them in their order.
-    """
+    """Points of one kind in the plane of mean service level and λ̄, mass, shape (points,) each; ``joined`` by a line."""
 
     name: str
     service: Floats
@@ -40,14 +33,9 @@ class PointSeries:
 def save_fronts(
     path: str | Path, network: Network, series: Sequence[PointSeries], bound: Floats, *, title: str
 ) -> Path:
-    """Save λ̄ against the service level as a PNG and return its path.
+    """Save λ̄ against the service level of policies, plans or controllers as a PNG and return its path.
 
-    Args:
-        path: file to write; its folder is made.
-        network: gives the unit.
-        series: policies, plans or controllers.
-        bound: service level and bound on λ̄, shape (points, 2), by service; what lies above is shaded. Empty for none.
-        title: of the picture.
+    ``bound`` is service level and bound on λ̄, shape (points, 2), by service; what lies above is shaded. Empty for none.
     """
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
@@ -83,13 +71,6 @@ def _draw_bound(axes: Axes, bound: Floats) -> None:
     service, most = np.append(bound[:, 0], 1.0), np.append(bound[:, 1], bound[-1, 1])
     axes.step(service, most, where="post", color=INK, linewidth=1.6, label="bound")
     axes.fill_between(service, most, high, step="post", color=GRID, linewidth=0, zorder=0)
-    axes.annotate(
-        "proved out of reach from a middle start",
-        (1.0, high),
-        xytext=(-4, -12),
-        textcoords="offset points",
-        ha="right",
-        fontsize=8,
-        color=MUTED,
-    )
+    note, below = "proved out of reach from a middle start", (-4, -12)
+    axes.annotate(note, (1.0, high), xytext=below, textcoords="offset points", ha="right", fontsize=8, color=MUTED)
     axes.set_ylim(low, high)
