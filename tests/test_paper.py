@@ -218,11 +218,14 @@ def test_recipes_of_other_versions_are_outdated() -> None:
     assert "another now" in outdated(replace(found, settings={"recipe": recorded | {"gone": 1}}))
 
 
-def test_other_failures_of_a_training_are_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_failures_of_a_training_are_no_result() -> None:
     """Only broken weights are what the settings give; anything else that goes wrong is said."""
-    monkeypatch.setattr(training.Watch, "_on_step", lambda _: int("none"))
-    with pytest.raises(ValueError, match="invalid literal"):
-        run_row(PaperRow(environment="CopperNet", algorithm="SAC", steps=200))
+
+    def broken(*_: object) -> None:
+        raise ValueError("not of NaN")
+
+    with pytest.raises(ValueError, match="not of NaN"):
+        run_row(PaperRow(environment="CopperNet", algorithm="SAC", steps=200), report=broken)
 
 
 def test_interrupted_row_leaves_nothing(

@@ -11,8 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from cirl_marl.drawing.arrangement import Arrangement, arrangement_of
-from cirl_marl.drawing.routing import Routes, bezier
+from cirl_marl.drawing.arrangement import Arrangement, Routes, arrangement_of, bezier
 from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, ROLE_NAMES, WARNING, number, spoken
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network

@@ -92,8 +92,8 @@ def prepared(
     found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     steps = found.run.steps if steps is None else _whole("steps", steps, 1)
     found.check(steps)
-    given = {name: value for name, value in options.items() if value is not None}
-    settings = found.environment | {n: v.item() if isinstance(v, np.generic) else v for n, v in given.items()}
+    given = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
+    settings = found.environment | given
     copies = found.run.envs if envs is None else _whole("envs", envs, 1)
     env = VectorEnv(network, num_envs=copies, agents=agents, **settings)
     if not env.agents:

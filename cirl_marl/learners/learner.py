@@ -17,7 +17,6 @@ from sb3_contrib import ARS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
@@ -91,14 +90,12 @@ class Learner:
                 self.model = build(spec.algorithm, spec.policy, self.env, parameters, seed=self._seed, device="cpu")
             except RecipeError as error:
                 raise RecipeError(f"{self.seat.title}: {error}") from error
-        if self.seat.num_envs > 1 and isinstance(self.model, OffPolicyAlgorithm):
-            frequency = self.model.train_freq
-            assert isinstance(frequency, TrainFreq)
-            if frequency.unit is TrainFrequencyUnit.EPISODE:
-                raise RecipeError(
-                    f"{self.seat.title}: parameters.train_freq: {spec.algorithm} learns after whole episodes in a "
-                    f"single environment only, not in {self.seat.num_envs}; give a number of steps"
-                )
+        frequency = getattr(self.model, "train_freq", None)
+        if self.seat.num_envs > 1 and isinstance(frequency, TrainFreq) and frequency.unit is TrainFrequencyUnit.EPISODE:
+            raise RecipeError(
+                f"{self.seat.title}: parameters.train_freq: {spec.algorithm} learns after whole episodes in a single "
+                f"environment only, not in {self.seat.num_envs}; give a number of steps"
+            )
         return self
 
     def load(self, folder: Path) -> Learner:
@@ -194,10 +191,6 @@ class Learner:
             path = folder / f"{self.name}.replay.pkl.gz"  # packed, as a buffer has room for much more than it holds
             with gzip.open(path, "wb", compresslevel=1) as packed, io.BufferedWriter(packed) as file:
                 self.model.save_replay_buffer(file)
-
-    def log_to(self, log: Path) -> None:
-        """Write TensorBoard events below the folder ``log``."""
-        self.model.set_logger(configure(str(log / self.name), ["tensorboard"]))
 
 
 def normalised(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:

@@ -51,7 +51,6 @@ class Seat(VecEnv):
 
     Attributes:
         name: of the learner; an independent learner has its agent's.
-        view: what it sees of the environment.
         latest: the observation that it acts on next, one row for each row of its view.
         action: what it last did.
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
@@ -59,12 +58,10 @@ class Seat(VecEnv):
 
     def __init__(self, env: VectorEnv, name: str, view: View, exchange: Callable[[Seat], VecEnvStepReturn]) -> None:
         """Seat the learner ``name``; ``exchange`` hands in its action and waits for the outcome of the joint step."""
-        self.name = name
-        self.view = view
+        self.name, self.view, self.copies = name, view, env.num_envs
         self.latest: ObservedRows | None = None
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
-        self.copies = env.num_envs
         self.views = [CopyView(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
         self._exchange = exchange
         super().__init__(len(self.views), view.observation_space, view.action_space)

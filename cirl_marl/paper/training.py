@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
@@ -180,20 +179,25 @@ def _train_copies(
     env = normalised(env, learner, ["observation"] if environment.has_goals else None)
     model = build(learner.algorithm, policy, env, parameters, seed=row.seed, device="cpu")
     env.seed(row.seed * copies)  # one seed for each copy from there on, so that no two rows share a start
+
+    def tell(*_: Any) -> bool:
+        report("training", min(model.num_timesteps, row.steps), row.steps)
+        return True
+
     elapsed = _stopwatch()
     if learner.demonstrations is not None:
         assert isinstance(model, OffPolicyAlgorithm)
         seeds = [derived_seed(row.seed, "demonstrations", i) for i in range(copies)]
         act = in_copies(learner.demonstrations.controller, monitors, seeds)
 
-        def act_and_report() -> NDArray[np.float32]:
-            report("training", model.num_timesteps, row.steps)
+        def act_and_tell() -> NDArray[np.float32]:
+            tell()
             return act()
 
-        demonstrate(model, learner.demonstrations.steps, act_and_report)
+        demonstrate(model, learner.demonstrations.steps, act_and_tell)
     left, fresh = row.steps - model.num_timesteps, model.num_timesteps == 0
     try:
-        model.learn(left, callback=Watch(report, row.steps), reset_num_timesteps=fresh)
+        model.learn(left, callback=tell, reset_num_timesteps=fresh)
     except (CirlError, ValueError):  # what torch's distributions and the environments say of NaN
         if _is_finite(model):
             raise
@@ -237,20 +241,6 @@ def _episodes_of(monitors: list[Monitor[Any, Any]]) -> tuple[list[int], list[flo
         for end, value in zip(np.cumsum(monitor.get_episode_lengths()), monitor.get_episode_rewards(), strict=True)
     )
     return [end for end, _, _ in found], [value for _, _, value in found]
-
-
-class Watch(BaseCallback):
-    """Reports the steps done."""
-
-    def __init__(self, report: Report, total: int) -> None:
-        """Report to ``report``."""
-        super().__init__()
-        self._report = report
-        self._total = total
-
-    def _on_step(self) -> bool:
-        self._report("training", min(self.num_timesteps, self._total), self._total)
-        return True
 
 
 def _stopwatch() -> Callable[[], tuple[float, float]]:

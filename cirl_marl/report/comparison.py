@@ -11,10 +11,10 @@ import numpy as np
 from rich.table import Table
 
 from cirl_marl.evaluation.comparison import FIGURES, Comparison
-from cirl_marl.evaluation.provenance import provenance
+from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, defined
 from cirl_marl.records.files import published, write_json, write_table
-from cirl_marl.report.fronts import PointSeries, save_fronts
+from cirl_marl.report.curves import PointSeries, save_fronts
 
 FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
 
