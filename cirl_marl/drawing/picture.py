@@ -12,8 +12,7 @@ from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
 from cirl_marl.drawing.arrangement import Arrangement, Routes, arrangement_of, bezier
-from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, ROLE_NAMES, WARNING, number, spoken
-from cirl_marl.errors import CirlError
+from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, WARNING, number, shaped, spoken
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law, Role
 
@@ -61,7 +60,7 @@ def draw_network(
     Raises:
         CirlError: if an array has the wrong shape.
     """
-    stock, flow = _checked("stock", stock, len(network.nodes)), _checked("flow", flow, len(network.arcs))
+    stock, flow = shaped("stock", stock, (len(network.nodes),)), shaped("flow", flow, (len(network.arcs),))
     reference = largest_flow(flow) if reference_flow is None else reference_flow
     share = np.clip(np.nan_to_num(np.abs(flow)) / max(reference, 1e-12), 0, BROADEST)
     layout = arrangement_of(network, axes.bbox.width / axes.bbox.height)
@@ -91,21 +90,14 @@ def legend_of(network: Network) -> dict[str, Any]:
     roles = dict.fromkeys(node.role for node in sorted(network.nodes, key=lambda n: list(Role).index(n.role)))
     patches: dict[str, str] = {}
     for role in roles:
-        colour = ROLE_COLOURS[role]
-        patches[colour] = f"{patches[colour]}, {ROLE_NAMES[role]}" if colour in patches else ROLE_NAMES[role]
+        colour, name = ROLE_COLOURS[role], spoken(role).replace("nonrenewable", "non-renewable")
+        patches[colour] = f"{patches[colour]}, {name}" if colour in patches else name
     sign = network.sustainability
     arrows = {WARNING: "flow that lowers λ", GOOD: "flow that raises λ", NEUTRAL: "other flow"}
     used = {WARNING: (sign > 0).any(), GOOD: (sign < 0).any(), NEUTRAL: (sign == 0).any()}
     patches |= {colour: label for colour, label in arrows.items() if used[colour]}
     handles = [Patch(facecolor=colour, label=label) for colour, label in patches.items()]
     return {"handles": handles, "frameon": False, "fontsize": 8, "labelcolor": MUTED, "handlelength": 1.2}
-
-
-def _checked(name: str, values: Floats, count: int) -> Floats:
-    found = np.asarray(values, dtype=float)
-    if found.shape != (count,):
-        raise CirlError(f"{name} has shape {found.shape}, expected {(count,)}")
-    return found
 
 
 def _frame(axes: Axes, layout: Arrangement, legend: bool) -> float:

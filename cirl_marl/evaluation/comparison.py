@@ -175,11 +175,10 @@ def compare(
         done = len(entered) * share
         names = [each.name for each in entered]
         measure, proved = _measured(env, starts, names, rollouts, part_of(progress, "bounds", done, 1 - done))
-    plain = [contender.run is None and contender.name == "neutral" for contender in entered]
-    neutral = rollouts[plain.index(True)]
+    neutral = next(run for who, run in zip(entered, rollouts, strict=True) if who.run is None and who.name == "neutral")
     entries = tuple(
-        Entry(contender.name, contender.seed, contender.run, checkpoint, run, gain(run, neutral), bound)
-        for contender, checkpoint, run, bound in zip(entered, checkpoints, rollouts, proved, strict=True)
+        Entry(who.name, who.seed, who.run, checkpoint, run, gain(run, neutral), bound)
+        for who, checkpoint, run, bound in zip(entered, checkpoints, rollouts, proved, strict=True)
     )
     return Comparison(env.network, env.agents, first, entries, measure)
 
@@ -203,9 +202,9 @@ def _measured(
             env.network, env.agents, starts, delivered, progress=lambda share: progress(SOLVING * share)
         )
         proved: list[Floats | None] = []
-        for place, run in enumerate(rollouts):
+        for run in rollouts:
             proved.append(measure.at(starts, run.episode_service))
-            progress(SOLVING + (1 - SOLVING) * (place + 1) / len(rollouts))
+            progress(SOLVING + (1 - SOLVING) * len(proved) / len(rollouts))
         return measure, proved
     except NoCertificate as missing:
         progress(1.0)

@@ -91,7 +91,7 @@ def pareto(
         seeds: training seeds 0, 1, … of each weight.
         steps: environment steps of each training; None is the recipe's.
         episodes: fresh episodes on which each policy is evaluated.
-        progress: called with what is being done and the share of all that is done.
+        progress: as for ``compare``.
 
     Raises:
         CirlError: for input that cannot be used, or a reward in which the weight has no part.

@@ -77,28 +77,21 @@ class Demonstrator:
             self.act()
         except CirlError as error:
             raise RecipeError(f"{title}: demonstrations by {self.name} control: {error}") from error
-        if isinstance(self._controller, Scripted):
-            known = self._controller.scripted
-            if not set(agents) & set(known):
-                raise RecipeError(
-                    f"{title}: demonstrations by scripted control: there is no script for it; "
-                    f"there are scripts for {', '.join(known) or 'no agent of this network'}"
-                )
+        if isinstance(self._controller, Scripted) and not set(agents) & set(known := self._controller.scripted):
+            raise RecipeError(
+                f"{title}: demonstrations by scripted control: there is no script for it; "
+                f"there are scripts for {', '.join(known) or 'no agent of this network'}"
+            )
 
     def act(self) -> Arrays:
         """Return the actions of all agents in the current state of the environment."""
         state = self.env.physical
         if state is not self._state:
-            if self.idle or not state.step.any():
-                self._begin()
+            if self.idle or (state is not self._began and not state.step.any()):
+                self._controller.start(self.env, self._seed)
+                self._began, self._seed = self.env.physical, self._seed + 1
             self._state, self._actions = state, self._controller.act(self.env.observations())
         return self._actions
-
-    def _begin(self) -> None:
-        if self.env.physical is not self._began:
-            self._controller.start(self.env, self._seed)
-            self._began = self.env.physical
-            self._seed += 1
 
 
 def in_copies(name: str, envs: Sequence[gymnasium.Env[Any, Any]], seeds: Sequence[int]) -> Act:

@@ -56,7 +56,6 @@ class Learner:
         spec: its part of the recipe.
         seat: its view of the environment, from which it has its name.
         env: the seat, behind ``VecNormalize`` if the recipe normalises.
-        streams: its random streams.
         model: the algorithm, as Stable-Baselines3 made it.
         demonstrator: whom it follows before it acts itself; None if it needs nobody.
     """

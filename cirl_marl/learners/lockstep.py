@@ -35,10 +35,8 @@ class Interrupted(Exception):
 class Lockstep:
     """Seats the learners of one batched environment and lets them run together.
 
-    Attributes:
-        env: the joint environment.
-        seats: by name of the learner, in the order in which learners are resumed.
-        joint_steps: control intervals done, each in every copy, those of a run that is resumed included.
+    Learners are resumed in the order of ``seats``. ``joint_steps`` are control intervals done, each in every copy,
+    those of a run that is resumed included.
     """
 
     def __init__(

@@ -134,12 +134,9 @@ class Match(LearnerSettings):
     def fits(self, agent: str, network: Network) -> bool:
         """Return whether the match names ``agent``."""
         compartment = network.compartments[agent]
-        is_node = isinstance(compartment, Node)
-        return (
-            (self.agents is None or agent in self.agents)
-            and (self.kind is None or (self.kind == "node") == is_node)
-            and (self.role is None or (isinstance(compartment, Node) and compartment.role == self.role))
-        )
+        kind, role = ("node", compartment.role) if isinstance(compartment, Node) else ("arc", None)
+        named = self.agents is None or agent in self.agents
+        return named and self.kind in (None, kind) and self.role in (None, role)
 
 
 class Run(Settings):

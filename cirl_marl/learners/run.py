@@ -237,14 +237,9 @@ class MetricsFile:
                 raise RunError(f"{path}: cannot be read: {error}") from error
         text = "".join(",".join(row) + "\n" for row in rows)
         write_atomically(path, lambda temporary: temporary.write_text(text))
-        self._file = path.open("a", newline="")
-        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._path = path
 
     def append(self, row: Sequence[float]) -> None:
-        """Write a row and flush it."""
-        self._writer.writerow([f"{value:.10g}" for value in row])
-        self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Write a row."""
+        with self._path.open("a", newline="") as file:
+            file.write(",".join(f"{value:.10g}" for value in row) + "\n")

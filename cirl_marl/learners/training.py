@@ -117,8 +117,6 @@ class Training:
         else:
             self._save("complete")
         finally:
-            if self._metrics is not None:
-                self._metrics.close()
             for learner in self.learners.values():
                 learner.model.logger.close()
 

@@ -54,13 +54,9 @@ class BestKnown:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperEnvironment:
-    """One environment of the paper.
+    """One environment of the paper, in which every algorithm was trained for ``steps``.
 
     Attributes:
-        name: as in the id ``cirl_marl/NAME-v0``.
-        steps: training steps of every algorithm.
-        runs: by algorithm, what the paper reports.
-        optima: best known returns.
         success_episodes: evaluation episodes over which successes are counted; 0 if there is no success.
         published_ends: whether the published class ends its episodes as ``legacy_episode=True`` does.
         comparable: whether returns may be set against the paper's.

@@ -20,14 +20,9 @@ def planned(
     seeds: int = 1,
     settings: str | None = "published",
 ) -> list[PaperRow]:
-    """Return the rows that the names choose.
+    """Return the rows that the names choose; None chooses all, the paper's steps, or both settings.
 
-    Args:
-        environment: name in the paper; None chooses all eight.
-        algorithm: name in the paper; None chooses all that it ran there.
-        steps: environment steps of each row; None takes the paper's.
-        seeds: seeds 0, 1, … of each row.
-        settings: ``published``, ``tuned``, or None for both.
+    Each has the seeds 0, 1, … below ``seeds``.
 
     Raises:
         CirlError: for a name that does not exist, or a combination that the paper did not run.

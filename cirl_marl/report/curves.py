@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
-from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dressed, save, spoken
+from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dressed, save, shaped, spoken
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law
@@ -125,17 +125,17 @@ def save_trajectory(
         CirlError: if an array has the wrong shape.
     """
     steps, mass = (len(time),), network.mass_unit
-    stock = _shaped("stock", stock, (len(network.nodes), *steps))
-    flow = _shaped("flow", flow, (len(network.arcs), *steps))
-    circularity = _shaped("circularity", circularity, steps)
+    stock = shaped("stock", stock, (len(network.nodes), *steps))
+    flow = shaped("flow", flow, (len(network.arcs), *steps))
+    circularity = shaped("circularity", circularity, steps)
     held = [node.id for node in network.nodes]
     if load is not None:
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {arc}" for arc in on_the_way]
-        stock = np.concatenate([stock, _shaped("load", load, (len(on_the_way), *steps))])
+        stock = np.concatenate([stock, shaped("load", load, (len(on_the_way), *steps))])
     held_at = time
     if start is not None:
-        stock = np.column_stack([_shaped("start", start, (len(stock),)), stock])
+        stock = np.column_stack([shaped("start", start, (len(stock),)), stock])
         held_at = np.concatenate([[0.0], time])
     heights = (1.25, 1.25, 0.8) if service is None else (1.25, 1.25, 0.8, 0.5)
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
@@ -146,7 +146,7 @@ def save_trajectory(
     _draw_mean(panels[2], time, circularity, "", 0)
     dressed(panels[2], title="Circularity", ylabel=f"λ / {mass}")
     if service is not None:
-        _draw_mean(panels[3], time, _shaped("service", service, steps), "", 0)
+        _draw_mean(panels[3], time, shaped("service", service, steps), "", 0)
         dressed(panels[3], title="Service level", ylabel="service level")
         panels[3].set_ylim(-0.03, 1.06)
     _set_time(panels[-1], held_at, network)
@@ -181,13 +181,6 @@ def save_fronts(
     axes.set_xlabel("mean service level", fontsize=9)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
     return save(figure, path)
-
-
-def _shaped(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
-    found = np.asarray(values, dtype=float)
-    if found.shape != shape:
-        raise CirlError(f"{name} has shape {found.shape}, expected {shape}")
-    return found
 
 
 def _matching(name: str, values: Floats, time: Floats) -> Floats:
