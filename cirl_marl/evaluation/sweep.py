@@ -122,11 +122,7 @@ def pareto(
         each = (1 - share) / (points * seeds)
         told = part_of(progress, f"training {asked}", share + each * place, each)
         runs.append(asked.run(directory / "runs", told))
-    groups = [runs[first : first + seeds] for first in range(0, len(runs), seeds)]
-    learnt = [point for group in groups for point in _learnt(group, episodes)]
-    trained = [each for each in learnt if each.kind == "trained"]
-    neutral = [each for each in learnt if each.kind == "neutral"][:1]
-    return Sweep(found, chosen, (*possible, *trained, *neutral), tuple(runs), reason, front)
+    return Sweep(found, chosen, (*possible, *_learnt(runs, episodes)), tuple(runs), reason, front)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +210,7 @@ def _levels(least: float, most: float, points: int) -> list[float]:
 
 
 def _learnt(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
-    """Yield where the policies of one weight are, and neutral control."""
+    """Yield where the policies are, and neutral control."""
     for entry in compare(runs, ["neutral"], episodes=episodes, bounds=False).entries:
         yield Point(
             kind="neutral" if entry.run is None else "trained",

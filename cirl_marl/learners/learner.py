@@ -143,11 +143,6 @@ class Learner:
         steps = 0 if asked is None else asked.steps * (self.seat.num_envs // self.seat.copies)
         return steps if steps > self.model.num_timesteps else 0
 
-    def follow(self, demonstrator: Demonstrator) -> None:
-        """Let ``demonstrator`` act first; a ``RecipeError`` if it cannot act for this learner."""
-        demonstrator.check(self.seat.view.agents, self.seat.title)
-        self.demonstrator = demonstrator
-
     def learn(self, steps: int, callback: BaseCallback | None) -> None:
         """Run the algorithm's own ``learn()`` up to its share of ``steps``, counting what it had learnt before.
 

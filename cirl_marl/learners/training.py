@@ -86,8 +86,9 @@ class Training:
             asked = learner.spec.demonstrations
             if asked is not None and learner.demonstrations:
                 seed = derived_seed(self.config.seed, "demonstrations", asked.controller, self.done)
-                known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
-                learner.follow(known[asked.controller])
+                leader = known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
+                leader.check(learner.seat.view.agents, learner.seat.title)
+                learner.demonstrator = leader
 
     def start(
         self, *, callbacks: Mapping[str, BaseCallback] | None = None, report: Callable[[Progress], None] | None = None
