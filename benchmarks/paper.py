@@ -24,12 +24,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from benchmarks.paper_document import markdown
+from cirl_marl.cli.common import shares
 from cirl_marl.errors import CirlError
 from cirl_marl.paper.published import BOX_ALGORITHMS, GOAL_ALGORITHMS
 from cirl_marl.paper.results import PaperRow, Results
 from cirl_marl.paper.running import outdated
 from cirl_marl.paper.selection import minutes, overview, planned
-from cirl_marl.paper.session import live_bar
 from cirl_marl.paper.table import result_line
 
 console = Console(width=None if sys.stdout.isatty() else 140)
@@ -246,8 +246,8 @@ def _stop(_signal: int, _frame: FrameType | None) -> None:
 def _compare_speed(steps: int) -> None:
     from benchmarks.paper_speed import compare, speed_table
 
-    with live_bar(console, "CopperNet") as report:
-        found = compare(steps, report)
+    with shares() as told:
+        found = compare(steps, lambda what, done, total: told(f"CopperNet: {what}", done / total))
     console.print(speed_table(found), soft_wrap=True, markup=False)
 
 

@@ -9,12 +9,10 @@ import numpy as np
 from benchmarks.document import markdown_table
 from cirl_marl.learners import load_recipe
 from cirl_marl.learners.training import one_torch_thread
-from cirl_marl.paper.final_policy import Report
 from cirl_marl.paper.published import HARDWARE, environment_of
 from cirl_marl.paper.results import WINDOW, PaperRow
 from cirl_marl.paper.table import number
-from cirl_marl.paper.tuned import train_tuned
-from cirl_marl.paper.untuned import PaperTraining, train_published
+from cirl_marl.paper.training import PaperTraining, Report, train_published, train_tuned
 
 ENVIRONMENT = "CopperNet"
 RECIPES = (("A2C", "independent_a2c"), ("PPO", "independent_ppo"), ("PPO", "paper_copper_net"))

@@ -20,7 +20,7 @@ from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.contenders import differences
-from cirl_marl.evaluation.provenance import provenance
+from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.statistics import interquartile_mean
 from cirl_marl.evaluation.sweep import pareto
 from cirl_marl.learners import Progress, Recipe, RunDirectory, Training, load_recipe, resume, train

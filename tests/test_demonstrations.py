@@ -26,7 +26,7 @@ from cirl_marl.learners.views import View
 from cirl_marl.optimum.named import CONTROLLERS, named_controller
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import PaperRow
-from cirl_marl.paper.tuned import train_tuned
+from cirl_marl.paper.training import train_tuned
 
 HORIZON, COPIES, SEED = 4, 2, 5
 AGENTS = ("mine", "use", "use_to_collection")

@@ -25,7 +25,7 @@ from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Rec
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.trained import Trained
 from cirl_marl.learners.training import Training
-from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, WithState, unseen_state
+from cirl_marl.learners.views import AllAtOnce, OneAgent, SharedPolicy, View, unseen_state, view_of
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -70,7 +70,7 @@ def test_views_lose_nothing(network: Network, copies: int, seed: int) -> None:
     rewards = {agent: rng.normal(size=copies) for agent in env.agents}
     views: list[View] = [SharedPolicy(env, env.agents), AllAtOnce(env, env.agents)]
     views += [OneAgent(env, agent) for agent in env.agents]
-    for view in [*views, *(WithState(env, view) for view in views)]:
+    for view in [*views, *(view_of(env, env.agents, scheme, with_state=True) for scheme in ("shared", "joint"))]:
         rows = view.observe(observations, env.state)
         if isinstance(rows, dict):
             assert (rows["state"][:copies] == env.state()).all() and (rows["state"][-copies:] == env.state()).all()
@@ -147,7 +147,7 @@ def test_rows_of_a_seat_are_agents_in_copies() -> None:
     """Time limits, returns and attributes of a row are those of its agent and copy; the last state as well."""
     env = vector_env("copper_net", num_envs=2, horizon=3)
     by_hand = vector_env("copper_net", num_envs=2, horizon=3)
-    lockstep = Lockstep(env, [1, 2], {"all": WithState(env, SharedPolicy(env, env.agents))})
+    lockstep = Lockstep(env, [1, 2], {"all": SharedPolicy(env, env.agents).with_state(env)})
     seat, count = lockstep.seats["all"], len(env.agents)
     by_hand.reset(seed=[1, 2])
     assert seat.get_attr("agent") == [agent for agent in env.agents for _ in range(2)]
@@ -188,7 +188,7 @@ def test_rows_of_a_seat_are_agents_in_copies() -> None:
 def central_critic() -> PPO:
     """Return PPO with a central critic on a toy view."""
     env = vector_env("carbo_net", num_envs=2)
-    lockstep = Lockstep(env, [0, 1], {"all": WithState(env, SharedPolicy(env, env.agents))})
+    lockstep = Lockstep(env, [0, 1], {"all": SharedPolicy(env, env.agents).with_state(env)})
     return PPO(CentralCriticPolicy, lockstep.seats["all"], seed=0, device="cpu", **SMALL)
 
 
@@ -230,7 +230,7 @@ def test_trained_actors_need_no_state(tmp_path: Path) -> None:
     controller.start(env, 9)
     got = controller.act(observations)
     learnt = training.learners["shared-learner"]
-    view = WithState(env, SharedPolicy(env, env.agents))
+    view = SharedPolicy(env, env.agents).with_state(env)
     rows = view.observe(observations, env.state)
     normalised: Any = learnt.env.normalize_obs(rows)  # type: ignore[attr-defined]
     expected = view.act(learnt.model.predict(normalised, deterministic=True)[0])

@@ -23,15 +23,13 @@ from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
 from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.learners.algorithms import build
-from cirl_marl.paper import final_policy, published, running, session, tuned, untuned
-from cirl_marl.paper.final_policy import evaluate
+from cirl_marl.paper import published, running, training
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
 from cirl_marl.paper.results import Evaluation, PaperRow, Result, Results, thinned
-from cirl_marl.paper.running import outdated, run_row
+from cirl_marl.paper.running import evaluate, outdated, run_row
 from cirl_marl.paper.selection import planned
 from cirl_marl.paper.table import table_rows
-from cirl_marl.paper.tuned import train_tuned
-from cirl_marl.paper.untuned import PaperTraining, described
+from cirl_marl.paper.training import PaperTraining, described, train_tuned
 
 COPPER = ENVIRONMENTS["CopperNet"]
 
@@ -144,7 +142,7 @@ def test_row_is_trained_kept_and_not_run_again(
     assert kept["end_return"] == pytest.approx(returns[-half:].mean())
     assert (returns < 0).all()
 
-    monkeypatch.setattr(session, "run_row", lambda *_, **__: pytest.fail("the row was run again"))
+    monkeypatch.setattr(running, "run_row", lambda *_, **__: pytest.fail("the row was run again"))
     assert cirl(monkeypatch, *arguments) == 0
     assert capsys.readouterr().out.partition("\n") == (f"rows: 1, done: 1; results in {tmp_path}", "\n", shown)
 
@@ -170,7 +168,7 @@ def test_weights_that_become_nan_are_a_result(
     def wild(name: str, policy: str, env: VecEnv, parameters: dict[str, Any], **fixed: Any) -> BaseAlgorithm:
         return build(name, policy, env, parameters | {"learning_rate": 1e30}, **fixed)
 
-    monkeypatch.setattr(untuned, "build", wild)
+    monkeypatch.setattr(training, "build", wild)
     arguments = (algorithm, "--steps", "10000", "--out", str(tmp_path))
     assert cirl(monkeypatch, *arguments) == 0
     assert "weights NaN after" in capsys.readouterr().out
@@ -204,7 +202,7 @@ def test_a_session_goes_on_after_a_row_that_fails(
             raise CirlError("no training episode ended")
         return replace(result(row.algorithm), row=row)
 
-    monkeypatch.setattr(session, "run_row", run)
+    monkeypatch.setattr(running, "run_row", run)
     assert cirl(monkeypatch, "--steps", "200", "--out", str(tmp_path)) == 1
     shown = capsys.readouterr().out
     assert "CopperNet A2C (published, 200 steps, seed 0): failed: no training episode ended" in shown
@@ -225,11 +223,14 @@ def test_recipes_of_other_versions_are_outdated() -> None:
     assert "another now" in outdated(replace(found, settings={"recipe": recorded | {"gone": 1}}))
 
 
-def test_other_failures_of_a_training_are_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_failures_of_a_training_are_no_result() -> None:
     """Only broken weights are what the settings give; anything else that goes wrong is said."""
-    monkeypatch.setattr(untuned.Watch, "_on_step", lambda _: int("none"))
-    with pytest.raises(ValueError, match="invalid literal"):
-        run_row(PaperRow(environment="CopperNet", algorithm="SAC", steps=200))
+
+    def broken(*_: object) -> None:
+        raise ValueError("not of NaN")
+
+    with pytest.raises(ValueError, match="not of NaN"):
+        run_row(PaperRow(environment="CopperNet", algorithm="SAC", steps=200), report=broken)
 
 
 def test_interrupted_row_leaves_nothing(
@@ -242,7 +243,7 @@ def test_interrupted_row_leaves_nothing(
     def interrupted(*_: Any, **__: Any) -> Result:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "run_row", interrupted)
+    monkeypatch.setattr(running, "run_row", interrupted)
     assert cirl(monkeypatch, "A2C", "--seeds", "2", "--out", str(tmp_path)) == 130
     assert "The same command goes on" in capsys.readouterr().out
     assert results.all() == [result()]
@@ -415,7 +416,7 @@ def test_results_need_a_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A path that cannot be one is refused before anything is trained."""
-    monkeypatch.setattr(session, "run_row", lambda *_, **__: pytest.fail("a row was run"))
+    monkeypatch.setattr(running, "run_row", lambda *_, **__: pytest.fail("a row was run"))
     (tmp_path / "file").touch()
     assert cirl(monkeypatch, "A2C", "--out", str(tmp_path / "file")) == 2
     assert f"{tmp_path / 'file'}: results need a directory" in capsys.readouterr().err
@@ -465,7 +466,7 @@ def test_tuned_policy_is_measured_behind_its_normaliser(monkeypatch: pytest.Monk
         kept.append(train(*arguments, **options))
         return kept[-1]
 
-    monkeypatch.setattr(tuned, "train", keeping)
+    monkeypatch.setattr(training, "train", keeping)
     row = PaperRow(environment="CopperNet", algorithm="PPO", settings="tuned", steps=200)
     trained = train_tuned(COPPER, row, lambda *_: None, recipe("PPO", n_steps=50, batch_size=100))
     (learner,) = kept[0].learners.values()
@@ -514,7 +515,7 @@ def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monk
         options={},
     )
     monkeypatch.setattr(running, "train_published", lambda *_: done)
-    monkeypatch.setattr(final_policy, "EVALUATION_EPISODES", 20)
+    monkeypatch.setattr(running, "EVALUATION_EPISODES", 20)
     found = run_row(PaperRow(environment="CopperNet", algorithm="A2C", steps=50 * episodes))
     assert found.start_return == pytest.approx(np.mean(returns[:window]))
     assert found.end_return == pytest.approx(np.mean(returns[-window:]))

@@ -18,9 +18,9 @@ from cirl_marl import VectorEnv
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING, rollout
 from cirl_marl.network import Floats
-from cirl_marl.paper.final_policy import EVALUATION_COPIES, EVALUATION_EPISODES, evaluate
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import Result, Results
+from cirl_marl.paper.running import EVALUATION_COPIES, EVALUATION_EPISODES, evaluate
 
 KEPT = Path(__file__).parent.parent / "benchmarks" / "results" / "paper"
 NETWORKS = {"CarboNet": "carbo_net", "CopperNet": "copper_net"}

@@ -51,11 +51,7 @@ def say(line: str) -> None:
 
 
 def folder_for(path: Path, option: str) -> Path:
-    """Return ``path``, which is or can become a folder.
-
-    Raises:
-        CirlError: if it is something else.
-    """
+    """Return ``path``, which is or can become a folder; a ``CirlError`` names the option if it is something else."""
     if path.exists() and not path.is_dir():
         raise CirlError(f"{option} {path}: is a file, not a folder")
     return path
@@ -72,7 +68,7 @@ def bar(what: str) -> Iterator[Callable[[float], None]]:
 def shares() -> Iterator[Callable[[str, float], None]]:
     """Progress bar of several things; the yielded function takes what is being done and the share of all done."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("preparing", total=1.0)
         yield lambda what, share: progress.update(task, description=what, completed=share)
 
@@ -95,6 +91,13 @@ def training_bar() -> Iterator[Any]:
         shown = clock.perf_counter()
         state: Any = None
 
+        def show() -> None:
+            done, speed = min(state.env_steps, state.total), state.env_steps / max(state.seconds, 1e-9)
+            progress.update(task, completed=done, total=state.total, speed=speed)
+            if not live:
+                figures = f"λ {state.circularity:.4g}, service {state.service_level:.3f}"
+                console.print(f"{done:,}/{state.total:,} steps, {speed:,.0f} environment steps/s, {figures}")
+
         def update(now: Any) -> None:
             nonlocal shown, state
             state = now
@@ -103,23 +106,8 @@ def training_bar() -> Iterator[Any]:
                 progress.update(task, circularity=circularity, service=service)
             if clock.perf_counter() - shown > (0.2 if live else 10.0):
                 shown = clock.perf_counter()
-                progress.update(task, completed=now.env_steps, total=now.total, speed=_speed(now))
-                if not live:
-                    _say(now)
+                show()
 
         yield update
         if state is not None:
-            progress.update(task, completed=state.total, total=state.total, speed=_speed(state))
-            if not live:
-                _say(state)
-
-
-def _speed(state: Any) -> float:
-    return float(state.env_steps / max(state.seconds, 1e-9))
-
-
-def _say(state: Any) -> None:
-    console.print(
-        f"{min(state.env_steps, state.total):,}/{state.total:,} steps, {_speed(state):,.0f} environment steps/s, "
-        f"λ {state.circularity:.4g}, service {state.service_level:.3f}"
-    )
+            show()

@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from cirl_marl.cli.common import (
-    EpisodeCount,
-    MinService,
-    NetworkName,
-    Scenario,
-    Seed,
-    app,
-    console,
-    folder_for,
-    listed,
-    say,
-    shares,
-)
+from cirl_marl.cli import common
+from cirl_marl.cli.common import EpisodeCount, MinService, NetworkName, Scenario, Seed, app, console, say, shares
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.optimum.named import CONTROLLERS
 
@@ -53,25 +42,16 @@ def compare(
     from cirl_marl.evaluation import compare as compared
     from cirl_marl.report.comparison import comparison_notes, comparison_table, write_comparison
 
-    names = listed(controllers)
-    folder = None if out is None else folder_for(out, "--out")
+    names = common.listed(controllers)
+    folder = None if out is None else common.folder_for(out, "--out")
+    asked: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service}
     with shares() as progress:
-        found = compared(
-            runs or [],
-            names,
-            network=network,
-            scenario=scenario,
-            episodes=episodes,
-            seed=seed,
-            min_service=min_service,
-            progress=progress,
-        )
+        found = compared(runs or [], names, network=network, scenario=scenario, progress=progress, **asked)
     console.print(comparison_table(found))
     for note in comparison_notes(found):
         say(note)
     if folder is not None:
-        asked = {"controllers": names, "episodes": episodes, "seed": seed, "min_service": min_service}
-        for path in write_comparison(found, folder, **asked):
+        for path in write_comparison(found, folder, controllers=names, **asked):
             say(f"wrote {path}")
 
 
@@ -100,20 +80,11 @@ def pareto(
     from cirl_marl.evaluation.sweep import pareto as swept
     from cirl_marl.report.sweep import write_sweep
 
-    folder = folder_for(out or Path("runs") / f"pareto-{load_network(network).name}", "--out")
+    folder = common.folder_for(out or Path("runs") / f"pareto-{load_network(network).name}", "--out")
+    asked: dict[str, Any] = {"points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
     try:
         with shares() as progress:
-            found = swept(
-                network,
-                recipe,
-                directory=folder,
-                scenario=scenario,
-                points=points,
-                seeds=seeds,
-                steps=steps,
-                episodes=episodes,
-                progress=progress,
-            )
+            found = swept(network, recipe, directory=folder, scenario=scenario, progress=progress, **asked)
     except KeyboardInterrupt:
         say(f"\nstopped; finished trainings are kept in {folder}. The same command goes on.")
         raise typer.Exit(130) from None
@@ -123,6 +94,5 @@ def pareto(
             say(f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {found.network.mass_unit}{about}")
     if found.reason:
         say(f"no bound: {found.reason}")
-    asked = {"recipe": recipe, "points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
-    for path in write_sweep(found, folder, **asked):
+    for path in write_sweep(found, folder, recipe=recipe, **asked):
         say(f"wrote {path}")

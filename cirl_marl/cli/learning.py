@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,9 @@ from cirl_marl.cli.common import EpisodeCount, RunPath, Scenario, Seed, app, con
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network.elements import OBSERVE, REWARDS
+
+if TYPE_CHECKING:
+    from cirl_marl.paper.results import PaperRow, Results
 
 
 @app.command()
@@ -47,24 +50,14 @@ def train(
     directory = resume or out
     if directory is None:
         directory = Path("runs") / f"{load_network(str(network)).name}-{Path(recipe).stem}-seed{seed}"
+    options: dict[str, Any] = {"steps": steps, "envs": envs, "seed": seed, "scenario": scenario, "reward": reward}
+    options |= {"observe": observe, "agents": None if agents is None else listed(agents)}
     with training_bar() as report:
         try:
             if resume is not None:
                 training = learners.resume(resume, steps=steps, report=report)
             else:
-                training = learners.train(
-                    str(network),
-                    recipe,
-                    directory=directory,
-                    steps=steps,
-                    envs=envs,
-                    seed=seed,
-                    agents=None if agents is None else listed(agents),
-                    scenario=scenario,
-                    reward=reward,
-                    observe=observe,
-                    report=report,
-                )
+                training = learners.train(str(network), recipe, directory=directory, report=report, **options)
         except KeyboardInterrupt:
             console.print(f"\nstopped; {_kept(directory)}", soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None
@@ -113,19 +106,52 @@ def paper(
     ),
 ) -> None:
     """Repeat the CiRL paper's training runs, half a day in all, and show their figures beside the published ones."""
+    from cirl_marl.paper.published import ENVIRONMENTS
     from cirl_marl.paper.results import Results
-    from cirl_marl.paper.selection import planned
-    from cirl_marl.paper.session import run_session
+    from cirl_marl.paper.running import outdated
+    from cirl_marl.paper.selection import overview, planned
+    from cirl_marl.paper.table import environment_table, result_line
+    from cirl_marl.paper.training import check_registered
 
-    rows = planned(environment, algorithm, steps=steps, seeds=seeds, settings=settings)
-    try:
-        failed = run_session(rows, Results(out), console, episodes=episodes)
-    except KeyboardInterrupt:
-        message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
-        console.print(message, soft_wrap=True, highlight=False)
-        raise typer.Exit(130) from None
+    rows, results = planned(environment, algorithm, steps=steps, seeds=seeds, settings=settings), Results(out)
+    environments = [ENVIRONMENTS[name] for name in dict.fromkeys(row.environment for row in rows)]
+    for found in environments:
+        check_registered(found)
+    results.prepare()
+    changed = {row: outdated(results.read(row), episodes) for row in rows if results.has(row)}
+    left = [row for row in rows if row not in changed or changed[row]]
+    say(f"{overview(rows, left)}; results in {results.path}")
+    failed = False
+    for i, row in enumerate(rows):
+        if changed.get(row):
+            say(f"{row}: once more, as {changed[row]}")
+        try:
+            if row in left:
+                _run_row(row, f"{i + 1} of {len(rows)}", results, episodes)
+            say(result_line(results.read(row)))
+        except CirlError as error:
+            failed = True
+            say(f"{row}: failed: {error}")
+        except KeyboardInterrupt:
+            say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
+            raise typer.Exit(130) from None
+    kept, asked = results.all(), {(row.environment, row.algorithm, row.settings) for row in rows}
+    for found in environments:
+        fit = [r for r in kept if r.row in rows or (r.row.environment, r.row.algorithm, r.row.settings) not in asked]
+        console.print(environment_table(found, fit))
     if failed:
         raise typer.Exit(1)
+
+
+def _run_row(row: PaperRow, place: str, results: Results, episodes: int | None) -> None:
+    """Train and evaluate a row of the paper's tables and keep the result."""
+    from cirl_marl.paper.running import run_row
+
+    title = f"{place}: {row.environment} {row.algorithm}, seed {row.seed}"
+    with shares() as told:
+        results.write(
+            run_row(row, report=lambda what, n, total: told(f"{title}: {what}", n / total), episodes=episodes)
+        )
 
 
 def _only_resume(context: typer.Context) -> None:

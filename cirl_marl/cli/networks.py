@@ -291,12 +291,11 @@ def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> No
     held = [*start.stock[env.rows.nodes, 0].tolist(), *[""] * len(network.arcs)]
     held += [*env.dynamics.batches.loads(start.stock)[:, 0].tolist(), *start.inner[physics.visible, 0].tolist()]
 
+    columns = (time, run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
+
     def write(target: Path) -> None:
         with target.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(header)
-            writer.writerow([0.0, "", "", *held])
-            columns = (time, run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
-            writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+            rows = zip(*(column.tolist() for column in columns), strict=True)
+            csv.writer(file).writerows([header, [0.0, "", "", *held], *rows])
 
     write_atomically(path, write)

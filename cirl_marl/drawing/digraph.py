@@ -1,7 +1,8 @@
-"""Pictures of a material network: as a file, two side by side, or frame by frame."""
+"""Pictures of a material network: as a file, two side by side, or frame by frame in a window."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,46 @@ from numpy.typing import NDArray
 
 from cirl_marl.drawing.picture import draw_network, largest_flow, legend_of
 from cirl_marl.drawing.style import number, save, spoken
-from cirl_marl.drawing.window import Window
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 
 __all__ = ["Canvas", "draw_network", "save_before_after", "save_network"]
 
 FRAME_INCHES = (9.0, 6.2)
 FRAME_DPI = 100
+
+
+class Window:
+    """A pygame window of fixed size; it opens with the first picture."""
+
+    def __init__(self, caption: str) -> None:
+        """Check that pygame is there; a ``CirlError`` if not."""
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # pygame greets on stdout otherwise
+        try:
+            import pygame
+        except ImportError as missing:
+            raise CirlError(
+                "render_mode 'human' needs pygame: install the extra, pip install 'cirl-marl[human]'"
+            ) from missing
+        self._pygame = pygame
+        self._caption = caption
+        self._screen: pygame.Surface | None = None
+
+    def show(self, image: NDArray[np.uint8]) -> None:
+        """Show an image, shape (height, width, 3)."""
+        if self._screen is None:
+            self._pygame.display.init()
+            self._screen = self._pygame.display.set_mode((image.shape[1], image.shape[0]))
+            self._pygame.display.set_caption(self._caption)
+        self._pygame.event.pump()
+        self._pygame.surfarray.blit_array(self._screen, image.swapaxes(0, 1))
+        self._pygame.display.flip()
+
+    def close(self) -> None:
+        """Close the window; it opens again with the next picture."""
+        if self._screen is not None:
+            self._pygame.display.quit()
+            self._screen = None
 
 
 class Canvas:
@@ -28,15 +62,7 @@ class Canvas:
     """
 
     def __init__(self, network: Network, *, window: bool) -> None:
-        """Prepare the picture.
-
-        Args:
-            network: what to draw.
-            window: whether to show each picture in a window too.
-
-        Raises:
-            CirlError: if a window is wanted and pygame is not installed.
-        """
+        """Prepare pictures of ``network``; a ``CirlError`` if a window is wanted and pygame is not installed."""
         self._network = network
         self._window = Window(spoken(network.name)) if window else None
         self._reference = max((arc.scale for arc in network.arcs), default=0.0)
@@ -47,11 +73,7 @@ class Canvas:
     def draw(self, stock: Floats, flow: Floats, time: float, circularity: float | None = None) -> NDArray[np.uint8]:
         """Return the picture, shape (height, width, 3), and show it if there is a window.
 
-        Args:
-            stock: stocks, shape (nodes,), mass.
-            flow: flows, shape (arcs,), mass/time.
-            time: time of the stocks, for the heading.
-            circularity: λ, mass; see ``draw_network``.
+        ``time`` is that of the stocks, for the heading; for the others see ``draw_network``.
         """
         network = self._network
         reference = max(self._reference, largest_flow(flow))
@@ -75,16 +97,7 @@ def save_network(
 ) -> Path:
     """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide, and return its path.
 
-    Args:
-        path: file to write; its folder is made.
-        network: the network.
-        stock: stocks, shape (nodes,), mass.
-        flow: flows, shape (arcs,), mass/time.
-        title: heading; empty takes that of the network.
-        circularity: λ, mass; see ``draw_network``.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
+    Its folder is made; without a title it has that of the network. For the other arguments see ``draw_network``.
     """
     figure = Figure(figsize=FRAME_INCHES)
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.87))
@@ -109,9 +122,6 @@ def save_before_after(
         after: the same, later or under other control.
         labels: headings of the two.
         circularity: λ of the two, mass; see ``draw_network``.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
     """
     figure = Figure(figsize=(9.0, 5.6))
     reference = max(largest_flow(np.asarray(flow)) for _, flow in (before, after))

@@ -11,10 +11,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from cirl_marl.drawing.arrangement import Arrangement, arrangement_of
-from cirl_marl.drawing.routing import Routes, bezier
-from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, ROLE_NAMES, WARNING, number, spoken
-from cirl_marl.errors import CirlError
+from cirl_marl.drawing.arrangement import Arrangement, Routes, arrangement_of, bezier
+from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, WARNING, number, shaped, spoken
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law, Role
 
@@ -62,11 +60,10 @@ def draw_network(
     Raises:
         CirlError: if an array has the wrong shape.
     """
-    stock, flow = _checked("stock", stock, len(network.nodes)), _checked("flow", flow, len(network.arcs))
+    stock, flow = shaped("stock", stock, (len(network.nodes),)), shaped("flow", flow, (len(network.arcs),))
     reference = largest_flow(flow) if reference_flow is None else reference_flow
     share = np.clip(np.nan_to_num(np.abs(flow)) / max(reference, 1e-12), 0, BROADEST)
-    width, height = _inches(axes)
-    layout = arrangement_of(network, width / height)
+    layout = arrangement_of(network, axes.bbox.width / axes.bbox.height)
     axes.clear()
     axes.set_axis_off()
     em = _frame(axes, layout, legend)
@@ -93,8 +90,8 @@ def legend_of(network: Network) -> dict[str, Any]:
     roles = dict.fromkeys(node.role for node in sorted(network.nodes, key=lambda n: list(Role).index(n.role)))
     patches: dict[str, str] = {}
     for role in roles:
-        colour = ROLE_COLOURS[role]
-        patches[colour] = f"{patches[colour]}, {ROLE_NAMES[role]}" if colour in patches else ROLE_NAMES[role]
+        colour, name = ROLE_COLOURS[role], spoken(role).replace("nonrenewable", "non-renewable")
+        patches[colour] = f"{patches[colour]}, {name}" if colour in patches else name
     sign = network.sustainability
     arrows = {WARNING: "flow that lowers λ", GOOD: "flow that raises λ", NEUTRAL: "other flow"}
     used = {WARNING: (sign > 0).any(), GOOD: (sign < 0).any(), NEUTRAL: (sign == 0).any()}
@@ -103,22 +100,10 @@ def legend_of(network: Network) -> dict[str, Any]:
     return {"handles": handles, "frameon": False, "fontsize": 8, "labelcolor": MUTED, "handlelength": 1.2}
 
 
-def _checked(name: str, values: Floats, count: int) -> Floats:
-    found = np.asarray(values, dtype=float)
-    if found.shape != (count,):
-        raise CirlError(f"{name} has shape {found.shape}, expected {(count,)}")
-    return found
-
-
-def _inches(axes: Axes) -> tuple[float, float]:
-    """Width and height of the axes."""
-    return axes.bbox.width / axes.figure.dpi, axes.bbox.height / axes.figure.dpi
-
-
 def _frame(axes: Axes, layout: Arrangement, legend: bool) -> float:
     """Set limits in em around the digraph and return the size of one em in points."""
     low, high = layout.extent()
-    width, height = (72 * inches for inches in _inches(axes))
+    width, height = (72 * pixels / axes.figure.dpi for pixels in axes.bbox.size)
     strip = 30.0 if legend else 4.0
     em = min(width / (high[0] - low[0] + 1), (height - strip) / (high[1] - low[1] + 1))
     em = float(min(em, LARGEST_EM) if layout.routes is not None else em)
@@ -135,13 +120,10 @@ def _colours(network: Network) -> list[str]:
 
 def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, share: Floats, em: float) -> None:
     colours = _colours(network)
-    shapes = [
-        _arrow(curve if value >= 0 else curve[::-1], WIDEST * size)
-        for curve, value, size in zip(routes.curves, flow, share, strict=True)
-    ]
-    axes.add_collection(
-        PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.4, zorder=2), autolim=False
-    )
+    along = zip(routes.curves, flow, share, strict=True)
+    shapes = [_arrow(curve if value >= 0 else curve[::-1], WIDEST * size) for curve, value, size in along]
+    arrows = PolyCollection(shapes, facecolors=colours, edgecolors="white", linewidths=0.4, zorder=2)
+    axes.add_collection(arrows, autolim=False)
     halo = [withStroke(linewidth=0.25 * em, foreground="white")]
     ends = Counter((arc.donor, arc.recipient) for arc in network.arcs)
     for arc, (x, y), value, colour in zip(network.arcs, routes.labels, flow, colours, strict=True):
@@ -170,11 +152,11 @@ def _draw_boxes(axes: Axes, network: Network, layout: Arrangement, stock: Floats
     width, height = layout.box
     for node, (x, y), amount, name in zip(network.nodes, layout.positions, stock, layout.names, strict=True):
         corner, colour = (x - width / 2, y - height / 2), ROLE_COLOURS[node.role]
-        look = f"round,pad=0,rounding_size={0.5}"
+        look = "round,pad=0,rounding_size=0.5"
         axes.add_patch(FancyBboxPatch(corner, width, height, look, fc=_tint(colour, 0.25), ec="none", zorder=3))
         level = Rectangle(corner, width, height * _fill(amount, node.scale), fc=colour, ec="none", zorder=3.1)
-        axes.add_patch(level)
         edge = FancyBboxPatch(corner, width, height, look, fc="none", ec=_darker(colour), lw=0.1 * em, zorder=3.2)
+        axes.add_patch(level)
         axes.add_patch(edge)
         level.set_clip_path(edge)
         top = y + 0.6 * len(name)
@@ -206,13 +188,8 @@ def _draw_dots(axes: Axes, network: Network, layout: Arrangement, stock: Floats,
     colours, order = _colours(network), np.argsort(np.abs(network.sustainability), kind="stable")
     lines = bezier(*ends, np.full(len(network.arcs), 0.12), 12)
     thickest = min(2.5, 40 / math.sqrt(len(network.arcs)))
-    collection = LineCollection(
-        list(lines[order]),
-        colors=[colours[k] for k in order],
-        linewidths=np.clip(thickest * share[order], 0.15, None),
-        alpha=0.6,
-    )
-    axes.add_collection(collection, autolim=False)
+    inks, widths = [colours[k] for k in order], np.clip(thickest * share[order], 0.15, None)
+    axes.add_collection(LineCollection(list(lines[order]), colors=inks, linewidths=widths, alpha=0.6), autolim=False)
     fill = np.array([_fill(amount, node.scale) for amount, node in zip(stock, network.nodes, strict=True)])
     area = (0.6 * em * layout.box[1]) ** 2 * (0.15 + 0.85 * fill)
     faces = [ROLE_COLOURS[node.role] for node in network.nodes]

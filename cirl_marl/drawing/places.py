@@ -6,10 +6,8 @@ Everything here is deterministic: the same network gives the same places.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,20 +22,12 @@ RESTARTS = 6
 STRETCH = 1.6
 
 
-@dataclass(frozen=True, slots=True)
-class Pitch:
-    """Distance between the centres of neighbouring places, in em."""
-
-    across: float
-    down: float
-
-
-def place(network: Network, pitch: Pitch, aspect: float) -> Floats:
+def place(network: Network, pitch: Floats, aspect: float) -> Floats:
     """Return the centre of each node, in em.
 
     Args:
         network: whose nodes are placed.
-        pitch: distance between neighbouring places.
+        pitch: distance between the centres of neighbouring places, across and down, em.
         aspect: width over height that the picture should have.
 
     Returns:
@@ -52,48 +42,32 @@ def place(network: Network, pitch: Pitch, aspect: float) -> Floats:
     return positions
 
 
-def _stretched(cells: Floats, pitch: Pitch, aspect: float) -> Floats:
+def _stretched(cells: Floats, pitch: Floats, aspect: float) -> Floats:
     """Return the pitch widened, at most by ``STRETCH``, so that the cells fill a picture of this aspect."""
-    columns, rows = np.ptp(cells, axis=0) + 1
-    wide, high = columns * pitch.across, rows * pitch.down
-    down = pitch.down * min(max(wide / aspect / high, 1.0), STRETCH)
-    across = pitch.across * min(max(high * aspect / wide, 1.0), STRETCH)
-    return np.array([across, down])
+    wide, high = (np.ptp(cells, axis=0) + 1) * pitch
+    stretch: Floats = np.clip(np.array([high * aspect / wide, wide / aspect / high]), 1.0, STRETCH)
+    return pitch * stretch
 
 
 def depths(network: Network) -> Integers:
     """Return the number of arcs from the nearest reservoir or source to each node, shape (nodes,)."""
-    outgoing: list[list[int]] = [[] for _ in network.nodes]
-    entered = set(network.recipients.tolist())
-    for donor, recipient in zip(network.donors.tolist(), network.recipients.tolist(), strict=True):
-        outgoing[donor].append(recipient)
-    reservoirs = [i for i, node in enumerate(network.nodes) if node.role is Role.NONRENEWABLE_RESERVOIR]
-    sources = [i for i in range(len(network.nodes)) if i not in entered]
-    depth = np.full(len(network.nodes), -1, dtype=np.intp)
-    _flood(dict.fromkeys(reservoirs + sources), outgoing, depth)
-    for start in range(len(network.nodes)):
-        # What no source reaches hangs on a cycle: its first node counts as a source.
-        if depth[start] < 0:
-            _flood([start], outgoing, depth)
+    graph = nx.DiGraph(zip(network.donors.tolist(), network.recipients.tolist(), strict=True))
+    graph.add_nodes_from(range(len(network.nodes)))
+    starts = [i for i, node in enumerate(network.nodes) if node.role is Role.NONRENEWABLE_RESERVOIR]
+    starts += [i for i in graph if not graph.in_degree(i)]
+    known: dict[int, int] = {}
+    # What no source reaches hangs on a cycle: its first node counts as a source.
+    for sources in (starts, *([i] for i in range(len(graph)))):
+        if fresh := [i for i in sources if i not in known]:
+            known = nx.multi_source_dijkstra_path_length(graph, fresh) | known
+    depth = np.array([known[i] for i in range(len(graph))], dtype=np.intp)
     for i, node in enumerate(network.nodes):
-        if node.role in SINKS and node.role is not Role.ENVIRONMENT and not outgoing[i]:
+        if node.role in SINKS and node.role is not Role.ENVIRONMENT and not graph.out_degree(i):
             depth[i] = depth.max()
     return depth
 
 
-def _flood(starts: Iterable[int], outgoing: list[list[int]], depth: Integers) -> None:
-    """Write the depth of all that ``starts`` reach, where it is not known yet."""
-    queue = deque(starts)
-    depth[list(queue)] = 0
-    while queue:
-        node = queue.popleft()
-        for after in outgoing[node]:
-            if depth[after] < 0:
-                depth[after] = depth[node] + 1
-                queue.append(after)
-
-
-def layered(network: Network, pitch: Pitch, aspect: float) -> Floats:
+def layered(network: Network, pitch: Floats, aspect: float) -> Floats:
     """Return cells (column, row) with the nodes ordered by depth and, within a depth, by their neighbours."""
     depth = depths(network)
     count = len(depth)
@@ -108,7 +82,7 @@ def layered(network: Network, pitch: Pitch, aspect: float) -> Floats:
         height = total / np.maximum(neighbours, 1)
         for level in levels:
             _spread(height, level)
-    rows = max(1, math.ceil(math.sqrt(count * pitch.across / (aspect * pitch.down))))
+    rows = max(1, math.ceil(math.sqrt(count * pitch[0] / (aspect * pitch[1]))))
     return _in_columns(depth, height, rows)
 
 
@@ -143,17 +117,17 @@ def _without_gaps(cells: Floats) -> Floats:
 class _Search:
     """Coordinate descent over the cells of a grid: short, uncrossed arcs, reservoirs left and sinks right."""
 
-    def __init__(self, network: Network, edges: Integers, pitch: Pitch, aspect: float) -> None:
+    def __init__(self, network: Network, edges: Integers, pitch: Floats, aspect: float) -> None:
         count = len(network.nodes)
         self._edges, self._count = edges, count
         places = 1.5 * count
-        self._columns = max(3, round(math.sqrt(places * aspect * pitch.down / pitch.across)))
+        self._columns = max(3, round(math.sqrt(places * aspect * pitch[1] / pitch[0])))
         self._rows = max(2, math.ceil(places / self._columns))
-        self._unit = np.array([1.0, pitch.down / pitch.across])
-        grid = np.indices((self._columns, self._rows)).reshape(2, -1).T
-        self._grid = grid.astype(float)
+        self._unit = np.array([1.0, pitch[1] / pitch[0]])
+        self._grid = np.indices((self._columns, self._rows)).reshape(2, -1).T.astype(float)
         roles = [node.role for node in network.nodes]
-        self._pull = np.array([_pull(role) for role in roles])
+        pull = dict.fromkeys(SINKS, -0.6) | {Role.NONRENEWABLE_RESERVOIR: 0.6, Role.ENVIRONMENT: -0.2}
+        self._pull = np.array([pull.get(role, 0.0) for role in roles])  # price of one column to the right
         self._upward = np.array([0.1 * (role is Role.NONRENEWABLE_RESERVOIR) for role in roles])
         self._donors, self._recipients = network.donors, network.recipients
         first, second = np.triu_indices(len(edges), 1)
@@ -164,14 +138,10 @@ class _Search:
     def best(self, seed: Floats) -> Floats:
         """Return the cheapest cells found from ``seed`` and some shuffled starts."""
         random = np.random.default_rng(0)
-        order = np.lexsort((seed[:, 1], seed[:, 0]))
-        starts = [np.argsort(order)]
-        starts += [
-            random.permutation(len(self._grid))[: self._count] for _ in range(RESTARTS // max(1, self._count // 8))
-        ]
-        found = [self._descend(start) for start in starts]
-        cells = min(found, key=lambda pair: pair[0])[1]
-        return self._grid[cells]
+        starts = [np.argsort(np.lexsort((seed[:, 1], seed[:, 0])))]
+        restarts = RESTARTS // max(1, self._count // 8)
+        starts += [random.permutation(len(self._grid))[: self._count] for _ in range(restarts)]
+        return self._grid[min(map(self._descend, starts), key=lambda found: found[0])[1]]
 
     def _descend(self, cells: Integers) -> tuple[float, Integers]:
         cells = cells.copy()
@@ -238,15 +208,6 @@ class _Search:
         cosine = (left * right).sum(axis=-1) / np.maximum(norm, 1e-12)
         narrow: Floats = np.maximum(cosine - 0.8, 0) * 5
         return narrow
-
-
-def _pull(role: Role) -> float:
-    """Price of one column to the right."""
-    if role is Role.NONRENEWABLE_RESERVOIR:
-        return 0.6
-    if role is Role.ENVIRONMENT:
-        return -0.2
-    return -0.6 if role in SINKS else 0.0
 
 
 def _cross(a: Floats, b: Floats, c: Floats, d: Floats) -> NDArray[np.bool_]:

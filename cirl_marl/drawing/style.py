@@ -6,8 +6,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from cirl_marl.errors import CirlError
+from cirl_marl.network import Floats
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import write_atomically
 
@@ -31,13 +34,6 @@ ROLE_COLOURS = {
     Role.INCINERATOR: "#c9a3c4",
     Role.ENVIRONMENT: "#86d0e6",
 }
-ROLE_NAMES = {
-    Role.NONRENEWABLE_RESERVOIR: "non-renewable reservoir",
-    Role.TECHNOSPHERE: "technosphere",
-    Role.LANDFILL: "landfill",
-    Role.INCINERATOR: "incinerator",
-    Role.ENVIRONMENT: "environment",
-}
 DPI = 200
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -59,6 +55,14 @@ def number(value: float) -> str:
     mantissa, exponent = f"{value:.2e}".split("e")
     mantissa = mantissa.rstrip("0").rstrip(".").replace("-", "−")
     return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+
+
+def shaped(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
+    """Return ``values`` as floats; a ``CirlError`` names them if they have another shape."""
+    found = np.asarray(values, dtype=float)
+    if found.shape != shape:
+        raise CirlError(f"{name} has shape {found.shape}, expected {shape}")
+    return found
 
 
 def spoken(identifier: str) -> str:

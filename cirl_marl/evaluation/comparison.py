@@ -33,14 +33,9 @@ ProgressReport = Callable[[str, float], None]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """The episodes of one policy or controller.
+    """The episodes of one policy or controller; ``seed``, ``run`` and ``checkpoint`` are of its training, if any.
 
     Attributes:
-        name: of its row.
-        seed: training seed; None if nothing was trained.
-        run: where it was trained.
-        checkpoint: name of the checkpoint that acted; empty if nothing was trained.
-        rollout: its episodes.
         gain: circularity gain over neutral control from the same start, shape (episodes,).
         bound: what no λ̄ of an episode from the same start with at least the same mean service level exceeds, shape
             (episodes,), mass; None if nothing is proved.
@@ -72,12 +67,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A recipe with all its seeds, or a controller.
-
-    Attributes:
-        name: recipe or controller.
-        entries: one for each training seed.
-    """
+    """A recipe with an entry for each training seed, or a controller."""
 
     name: str
     entries: tuple[Entry, ...]
@@ -104,14 +94,9 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What every policy and controller did in the same episodes.
+    """What every policy and controller did in the same episodes; episode i starts from seed ``first_seed + i``.
 
-    Attributes:
-        network: under its scenario and horizon.
-        agents: who acted.
-        first_seed: episode i starts from seed ``first_seed + i``.
-        entries: of every policy and controller.
-        yardstick: the bounds that they are held against.
+    The network is under its scenario and horizon, and ``yardstick`` has the bounds that the entries are held against.
     """
 
     network: Network
@@ -188,18 +173,12 @@ def compare(
     if bounds:
         starts = starting_stocks(entered[0].env(episodes), first)
         done = len(entered) * share
-        measure, proved = _measured(
-            env,
-            starts,
-            [each.name for each in entered],
-            rollouts,
-            lambda part: progress("bounds", done + part * (1 - done)),
-        )
-    plain = [contender.run is None and contender.name == "neutral" for contender in entered]
-    neutral = rollouts[plain.index(True)]
+        names = [each.name for each in entered]
+        measure, proved = _measured(env, starts, names, rollouts, part_of(progress, "bounds", done, 1 - done))
+    neutral = next(run for who, run in zip(entered, rollouts, strict=True) if who.run is None and who.name == "neutral")
     entries = tuple(
-        Entry(contender.name, contender.seed, contender.run, checkpoint, run, gain(run, neutral), bound)
-        for contender, checkpoint, run, bound in zip(entered, checkpoints, rollouts, proved, strict=True)
+        Entry(who.name, who.seed, who.run, checkpoint, run, gain(run, neutral), bound)
+        for who, checkpoint, run, bound in zip(entered, checkpoints, rollouts, proved, strict=True)
     )
     return Comparison(env.network, env.agents, first, entries, measure)
 
@@ -222,10 +201,10 @@ def _measured(
         measure = yardstick(
             env.network, env.agents, starts, delivered, progress=lambda share: progress(SOLVING * share)
         )
-        proved = []
-        for place, run in enumerate(rollouts):
+        proved: list[Floats | None] = []
+        for run in rollouts:
             proved.append(measure.at(starts, run.episode_service))
-            progress(SOLVING + (1 - SOLVING) * (place + 1) / len(rollouts))
+            progress(SOLVING + (1 - SOLVING) * len(proved) / len(rollouts))
         return measure, proved
     except NoCertificate as missing:
         progress(1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from cirl_marl.controllers.basic import Controller
@@ -16,14 +17,9 @@ from cirl_marl.optimum.named import CONTROLLERS, named_controller
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """A policy or controller that is yet to act.
+    """A policy or controller that is yet to act in its row of a comparison; ``seed`` and ``run`` are of its training.
 
-    Attributes:
-        name: of the row that it belongs to.
-        seed: training seed; None if nothing was trained.
-        run: where it was trained.
-        controller: makes the controller.
-        env: makes the environment in which it acts, with so many copies.
+    ``controller`` makes it, and ``env`` the environment in which it acts, with so many copies.
     """
 
     name: str
@@ -123,19 +119,17 @@ def _trained(runs: Sequence[RunDirectory]) -> Iterator[Contender]:
         twin = seen.setdefault((asked, config.seed), run)
         if twin is not run:
             raise RunError(f"{run.path}: the same recipe and seed {config.seed} as {twin.path}; give one of them")
-        yield Contender(names[asked], config.seed, run, _policy(run), run.make_env)
+        yield Contender(names[asked], config.seed, run, partial(_policy, run), run.make_env)
 
 
-def _policy(run: RunDirectory) -> Callable[[], Controller]:
-    def load() -> Controller:
-        from cirl_marl.learners.trained import Trained
+def _policy(run: RunDirectory) -> Controller:
+    from cirl_marl.learners.trained import Trained  # it needs torch
 
-        return Trained(run)
-
-    return load
+    return Trained(run)
 
 
 def _untrained(name: str, env: Callable[[int], VectorEnv], min_service: float | None) -> Contender:
     demanded = min_service if name in ("mpc", "optimum") else None
-    named_controller(name, min_service=demanded)  # an unknown name fails before anything is computed
-    return Contender(name, None, None, lambda: named_controller(name, min_service=demanded), env)
+    controller = partial(named_controller, name, min_service=demanded)
+    controller()  # an unknown name fails before anything is computed
+    return Contender(name, None, None, controller, env)

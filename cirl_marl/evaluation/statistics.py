@@ -29,13 +29,7 @@ RESAMPLES = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Aggregate:
-    """A figure with its 95 % confidence interval.
-
-    Attributes:
-        value: the figure.
-        low: lower end of the interval, NaN if there is none.
-        high: upper end, likewise.
-    """
+    """A figure with the ends of its 95 % confidence interval, which are NaN if there is none."""
 
     value: float
     low: float
@@ -81,12 +75,8 @@ def interquartile_mean(scores: ArrayLike) -> float:
 def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Aggregate:
     """Return the interquartile mean of scores of training seeds with its stratified percentile bootstrap interval.
 
-    Scores of different networks must be on one scale, such as a gain or a gap. A single seed has no interval.
-
-    Args:
-        scores: of each network, one score a seed.
-        resamples: bootstrap samples.
-        seed: of the resampling.
+    Of each network there is one score a seed. Scores of different networks must be on one scale, such as a gain or a
+    gap. A single seed has no interval.
 
     Raises:
         CirlError: if there are no scores, or a network has another number of seeds than the first.
@@ -98,14 +88,8 @@ def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed:
     value = interquartile_mean(strata)
     if seeds == 1 or not np.isfinite(value):
         return Aggregate(value, float("nan"), float("nan"))
-    found = stats.bootstrap(
-        strata,
-        _joint_mean,
-        n_resamples=resamples,
-        vectorized=True,
-        method="percentile",
-        rng=np.random.default_rng(seed),
-    )
+    rng = np.random.default_rng(seed)
+    found = stats.bootstrap(strata, _joint_mean, n_resamples=resamples, vectorized=True, method="percentile", rng=rng)
     interval = found.confidence_interval
     return Aggregate(value, float(interval.low), float(interval.high))
 

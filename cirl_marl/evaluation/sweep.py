@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,14 +29,10 @@ WEIGHED = ("mixed", "mixed_difference", "team")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """A point in the plane of service and circularity.
+    """A point in the plane of mean service level and λ̄: a ``bound``, ``plan``, ``trained`` or ``neutral``.
 
-    Attributes:
-        kind: ``bound``, ``plan``, ``trained`` or ``neutral``.
-        service: mean service level; of a bound, the least that is demanded.
-        circularity: λ̄; of a bound, the highest with this service or more.
-        weight: circularity weight that was trained with.
-        seed: training seed.
+    Of a bound, the service is the least that is demanded, and λ̄ the highest with this service or more. ``weight`` is
+    the circularity weight, and ``seed`` the training seed, of what was trained.
     """
 
     kind: str
@@ -50,10 +47,7 @@ class Sweep:
     """All points of a network.
 
     Attributes:
-        network: under its scenario.
         recipe: what was trained; None for nothing.
-        points: of every kind.
-        runs: training runs.
         reason: why there is no bound; empty if there is.
         front: service levels and what the multipliers of all bounds prove there, shape (levels, 2).
     """
@@ -61,7 +55,7 @@ class Sweep:
     network: Network
     recipe: Recipe | None
     points: tuple[Point, ...]
-    runs: tuple[RunDirectory, ...] = field(default=())
+    runs: tuple[RunDirectory, ...] = ()
     reason: str = ""
     front: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
@@ -97,7 +91,7 @@ def pareto(
         seeds: training seeds 0, 1, … of each weight.
         steps: environment steps of each training; None is the recipe's.
         episodes: fresh episodes on which each policy is evaluated.
-        progress: called with what is being done and the share of all that is done.
+        progress: as for ``compare``.
 
     Raises:
         CirlError: for input that cannot be used, or a reward in which the weight has no part.
@@ -128,11 +122,7 @@ def pareto(
         each = (1 - share) / (points * seeds)
         told = part_of(progress, f"training {asked}", share + each * place, each)
         runs.append(asked.run(directory / "runs", told))
-    groups = [runs[first : first + seeds] for first in range(0, len(runs), seeds)]
-    learnt = tuple(point for group in groups for point in _learnt(group, episodes))
-    neutral = [each for each in learnt if each.kind == "neutral"][:1]
-    trained = [each for each in learnt if each.kind == "trained"]
-    return Sweep(found, chosen, (*possible, *trained, *neutral), tuple(runs), reason, front)
+    return Sweep(found, chosen, (*possible, *_learnt(runs, episodes)), tuple(runs), reason, front)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,20 +141,17 @@ class _Asked:
     def run(self, folder: Path, progress: Callable[[float], None]) -> RunDirectory:
         """Train, go on training, or find the finished run."""
         run = RunDirectory(folder / f"{self.recipe.name}-weight{self.weight:.6g}-seed{self.seed}")
-        if run.path.exists():
-            self._check(run)
-            if run.status["state"] != "complete":
-                learners.resume(run.path, report=lambda now: progress(now.env_steps / max(now.total, 1)))
-        else:
-            learners.train(
-                self.network,
-                self.recipe,
-                directory=run.path,
-                steps=self.steps,
-                seed=self.seed,
-                circularity_weight=self.weight,
-                report=lambda now: progress(now.env_steps / max(now.total, 1)),
-            )
+
+        def report(now: learners.Progress) -> None:
+            progress(now.env_steps / max(now.total, 1))
+
+        if not run.path.exists():
+            options: dict[str, Any] = {"steps": self.steps, "seed": self.seed, "circularity_weight": self.weight}
+            learners.train(self.network, self.recipe, directory=run.path, report=report, **options)
+            return run
+        self._check(run)
+        if run.status["state"] != "complete":
+            learners.resume(run.path, report=report)
         return run
 
     def _check(self, run: RunDirectory) -> None:
@@ -223,7 +210,7 @@ def _levels(least: float, most: float, points: int) -> list[float]:
 
 
 def _learnt(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
-    """Yield where the policies of one weight are, and neutral control."""
+    """Yield where the policies are, and neutral control."""
     for entry in compare(runs, ["neutral"], episodes=episodes, bounds=False).entries:
         yield Point(
             kind="neutral" if entry.run is None else "trained",

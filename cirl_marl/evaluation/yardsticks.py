@@ -40,11 +40,7 @@ class Yardstick:
     reason: str = ""
 
     def at(self, starts: Floats, service: Floats) -> Floats | None:
-        """Return the bounds of episodes from ``starts``, shape (episodes, nodes), with the mean levels ``service``.
-
-        Raises:
-            NoCertificate: if nothing is proved for one of the starts.
-        """
+        """Return the bounds of episodes from ``starts``, shape (episodes, nodes), with the mean levels ``service``."""
         return None if self.envelope is None else self.envelope.at(starts, np.clip(service, 0.0, 1.0))
 
 
@@ -56,14 +52,9 @@ def yardstick(
     *,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Yardstick:
-    """Solve the programs for the service levels that some rows delivered.
+    """Solve the programs for ``services``, the mean service levels, shape (episodes,), that each row delivered.
 
-    Args:
-        network: under its scenario and horizon.
-        agents: who acts.
-        starts: shape (episodes, nodes), mass.
-        services: mean service levels of each row, shape (episodes,).
-        progress: called with the share that is done.
+    ``starts`` are of shape (episodes, nodes), mass; ``progress`` is called with the share that is done.
 
     Raises:
         NoCertificate: if the network has flows for which nothing is proved.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import importlib
 import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -11,6 +10,8 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+import sb3_contrib
+import stable_baselines3
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
@@ -24,7 +25,7 @@ from cirl_marl.errors import RecipeError, unknown
 from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.views import CENTRAL_CRITIC
 
-MODULES = ("stable_baselines3", "sb3_contrib")
+DISCRETE = ("DQN", "QRDQN", "MaskablePPO")
 POLICIES: Mapping[str, type[BasePolicy]] = {CENTRAL_CRITIC: CentralCriticPolicy}
 """Policies that Stable-Baselines3 has no name for."""
 
@@ -44,21 +45,16 @@ NOISES: Mapping[str, type[ActionNoise]] = {
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:
     """Return every algorithm for continuous actions that the installed packages export, by class name."""
-    found: dict[str, type[BaseAlgorithm]] = {}
-    for name in MODULES:
-        module = importlib.import_module(name)
-        for attribute in module.__all__:
-            value = getattr(module, attribute)
-            if isinstance(value, type) and issubclass(value, BaseAlgorithm):
-                found[attribute] = value
-    return {name: found[name] for name in sorted(found) if name not in ("DQN", "QRDQN", "MaskablePPO")}
+    exported = {name: getattr(module, name) for module in (stable_baselines3, sb3_contrib) for name in module.__all__}
+    return {
+        name: found
+        for name, found in sorted(exported.items())
+        if isinstance(found, type) and issubclass(found, BaseAlgorithm) and name not in DISCRETE
+    }
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """Return the algorithm called ``name``.
-
-    Raises:
-        RecipeError: if there is none; names the nearest.
+    """Return the algorithm called ``name``; a ``RecipeError`` names the nearest if there is none.
 
     >>> algorithm_class("PPO").__name__
     'PPO'
@@ -182,8 +178,7 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         name: class name in Stable-Baselines3 or sb3-contrib.
         policy: such as ``MlpPolicy``.
         env: what it learns in.
-        parameters: keyword arguments of its constructor; ``learning_rate = {linear_from, linear_to}`` and
-            ``action_noise = {kind, sigma}`` are turned into the objects that the library expects.
+        parameters: keyword arguments of its constructor; tables that recipes write become the objects that it expects.
         **fixed: seed, device, tensorboard_log and so on.
 
     Raises:

@@ -3,7 +3,7 @@
 For any on-policy algorithm of Stable-Baselines3 whose policies are its ``ActorCriticPolicy`` (PPO, A2C, TRPO). With a
 policy that all agents share and PPO this is MAPPO (Yu et al. 2022, The Surprising Effectiveness of PPO in Cooperative
 Multi-Agent Games, arXiv 2103.01955). The environment is seen as a dict of ``observation`` and ``state``
-(``views.WithState``); no gradient of the actor reaches the critic or the reverse, and no action depends on the state.
+(``View.with_state``); no gradient of the actor reaches the critic or the reverse, and no action depends on the state.
 """
 
 from __future__ import annotations

@@ -35,12 +35,8 @@ def demonstrate(model: OffPolicyAlgorithm, steps: int, act: Act) -> None:
     ``model.learn(…, reset_num_timesteps=False)`` goes on from there. What is kept is what the model would have kept of
     its own steps: observations and rewards before normalisation, the true last observation of an episode. Statistics of
     a normaliser are those of all steps. A model that was saved in the middle of its demonstrations gets the rest of
-    them; one that has passed them gets none, and has them only if its replay buffer was saved as well.
-
-    Args:
-        model: fresh, or loaded with its replay buffer; its actions are those of Box(-1, 1).
-        steps: rows, as the model counts them.
-        act: what to do in the current state.
+    them; one that has passed them gets none, and has them only if its replay buffer was saved as well. Its actions are
+    those of Box(-1, 1), its steps rows.
     """
     if model.num_timesteps >= steps:
         return
@@ -55,13 +51,9 @@ def demonstrate(model: OffPolicyAlgorithm, steps: int, act: Act) -> None:
 
 
 class Demonstrator:
-    """A controller at work in a batched environment, started anew with every episode.
+    """A controller at work in a batched environment, for all agents, started anew with every episode.
 
     Several learners may follow it: it acts once for each state.
-
-    Attributes:
-        name: of the controller.
-        env: where it acts, for all agents.
     """
 
     def __init__(self, name: str, env: VectorEnv, seed: int) -> None:
@@ -80,46 +72,32 @@ class Demonstrator:
         return self._began is None
 
     def check(self, agents: Sequence[str], title: str) -> None:
-        """Start and act in the current state; refuse a controller that cannot do so, or not for ``agents``.
-
-        Raises:
-            RecipeError: naming the learner ``title`` and what the controller lacks.
-        """
+        """Start and act in the current state; raise a ``RecipeError`` if it cannot do so, or not for ``agents``."""
         try:
             self.act()
         except CirlError as error:
             raise RecipeError(f"{title}: demonstrations by {self.name} control: {error}") from error
-        if isinstance(self._controller, Scripted):
-            known = self._controller.scripted
-            if not set(agents) & set(known):
-                raise RecipeError(
-                    f"{title}: demonstrations by scripted control: there is no script for it; "
-                    f"there are scripts for {', '.join(known) or 'no agent of this network'}"
-                )
+        if isinstance(self._controller, Scripted) and not set(agents) & set(known := self._controller.scripted):
+            raise RecipeError(
+                f"{title}: demonstrations by scripted control: there is no script for it; "
+                f"there are scripts for {', '.join(known) or 'no agent of this network'}"
+            )
 
     def act(self) -> Arrays:
         """Return the actions of all agents in the current state of the environment."""
         state = self.env.physical
         if state is not self._state:
-            if self.idle or not state.step.any():
-                self._begin()
+            if self.idle or (state is not self._began and not state.step.any()):
+                self._controller.start(self.env, self._seed)
+                self._began, self._seed = self.env.physical, self._seed + 1
             self._state, self._actions = state, self._controller.act(self.env.observations())
         return self._actions
 
-    def _begin(self) -> None:
-        if self.env.physical is not self._began:
-            self._controller.start(self.env, self._seed)
-            self._began = self.env.physical
-            self._seed += 1
-
 
 def in_copies(name: str, envs: Sequence[gymnasium.Env[Any, Any]], seeds: Sequence[int]) -> Act:
-    """Return what the controller ``name`` does in copies of a Gymnasium environment of this library.
+    """Return what the controller ``name`` does in copies of a Gymnasium environment, with a seed for each.
 
-    Args:
-        name: of the controller.
-        envs: each with an agent of a network, as a vector or as a goal task; may be wrapped.
-        seeds: of the controllers, one for each copy.
+    Each has an agent of a network, as a vector or as a goal task; it may be wrapped.
 
     Raises:
         RecipeError: if an environment is not of a network, or the controller cannot act in it.

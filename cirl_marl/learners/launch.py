@@ -88,16 +88,12 @@ def prepared(
     agents: Sequence[str] | None = None,
     **options: Any,
 ) -> Training:
-    """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written.
-
-    Raises:
-        CirlError: for input that cannot be used.
-    """
+    """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
     found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     steps = found.run.steps if steps is None else _whole("steps", steps, 1)
     found.check(steps)
-    given = {name: value for name, value in options.items() if value is not None}
-    settings = found.environment | {n: v.item() if isinstance(v, np.generic) else v for n, v in given.items()}
+    given = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
+    settings = found.environment | given
     copies = found.run.envs if envs is None else _whole("envs", envs, 1)
     env = VectorEnv(network, num_envs=copies, agents=agents, **settings)
     if not env.agents:

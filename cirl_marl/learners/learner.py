@@ -9,7 +9,7 @@ import pickle
 import warnings
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from sb3_contrib import ARS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
@@ -54,11 +53,9 @@ class Learner:
     """A learner seated in the joint environment.
 
     Attributes:
-        name: the agent's whose learner it is, or that of a learner of several agents.
         spec: its part of the recipe.
-        seat: its view of the environment.
+        seat: its view of the environment, from which it has its name.
         env: the seat, behind ``VecNormalize`` if the recipe normalises.
-        streams: its random streams.
         model: the algorithm, as Stable-Baselines3 made it.
         demonstrator: whom it follows before it acts itself; None if it needs nobody.
     """
@@ -81,11 +78,7 @@ class Learner:
         self.streams = Streams(self._seed, keep_gaussian=noisy)
 
     def build(self) -> Learner:
-        """Make a fresh algorithm.
-
-        Raises:
-            RecipeError: naming the learner, if the algorithm refuses its parameters.
-        """
+        """Make a fresh algorithm; a ``RecipeError`` names the learner if the algorithm refuses its parameters."""
         spec = self.spec
         self.env = normalised(self.seat, spec)
         parameters = dict(spec.parameters)
@@ -96,14 +89,12 @@ class Learner:
                 self.model = build(spec.algorithm, spec.policy, self.env, parameters, seed=self._seed, device="cpu")
             except RecipeError as error:
                 raise RecipeError(f"{self.seat.title}: {error}") from error
-        if self.seat.num_envs > 1 and isinstance(self.model, OffPolicyAlgorithm):
-            frequency = self.model.train_freq
-            assert isinstance(frequency, TrainFreq)
-            if frequency.unit is TrainFrequencyUnit.EPISODE:
-                raise RecipeError(
-                    f"{self.seat.title}: parameters.train_freq: {spec.algorithm} learns after whole episodes in a "
-                    f"single environment only, not in {self.seat.num_envs}; give a number of steps"
-                )
+        frequency = getattr(self.model, "train_freq", None)
+        if self.seat.num_envs > 1 and isinstance(frequency, TrainFreq) and frequency.unit is TrainFrequencyUnit.EPISODE:
+            raise RecipeError(
+                f"{self.seat.title}: parameters.train_freq: {spec.algorithm} learns after whole episodes in a single "
+                f"environment only, not in {self.seat.num_envs}; give a number of steps"
+            )
         return self
 
     def load(self, folder: Path) -> Learner:
@@ -152,15 +143,6 @@ class Learner:
         steps = 0 if asked is None else asked.steps * (self.seat.num_envs // self.seat.copies)
         return steps if steps > self.model.num_timesteps else 0
 
-    def follow(self, demonstrator: Demonstrator) -> None:
-        """Let ``demonstrator`` act first.
-
-        Raises:
-            RecipeError: if it cannot act for this learner.
-        """
-        demonstrator.check(self.seat.view.agents, self.seat.title)
-        self.demonstrator = demonstrator
-
     def learn(self, steps: int, callback: BaseCallback | None) -> None:
         """Run the algorithm's own ``learn()`` up to its share of ``steps``, counting what it had learnt before.
 
@@ -204,14 +186,6 @@ class Learner:
             with gzip.open(path, "wb", compresslevel=1) as packed, io.BufferedWriter(packed) as file:
                 self.model.save_replay_buffer(file)
 
-    def close(self) -> None:
-        """Close the log files."""
-        self.model.logger.close()
-
-    def log_to(self, log: Path) -> None:
-        """Write TensorBoard events below the folder ``log``."""
-        self.model.set_logger(configure(str(log / self.name), ["tensorboard"]))
-
 
 def normalised(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:
     """Return ``env`` behind the normaliser that the settings ask for, if they do; of a dict ``keys`` are normalised."""
@@ -230,11 +204,7 @@ def normalised(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None
 
 
 def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = None) -> BaseAlgorithm:
-    """Load the policy that the learner ``name`` learnt; the global random streams are left as they were.
-
-    Raises:
-        RunError: if the file cannot be read.
-    """
+    """Load the policy that the learner ``name`` learnt; the global random streams are left as they were."""
     path = folder / f"{name}.zip"
     with global_streams_kept(), warnings.catch_warnings():
         # of learners with returns of n steps: the library saved the buffer's class, and takes it for one of the user's
@@ -246,11 +216,7 @@ def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = Non
 
 
 def load_normaliser(folder: Path, name: str, spec: LearnerSettings, seat: Seat | None = None) -> VecNormalize | None:
-    """Load the normaliser saved with a policy; None if its recipe does not normalise.
-
-    Raises:
-        RunError: if it is missing although the recipe normalises, or cannot be read.
-    """
+    """Load the normaliser saved with a policy; None if its recipe does not normalise."""
     if not spec.normalise.any:
         return None
     path = folder / f"{name}.normaliser.pkl"
@@ -258,7 +224,6 @@ def load_normaliser(folder: Path, name: str, spec: LearnerSettings, seat: Seat |
         if seat is not None:
             return VecNormalize.load(str(path), seat)
         with path.open("rb") as file:
-            normaliser: VecNormalize = pickle.load(file)
+            return cast(VecNormalize, pickle.load(file))
     except UNREADABLE as error:
         raise RunError(f"{path}: cannot be read: {error}; without it the policy of '{name}' is useless") from error
-    return normaliser

@@ -35,23 +35,17 @@ class Interrupted(Exception):
 class Lockstep:
     """Seats the learners of one batched environment and lets them run together.
 
-    Attributes:
-        env: the joint environment.
-        seats: by name of the learner, in the order in which learners are resumed.
-        joint_steps: control intervals done, each in every copy, those of a run that is resumed included.
+    Learners are resumed in the order of ``seats``. ``joint_steps`` are control intervals done, each in every copy,
+    those of a run that is resumed included.
     """
 
     def __init__(
         self, env: VectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None, *, done: int = 0
     ) -> None:
-        """Reset ``env`` with one seed per copy and seat its learners.
+        """Reset ``env`` with one of ``seeds`` per copy and seat its learners, after ``done`` joint steps before.
 
-        Args:
-            env: the joint environment.
-            seeds: of its copies.
-            views: what each learner sees, by its name; together they act for every agent once. None: every agent has
-                a learner of its own.
-            done: joint steps done before.
+        ``views`` are what each learner sees, by its name; together they act for every agent once. None gives every
+        agent a learner of its own.
         """
         self.env = env
         self.joint_steps = done

@@ -134,12 +134,9 @@ class Match(LearnerSettings):
     def fits(self, agent: str, network: Network) -> bool:
         """Return whether the match names ``agent``."""
         compartment = network.compartments[agent]
-        is_node = isinstance(compartment, Node)
-        return (
-            (self.agents is None or agent in self.agents)
-            and (self.kind is None or (self.kind == "node") == is_node)
-            and (self.role is None or (isinstance(compartment, Node) and compartment.role == self.role))
-        )
+        kind, role = ("node", compartment.role) if isinstance(compartment, Node) else ("arc", None)
+        named = self.agents is None or agent in self.agents
+        return named and self.kind in (None, kind) and self.role in (None, role)
 
 
 class Run(Settings):
@@ -151,13 +148,10 @@ class Run(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Agents that one learner learns for.
+    """Agents that one learner learns for, in the order of the environment, and how it learns.
 
-    Attributes:
-        name: the agent's of an independent learner, else ``shared-learner`` or ``joint-learner``; of several with the
-            number of the match, 0 for the common one.
-        agents: in the order of the environment.
-        spec: how it learns.
+    An independent learner has the name of its agent, others are ``shared-learner`` or ``joint-learner``; of several
+    with the number of the match, 0 for the common one.
     """
 
     name: str
@@ -215,19 +209,11 @@ class Recipe(Settings):
         return tuple(found.values())
 
     def check(self, steps: int) -> None:
-        """Refuse what is wrong whatever the network, in a run of ``steps``.
-
-        Raises:
-            RecipeError: naming every mistake.
-        """
+        """Raise a ``RecipeError`` that names all that is wrong whatever the network, in a run of ``steps``."""
         self._refuse(self.mistakes(steps))
 
     def check_agents(self, agents: Sequence[str]) -> None:
-        """Refuse matches that name agents which do not act.
-
-        Raises:
-            RecipeError: naming the match, the agent and the nearest that acts.
-        """
+        """Raise a ``RecipeError`` for matches that name agents which do not act; it names the nearest that acts."""
         self._refuse(
             f"match.{i}.agents: {unknown('agent', agent, agents)}"
             for i, match in enumerate(self.match)

@@ -44,15 +44,8 @@ STATES = ("running", "complete", "interrupted", "failed")
 class RunConfig(Settings):
     """What a run was asked to do, fully resolved.
 
-    Attributes:
-        network: name of the network.
-        scenario: its scenario.
-        agents: who acts.
-        recipe: the recipe, validated.
-        seed: from which every random stream derives.
-        steps: environment steps, summed over the copies.
-        envs: number of copies.
-        options: other options of ``VectorEnv``.
+    ``steps`` are environment steps, summed over the copies, of which there are ``envs``. Every random stream derives
+    from ``seed``; ``options`` are those of ``VectorEnv``.
     """
 
     network: str
@@ -74,14 +67,10 @@ class RunConfig(Settings):
 
 
 class RunDirectory:
-    """Reads and writes one run.
-
-    Attributes:
-        path: the directory.
-    """
+    """Reads and writes one run."""
 
     def __init__(self, path: str | Path) -> None:
-        """Refer to a run; nothing is read or written yet."""
+        """Refer to the run in the directory ``path``; nothing is read or written yet."""
         self.path = Path(path)
 
     @classmethod
@@ -108,11 +97,7 @@ class RunDirectory:
 
     @contextmanager
     def claimed(self) -> Iterator[None]:
-        """Keep other processes from training this run at the same time.
-
-        Raises:
-            RunError: if one does.
-        """
+        """Keep other processes from training this run at the same time; a ``RunError`` if one does."""
         lock = FileLock(self.path / ".lock", blocking=False)
         try:
             lock.acquire()
@@ -125,11 +110,7 @@ class RunDirectory:
 
     @property
     def config(self) -> RunConfig:
-        """The resolved configuration.
-
-        Raises:
-            RunError: if the directory holds no complete run description.
-        """
+        """The resolved configuration; a ``RunError`` if the directory holds no complete run description."""
         plain = self._json("config.json")
         try:
             return RunConfig.model_validate(plain)
@@ -139,11 +120,7 @@ class RunDirectory:
 
     @property
     def status(self) -> dict[str, Any]:
-        """State, joint steps and checkpoint.
-
-        Raises:
-            RunError: if the file is missing or says something else.
-        """
+        """State, joint steps and checkpoint; a ``RunError`` if the file is missing or says something else."""
         status = self._json("status.json")
         fits = isinstance(status, dict) and {"state", "joint_steps", "checkpoint"} <= set(status)
         fits = fits and status["state"] in STATES and type(status["joint_steps"]) is int
@@ -164,11 +141,7 @@ class RunDirectory:
 
     @property
     def checkpoint(self) -> Path:
-        """The newest complete checkpoint.
-
-        Raises:
-            RunError: if nothing was saved yet, or files of it are missing.
-        """
+        """The newest complete checkpoint; a ``RunError`` if nothing was saved yet, or files of it are missing."""
         name = self.status["checkpoint"]
         if name is None:
             raise RunError(f"{self.path}: nothing was saved in this run yet (state: {self.status['state']})")
@@ -184,15 +157,8 @@ class RunDirectory:
         return config.recipe.groups(self.network(), config.agents)
 
     def network(self) -> Network:
-        """Return the network that the run trained on, under its scenario.
-
-        Raises:
-            RunError: if the definition is missing.
-        """
-        definition = self.path / "network.toml"
-        if not definition.is_file():
-            raise RunError(f"{definition}: missing; the run directory is incomplete")
-        return load_network(definition, scenario=self.config.scenario)
+        """Return the network that the run trained on, under its scenario; a ``RunError`` if its file is missing."""
+        return load_network(self._file("network.toml"), scenario=self.config.scenario)
 
     def make_env(self, num_envs: int) -> VectorEnv:
         """Return the environment that the run trained in, with ``num_envs`` copies."""
@@ -223,23 +189,25 @@ class RunDirectory:
 
     def metrics(self) -> dict[str, list[float]]:
         """Return the columns of ``metrics.csv``."""
-        path = self.path / "metrics.csv"
-        if not path.is_file():
-            raise RunError(f"{path}: missing; the run directory is incomplete")
+        path = self._file("metrics.csv")
         try:
             header, *rows = _complete_rows(path)
             return {name: [float(row[i]) for row in rows] for i, name in enumerate(header)}
         except (ValueError, IndexError) as error:
             raise RunError(f"{path}: cannot be read: {error}") from error
 
-    def _json(self, name: str) -> dict[str, Any]:
+    def _file(self, name: str) -> Path:
         path = self.path / name
+        if not path.is_file():
+            raise RunError(f"{path}: missing; the run directory is incomplete")
+        return path
+
+    def _json(self, name: str) -> dict[str, Any]:
         if not (self.path / "config.json").is_file():
             beside = sorted(str(config.parent) for config in self.path.parent.glob("*/config.json"))
             others = f": {unknown('run', self.path, beside)}" if beside else ""
             raise RunError(f"no run in {self.path} (it has no config.json){others}")
-        if not path.is_file():
-            raise RunError(f"{path}: missing; the run directory is incomplete")
+        path = self._file(name)
         try:
             value: dict[str, Any] = json.loads(path.read_text())
         except ValueError as error:
@@ -254,11 +222,7 @@ def _complete_rows(path: Path) -> list[list[str]]:
 
 
 class MetricsFile:
-    """Appends one row per joint episode to ``metrics.csv``.
-
-    Attributes:
-        seconds: training time of the rows that were there.
-    """
+    """Appends a row per joint episode to ``metrics.csv``; ``seconds`` is the training time of rows that were there."""
 
     def __init__(self, path: Path, agents: Sequence[str], done: int) -> None:
         """Open the file; rows past joint step ``done``, which a resumed run will repeat, are dropped."""
@@ -273,14 +237,9 @@ class MetricsFile:
                 raise RunError(f"{path}: cannot be read: {error}") from error
         text = "".join(",".join(row) + "\n" for row in rows)
         write_atomically(path, lambda temporary: temporary.write_text(text))
-        self._file = path.open("a", newline="")
-        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._path = path
 
     def append(self, row: Sequence[float]) -> None:
-        """Write a row and flush it."""
-        self._writer.writerow([f"{value:.10g}" for value in row])
-        self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Write a row."""
+        with self._path.open("a", newline="") as file:
+            file.write(",".join(f"{value:.10g}" for value in row) + "\n")

@@ -17,39 +17,29 @@ from cirl_marl.network.elements import Compartment
 
 
 class CopyView:
-    """One copy of the environment; what ``env_method`` and ``get_attr`` of a joint learner's seat reach.
+    """One copy of the environment, as an agent if a row is one's: what ``env_method`` and ``get_attr`` reach.
 
     Attributes that it lacks are those of the joint environment.
     """
 
     render_mode: str | None = None
 
-    def __init__(self, env: VectorEnv, index: int) -> None:
-        """View copy ``index`` of ``env``."""
-        self.env = env
-        self.index = index
+    def __init__(self, env: VectorEnv, index: int, agent: str | None = None) -> None:
+        """View copy ``index`` of ``env`` as ``agent``, or as all agents of a joint learner."""
+        self.env, self.index, self.agent = env, index, agent
 
     def __getattr__(self, name: str) -> Any:
         """Fall back on the joint environment."""
         return getattr(self.env, name)
 
-
-class AgentView(CopyView):
-    """One agent in one copy of the environment."""
-
-    def __init__(self, env: VectorEnv, index: int, agent: str) -> None:
-        """View copy ``index`` of ``env`` as ``agent``."""
-        super().__init__(env, index)
-        self.agent = agent
-
     @property
     def compartment(self) -> Compartment:
         """The compartment that the agent is."""
-        return self.env.network.compartments[self.agent]
+        return self.env.network.compartments[str(self.agent)]
 
     def local_reward(self) -> float:
         """Return the local reward that the current state gives the agent."""
-        return float(self.env.local_rewards()[self.agent][self.index])
+        return float(self.env.local_rewards()[str(self.agent)][self.index])
 
 
 class Seat(VecEnv):
@@ -61,7 +51,6 @@ class Seat(VecEnv):
 
     Attributes:
         name: of the learner; an independent learner has its agent's.
-        view: what it sees of the environment.
         latest: the observation that it acts on next, one row for each row of its view.
         action: what it last did.
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
@@ -69,15 +58,11 @@ class Seat(VecEnv):
 
     def __init__(self, env: VectorEnv, name: str, view: View, exchange: Callable[[Seat], VecEnvStepReturn]) -> None:
         """Seat the learner ``name``; ``exchange`` hands in its action and waits for the outcome of the joint step."""
-        self.name = name
-        self.view = view
+        self.name, self.view, self.copies = name, view, env.num_envs
         self.latest: ObservedRows | None = None
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
-        self.copies = env.num_envs
-        copies = range(self.copies)
-        self.views: list[CopyView] = [AgentView(env, i, agent) for agent in view.row_agents for i in copies]
-        self.views = self.views or [CopyView(env, i) for i in copies]
+        self.views = [CopyView(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
         self._exchange = exchange
         super().__init__(len(self.views), view.observation_space, view.action_space)
 
@@ -96,12 +81,8 @@ class Seat(VecEnv):
     ) -> VecEnvStepReturn:
         """Put together what a joint step brought the learner.
 
-        Args:
-            rewards: of this step by agent, shape (B,).
-            done: copies whose episode ended, shape (B,).
-            returns: of the episode so far by agent, shape (B,).
-            lengths: of the episode so far, shape (B,).
-            final: last observation of the episodes that ended; None if none did.
+        ``rewards`` are those of this step, ``returns`` and ``lengths`` those of the episode so far, ``done`` the copies
+        whose episode ended, each of shape (B,), and ``final`` the last observation of these; None if there is none.
         """
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.tile(done, self.num_envs // self.copies)

@@ -84,11 +84,7 @@ def global_streams_kept() -> Iterator[None]:
 
 @contextmanager
 def global_streams_claimed() -> Iterator[None]:
-    """Keep the global streams of this process for one training.
-
-    Raises:
-        CirlError: if another training, in another thread or in a callback, has them.
-    """
+    """Keep the global streams of this process for one training; a ``CirlError`` if another training has them."""
     if not _IN_USE.acquire(blocking=False):
         raise CirlError("another training is under way in this process and draws from its random streams; use another")
     try:

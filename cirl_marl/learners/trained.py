@@ -13,23 +13,17 @@ from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.learners.learner import load_model, load_normaliser
 from cirl_marl.learners.run import RunDirectory
-from cirl_marl.learners.views import View, unseen_state
+from cirl_marl.learners.views import unseen_state
 
 
 class Trained(Controller):
     """Acts by the deterministic policies of a run's newest checkpoint, with their normalisers frozen.
 
-    Attributes:
-        run: the run.
-        checkpoint: the folder from which the policies were loaded; a run that is being trained has others later.
+    ``checkpoint`` is the folder from which they were loaded; a run that is being trained has others later.
     """
 
     def __init__(self, run: str | Path | RunDirectory) -> None:
-        """Load every policy.
-
-        Raises:
-            RunError: if the run is incomplete or a file of it cannot be read.
-        """
+        """Load every policy; a ``RunError`` if the run is incomplete or a file of it cannot be read."""
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
         self.checkpoint = folder = self.run.checkpoint
         groups = self.run.groups()
@@ -39,24 +33,16 @@ class Trained(Controller):
         self._models = {group.name: load_model(folder, group.name, group.spec.algorithm) for group in groups}
         self._normalisers = {group.name: load_normaliser(folder, group.name, group.spec) for group in groups}
         for name, view in self._views.items():
-            self._check(name, folder, self._models[name], view)
-            if (normaliser := self._normalisers[name]) is not None:
-                self._check(name, folder, normaliser, view)
+            for loaded in (self._models[name], self._normalisers[name]):
+                shapes = getattr(loaded, "observation_space", None), getattr(loaded, "action_space", None)
+                if loaded is not None and shapes != (view.observation_space, view.action_space):
+                    what = f"the policy or normaliser of '{name}'"
+                    raise RunError(f"{folder}: {what} is for other observations or actions")
         self._memory: dict[str, Any] = {}
         self._starts = np.ones(1, dtype=bool)
 
-    def _check(self, name: str, folder: Path, loaded: Any, view: View) -> None:
-        """Refuse a policy or normaliser that is for something else."""
-        shapes = getattr(loaded, "observation_space", None), getattr(loaded, "action_space", None)
-        if shapes != (view.observation_space, view.action_space):
-            raise RunError(f"{folder}: the policy or normaliser of '{name}' is for other observations or actions")
-
     def start(self, env: VectorEnv, seed: int) -> None:
-        """Forget the last episode.
-
-        Raises:
-            RunError: if ``env`` has other agents than the run, or shows them something else.
-        """
+        """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
         if set(env.agents) != set(self._seen):
             raise RunError(f"{self.run.path}: trained {sorted(self._seen)}, not {sorted(env.agents)}")
         for agent, seen in self._seen.items():

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
 
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError, unknown
@@ -33,8 +34,7 @@ class Progress:
     """What a running training reports.
 
     Attributes:
-        env_steps: environment steps done, summed over the copies, in this call.
-        total: environment steps that this call will do.
+        env_steps: environment steps done in this call, summed over the copies, of ``total``.
         seconds: since training began.
         circularity: mean over the copies of λ at the end of the last step, or λ̄ of the last episode; mass.
         service_level: likewise.
@@ -50,14 +50,7 @@ class Progress:
 
 
 class Training:
-    """A run in progress.
-
-    Attributes:
-        config: what it was asked to do.
-        env: the joint environment.
-        learners: the learners by name; an independent learner has its agent's.
-        run: where it is kept; None if it is not.
-    """
+    """A run in progress: what it was asked to do, the joint environment, its learners by name, and where it is kept."""
 
     def __init__(self, config: RunConfig, env: VectorEnv, resumed: RunDirectory | None = None) -> None:
         """Seat the learners and make their algorithms, or load those of a run that is resumed."""
@@ -78,13 +71,13 @@ class Training:
             learner = Learner(seat, groups[name].spec, config.seed, done=self.done)
             self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
         self._appoint_demonstrators()
-        self._log()
 
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs and checkpoints in ``run`` from now on."""
         self.run = run
         self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
-        self._log()
+        for name, learner in self.learners.items():
+            learner.model.set_logger(configure(str(run.path / "tensorboard" / name), ["tensorboard"]))
 
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
@@ -93,31 +86,19 @@ class Training:
             asked = learner.spec.demonstrations
             if asked is not None and learner.demonstrations:
                 seed = derived_seed(self.config.seed, "demonstrations", asked.controller, self.done)
-                known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
-                learner.follow(known[asked.controller])
-
-    def _log(self) -> None:
-        if self.run is not None:
-            for learner in self.learners.values():
-                learner.log_to(self.run.path / "tensorboard")
+                leader = known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
+                leader.check(learner.seat.view.agents, learner.seat.title)
+                learner.demonstrator = leader
 
     def start(
         self, *, callbacks: Mapping[str, BaseCallback] | None = None, report: Callable[[Progress], None] | None = None
     ) -> None:
-        """Train to the end of the budget.
-
-        Ctrl-C and errors save what was learnt before they are raised.
-
-        Args:
-            callbacks: Stable-Baselines3 callbacks by name of the learner.
-            report: called after every joint step.
+        """Train to the end of the budget; the arguments are those of ``train``.
 
         Raises:
-            LearnerError: if a learner fails; the others' policies are saved.
-            KeyboardInterrupt: after Ctrl-C.
+            LearnerError: if a learner fails; what was learnt is saved first, as it is after Ctrl-C.
         """
         callbacks = callbacks or {}
-        self.check_callbacks(callbacks)
         steps = self.config.steps
         try:
             with one_torch_thread(), self._interruptible():
@@ -137,10 +118,8 @@ class Training:
         else:
             self._save("complete")
         finally:
-            if self._metrics is not None:
-                self._metrics.close()
             for learner in self.learners.values():
-                learner.close()
+                learner.model.logger.close()
 
     def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
         """Raise a ``CirlError`` for callbacks of learners that there are not."""
@@ -157,32 +136,23 @@ class Training:
         self, began: float, report: Callable[[Progress], None] | None, infos: Infos, ended: NDArray[np.bool_]
     ) -> None:
         """Report, record finished episodes, save checkpoints, heed Ctrl-C."""
+        seconds, copies, steps = time.perf_counter() - began, self.env.num_envs, self.joint_steps
         finished = bool(ended.any())
         if finished or report is not None:
-            self._tell(time.perf_counter() - began, report, infos, ended if finished else None)
-        every = max(1, self.config.steps // self.env.num_envs // CHECKPOINTS)
-        if self.joint_steps % every == 0:
+            first, which = infos[self.env.agents[0]], ended if finished else slice(None)
+            names = ("episode_circularity", "episode_service_level") if finished else ("circularity", "service_level")
+            circularity, service = (float(first[name][which].mean()) for name in names)
+            if report is not None:
+                total = max(self.config.steps, steps * copies) - self.done * copies
+                report(Progress((steps - self.done) * copies, total, seconds, circularity, service, finished))
+            if finished and self._metrics is not None:
+                returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
+                spent = self._metrics.seconds + seconds
+                self._metrics.append([steps, steps * copies, spent, circularity, service, *returns])
+        if steps % max(1, self.config.steps // copies // CHECKPOINTS) == 0:
             self._save("running")
         if self._interrupted:
             raise Interrupted
-
-    def _tell(
-        self, seconds: float, report: Callable[[Progress], None] | None, infos: Infos, ended: NDArray[np.bool_] | None
-    ) -> None:
-        """Report how far the training is, and keep the figures of episodes that ended, if some did."""
-        first, copies, steps = infos[self.env.agents[0]], self.env.num_envs, self.joint_steps
-        names = ("circularity", "service_level")
-        if ended is None:
-            circularity, service = (float(first[name].mean()) for name in names)
-        else:
-            circularity, service = (float(first[f"episode_{name}"][ended].mean()) for name in names)
-        if report is not None:
-            total = max(self.config.steps, steps * copies) - self.done * copies
-            report(Progress((steps - self.done) * copies, total, seconds, circularity, service, ended is not None))
-        if ended is not None and self._metrics is not None:
-            returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
-            spent = self._metrics.seconds + seconds
-            self._metrics.append([steps, steps * copies, spent, circularity, service, *returns])
 
     def _save(self, state: str, reason: str = "") -> None:
         if self.run is None:

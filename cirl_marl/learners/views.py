@@ -39,10 +39,28 @@ class View(ABC):
     row_agents: tuple[str, ...]
     observation_space: spaces.Space[Any]
     action_space: spaces.Space[Any]
+    _sees_state = False
 
-    @abstractmethod
+    def with_state(self, env: VectorEnv) -> View:
+        """Show the whole state beside the rows from now on: ``{"observation": …, "state": …}``; return the view.
+
+        The state is that of ``VectorEnv.state()``, in physical units and double precision.
+        """
+        state = spaces.Box(-np.inf, np.inf, (len(env.state_names) + 1,), dtype=np.float64)
+        self.observation_space = spaces.Dict({"observation": self.observation_space, "state": state})
+        self._sees_state = True
+        return self
+
     def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
         """Return the rows of all copies, agent by agent; ``state`` is called by those who see the whole state."""
+        rows = self.rows(observations)
+        if not self._sees_state:
+            return rows
+        return {"observation": rows, "state": np.tile(state(), (max(1, len(self.row_agents)), 1))}
+
+    @abstractmethod
+    def rows(self, observations: Arrays) -> NDArray[np.floating]:
+        """Return what the agents see, without the state."""
 
     @abstractmethod
     def act(self, actions: NDArray[np.floating]) -> Arrays:
@@ -66,7 +84,7 @@ class OneAgent(View):
         self.observation_space = env.observation_spaces[agent]
         self.action_space = env.action_spaces[agent]
 
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
+    def rows(self, observations: Arrays) -> NDArray[np.floating]:
         """Return the agent's observation, shape (B, k)."""
         return np.ascontiguousarray(observations[self.agents[0]])
 
@@ -104,7 +122,7 @@ class SharedPolicy(View):
         self.observation_space = spaces.Box(low, high, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (max(self._actions.values()),), dtype=np.float32)
 
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
+    def rows(self, observations: Arrays) -> NDArray[np.floating]:
         """Return the padded and marked observations, shape (N·B, longest + N)."""
         copies = len(observations[self.agents[0]])
         rows = np.zeros((len(self.agents), copies, self._length + len(self.agents)), dtype=np.float32)
@@ -145,7 +163,7 @@ class AllAtOnce(View):
         )
         self.action_space = spaces.Box(-1.0, 1.0, (int(self._ends[-1]),), dtype=np.float32)
 
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
+    def rows(self, observations: Arrays) -> NDArray[np.floating]:
         """Return the observations side by side, shape (B, Σ k)."""
         return np.concatenate([observations[agent] for agent in self.agents], axis=1)
 
@@ -163,39 +181,6 @@ class AllAtOnce(View):
         return mean
 
 
-class WithState(View):
-    """Another view, and the whole state beside it: ``{"observation": …, "state": …}``.
-
-    The state is that of ``VectorEnv.state()``, in physical units and double precision.
-    """
-
-    def __init__(self, env: VectorEnv, view: View) -> None:
-        """Add the state of ``env`` to what ``view`` shows."""
-        self._view = view
-        self.agents, self.row_agents = view.agents, view.row_agents
-        self.action_space = view.action_space
-        state = spaces.Box(-np.inf, np.inf, (len(env.state_names) + 1,), dtype=np.float64)
-        self.observation_space = spaces.Dict({"observation": view.observation_space, "state": state})
-
-    def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
-        """Return the view's rows, and for each the state of its copy."""
-        rows = self._view.observe(observations, state)
-        assert isinstance(rows, np.ndarray)
-        return {"observation": rows, "state": np.tile(state(), (max(1, len(self.row_agents)), 1))}
-
-    def act(self, actions: NDArray[np.floating]) -> Arrays:
-        """Act as the view does."""
-        return self._view.act(actions)
-
-    def join(self, actions: Arrays) -> NDArray[np.float32]:
-        """Join as the view does."""
-        return self._view.join(actions)
-
-    def score(self, rewards: Arrays) -> Floats:
-        """Score as the view does."""
-        return self._view.score(rewards)
-
-
 def view_of(env: VectorEnv, agents: Sequence[str], scheme: Scheme, *, with_state: bool = False) -> View:
     """Return how a learner of ``agents`` sees ``env``; one that is independent has a single agent."""
     view: View
@@ -204,7 +189,7 @@ def view_of(env: VectorEnv, agents: Sequence[str], scheme: Scheme, *, with_state
         view = OneAgent(env, agent)
     else:
         view = SharedPolicy(env, agents) if scheme == "shared" else AllAtOnce(env, agents)
-    return WithState(env, view) if with_state else view
+    return view.with_state(env) if with_state else view
 
 
 def unseen_state(env: VectorEnv) -> Callable[[], Floats]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from cirl_marl.errors import RunError
 from cirl_marl.records.files import write_atomically
@@ -24,14 +25,10 @@ WINDOW = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperRow:
-    """One training run: what, with which settings, how long.
+    """One training run: environment and algorithm as the paper calls them, and environment steps over all copies.
 
-    Attributes:
-        environment: name in the paper.
-        algorithm: name in the paper; of a tuned row, that of its recipe, with ``-HER`` where it learns in hindsight.
-        settings: ``published`` for the paper's own, ``tuned`` for ``agents/paper_*.toml``.
-        steps: environment steps, summed over the copies.
-        seed: of model and environment.
+    Settings are ``published``, the paper's own, or ``tuned``, those of ``agents/paper_*.toml``. The algorithm of a
+    tuned row is that of its recipe, with ``-HER`` where it learns in hindsight.
     """
 
     environment: str
@@ -52,13 +49,9 @@ class PaperRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
-    """The final policy, deterministic, on fresh episodes.
+    """The final policy, deterministic, on fresh episodes: mean and standard deviation of their returns.
 
-    Attributes:
-        episodes: how many.
-        mean: of their returns.
-        deviation: standard deviation of their returns.
-        success: share with a success at any step, percent; None if the environment knows no success.
+    ``success`` is the share with a success at any step, percent; None if the environment knows no success.
     """
 
     episodes: int
@@ -72,7 +65,6 @@ class Result:
     """What a finished row measured, and what it depends on.
 
     Attributes:
-        row: the row.
         steps_done: environment steps done; on-policy learners finish their last rollout, and a learner whose weights
             became NaN did no more.
         seconds: wall time of training, without evaluation.
@@ -120,25 +112,9 @@ class Result:
         """ψ = ζ / steps done."""
         return self.gain / self.steps_done
 
-    @classmethod
-    def from_dict(cls, plain: dict[str, Any]) -> Result:
-        """Read what ``asdict`` returned, after a detour through JSON."""
-        given = {key: value for key, value in plain.items() if key not in ("gain", "gain_per_step")}
-        row = dict(given["row"])
-        row.setdefault("settings", row.pop("recipe", "published"))  # what files of 0.1 call it
-        given["row"] = PaperRow(**row)
-        for key in ("evaluation", "published_ends"):
-            given[key] = Evaluation(**given[key]) if given.get(key) is not None else None
-        given["curve"] = [(int(step), float(value)) for step, value in given["curve"]]
-        return cls(**given)
-
 
 class Results:
-    """A directory of results.
-
-    Attributes:
-        path: the directory.
-    """
+    """A directory of results."""
 
     def __init__(self, path: str | Path) -> None:
         """Refer to a directory; it is made when the first result is written."""
@@ -153,19 +129,11 @@ class Results:
         return self.file(row).is_file()
 
     def read(self, row: PaperRow) -> Result:
-        """Return the result of ``row``.
-
-        Raises:
-            RunError: if it is not done, or its file is not a result.
-        """
+        """Return the result of ``row``; a ``RunError`` if it is not done, or its file is not a result."""
         return _read(self.file(row))
 
     def prepare(self) -> None:
-        """Make the directory.
-
-        Raises:
-            RunError: if the path cannot be one.
-        """
+        """Make the directory; a ``RunError`` if the path cannot be one."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -198,8 +166,10 @@ def _one_line_each(plain: dict[str, Any]) -> str:
 
 def _read(path: Path) -> Result:
     try:
-        return Result.from_dict(json.loads(path.read_text()))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        plain = json.loads(path.read_text())
+        plain["row"].setdefault("settings", plain["row"].pop("recipe", "published"))  # what files of 0.1 call it
+        return TypeAdapter(Result).validate_python(plain)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RunError(f"{path}: is not the result of a row: {error!r}; delete it to run the row again") from error
 
 

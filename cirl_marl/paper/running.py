@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
@@ -12,30 +11,27 @@ import gymnasium
 import numpy as np
 import torch
 from pydantic import ValidationError
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.training import one_torch_thread
-from cirl_marl.paper.final_policy import Report, evaluate, evaluation_episodes
 from cirl_marl.paper.published import PaperEnvironment, environment_of
-from cirl_marl.paper.results import WINDOW, PaperRow, Result, thinned
+from cirl_marl.paper.results import WINDOW, Evaluation, PaperRow, Result, thinned
 from cirl_marl.paper.selection import tuned_recipe
-from cirl_marl.paper.tuned import train_tuned
-from cirl_marl.paper.untuned import check_registered, described, train_published
+from cirl_marl.paper.training import Predict, Report, check_registered, described, train_published, train_tuned
 from cirl_marl.records.machine import processor, versions
 
 PACKAGES = ("gymnasium-robotics", "mujoco")
 """On which the two robots depend, beside what every training run records."""
+EVALUATION_EPISODES = 100
+EVALUATION_COPIES = 20
 
 
-def run_row(row: PaperRow, *, report: Report | None = None, episodes: int | None = None) -> Result:
-    """Train and evaluate one row.
-
-    Args:
-        row: what to run.
-        report: called now and then.
-        episodes: that the final policy plays; None takes 100, or the paper's number where it counts successes.
+def run_row(row: PaperRow, *, report: Report = lambda what, done, total: None, episodes: int | None = None) -> Result:
+    """Train and evaluate one row; the final policy plays 100 ``episodes``, or the paper's where it counts successes.
 
     Raises:
         CirlError: if the environment is missing in this version, or no training episode ended.
@@ -44,15 +40,12 @@ def run_row(row: PaperRow, *, report: Report | None = None, episodes: int | None
     check_registered(environment)
     if environment.success_episodes:
         _check_success(environment)
-    report = report or _silent
     with one_torch_thread():
-        if row.settings == "published":
-            trained = train_published(environment, row, report)
-        else:
-            trained = train_tuned(environment, row, report)
+        train = train_published if row.settings == "published" else train_tuned
+        trained = train(environment, row, report)
         if not trained.returns:
             raise CirlError(f"{row}: no training episode ended; use more steps")
-        episodes = evaluation_episodes(environment, episodes)
+        episodes = _evaluation_episodes(environment, episodes)
         seed = EVALUATION_SEEDS + SEED_SPACING * row.seed
         evaluation = published_ends = None
         if trained.predict is not None:
@@ -61,6 +54,7 @@ def run_row(row: PaperRow, *, report: Report | None = None, episodes: int | None
                 options = trained.options | {"legacy_episode": True}  # its first episode is longer than all others
                 published_ends = evaluate(environment.id, trained.predict, episodes, seed, report, options, warm_up=1)
         threads = torch.get_num_threads()
+    machine = {"cpus": os.cpu_count(), "model": processor(), "torch_threads": threads, "device": "cpu"}
     window = max(1, min(WINDOW, len(trained.returns) // 2))
     return Result(
         row=row,
@@ -73,13 +67,7 @@ def run_row(row: PaperRow, *, report: Report | None = None, episodes: int | None
         evaluation=evaluation,
         settings=trained.settings,
         versions=versions() | {package: metadata.version(package) for package in PACKAGES},
-        machine={
-            "cpus": os.cpu_count(),
-            "model": processor(),
-            "torch_threads": threads,
-            "load": os.getloadavg()[0],
-            "device": "cpu",
-        },
+        machine=machine | {"load": os.getloadavg()[0]},
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
         cpu_seconds=trained.cpu_seconds,
         published_ends=published_ends,
@@ -87,30 +75,26 @@ def run_row(row: PaperRow, *, report: Report | None = None, episodes: int | None
 
 
 def outdated(result: Result, episodes: int | None = None) -> str:
-    """Return in what a result differs from what its row would give today; empty if in nothing that is known.
-
-    Args:
-        result: of a row that is done.
-        episodes: as for ``run_row``.
-    """
+    """Return in what a result differs from what ``run_row`` would give today; empty if in nothing that is known."""
     environment, settings = environment_of(result.row.environment), result.settings
-    wanted = evaluation_episodes(environment, episodes)
+    wanted = _evaluation_episodes(environment, episodes)
     if result.evaluation is not None and result.evaluation.episodes != wanted:
         return f"its policy played {result.evaluation.episodes} episodes, not {wanted}"
     recorded = settings.get("definition_sha256")
     if recorded is not None and recorded != described(environment).get("definition_sha256"):
         return "the definition of the environment is another now"
-    name = tuned_recipe(environment.name) if result.row.settings == "tuned" else None
-    if name is not None and not _is_recipe(settings["recipe"], load_recipe(name)):
-        return f"the recipe '{name}' is another now"
+    if result.row.settings == "tuned" and (name := tuned_recipe(environment.name)) is not None:
+        try:
+            same = Recipe.model_validate(settings["recipe"]) == load_recipe(name)
+        except ValidationError:  # it has keys that recipes no longer have
+            same = False
+        return "" if same else f"the recipe '{name}' is another now"
     return ""
 
 
-def _is_recipe(recorded: Mapping[str, Any], recipe: Recipe) -> bool:
-    try:
-        return Recipe.model_validate(recorded) == recipe
-    except ValidationError:  # it has keys that recipes no longer have
-        return False
+def _evaluation_episodes(environment: PaperEnvironment, asked: int | None) -> int:
+    """Return how many episodes a final policy plays: as many as ``asked``, else 100, or the paper's that succeed."""
+    return asked or environment.success_episodes or EVALUATION_EPISODES
 
 
 def _check_success(environment: PaperEnvironment) -> None:
@@ -123,5 +107,40 @@ def _check_success(environment: PaperEnvironment) -> None:
         raise RunError(f"{environment.id}: its info lacks 'success', whose share is a figure of this row")
 
 
-def _silent(what: str, done: int, total: int) -> None:
-    del what, done, total
+def evaluate(
+    id_: str, predict: Predict, episodes: int, seed: int, report: Report, options: dict[str, Any], *, warm_up: int = 0
+) -> Evaluation:
+    """Return mean return and share of successes of ``episodes`` fresh episodes.
+
+    Each copy plays a fixed number of episodes, so that short ones are not favoured, after ``warm_up`` that do not
+    count.
+    """
+    copies = min(EVALUATION_COPIES, episodes)
+    env = DummyVecEnv([lambda: Monitor(gymnasium.make(id_, **options))] * copies)
+    env.seed(seed)
+    quota = np.array([(episodes + copy) // copies for copy in range(copies)])
+    played = np.full(copies, -warm_up)
+    reached, starts = np.zeros(copies, dtype=bool), np.ones(copies, dtype=bool)
+    returns: list[float] = []
+    successes: list[bool] = []
+    knows_success, state, observation = False, None, env.reset()
+    while (played < quota).any():
+        actions, state = predict(observation, state, starts)
+        observation, _, starts, infos = env.step(actions)
+        for copy, info in enumerate(infos):
+            knows_success |= "success" in info
+            reached[copy] |= bool(info.get("success", False))
+            if starts[copy]:
+                if 0 <= played[copy] < quota[copy]:
+                    returns.append(float(info["episode"]["r"]))
+                    successes.append(bool(reached[copy]))
+                played[copy] += 1
+                reached[copy] = False
+        report("evaluating", len(returns), episodes)
+    env.close()
+    return Evaluation(
+        episodes=len(returns),
+        mean=float(np.mean(returns)),
+        deviation=float(np.std(returns)),
+        success=100 * float(np.mean(successes)) if knows_success else None,
+    )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from cirl_marl.definitions.catalogue import recipes
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, chosen, environment_of
+from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, environment_of
 from cirl_marl.paper.results import PaperRow
 
 SETTINGS = ("published", "tuned")
@@ -20,14 +20,9 @@ def planned(
     seeds: int = 1,
     settings: str | None = "published",
 ) -> list[PaperRow]:
-    """Return the rows that the names choose.
+    """Return the rows that the names choose; None chooses all, the paper's steps, or both settings.
 
-    Args:
-        environment: name in the paper; None chooses all eight.
-        algorithm: name in the paper; None chooses all that it ran there.
-        steps: environment steps of each row; None takes the paper's.
-        seeds: seeds 0, 1, … of each row.
-        settings: ``published``, ``tuned``, or None for both.
+    Each has the seeds 0, 1, … below ``seeds``.
 
     Raises:
         CirlError: for a name that does not exist, or a combination that the paper did not run.
@@ -38,18 +33,42 @@ def planned(
         raise CirlError(f"{environment} is an algorithm, which comes after an environment: {', '.join(ENVIRONMENTS)}")
     if algorithm is not None and algorithm not in ALGORITHMS:
         raise CirlError(unknown("algorithm of the paper", algorithm, ALGORITHMS))
-    rows = []
-    if settings != "tuned":
-        rows += [
-            PaperRow(environment=found.name, algorithm=name, steps=steps or found.steps, seed=seed)
-            for found, name in chosen(environment, algorithm)
-            for seed in range(seeds)
-        ]
+    asked = [] if settings == "tuned" else [(*run, "published") for run in _published(environment, algorithm)]
     if settings != "published":
-        rows += _tuned(environment, algorithm, steps, seeds, must_exist=settings == "tuned")
-    if not rows:
+        only = environment is not None and settings == "tuned"
+        asked += [(*run, "tuned") for run in _tuned(environment, algorithm, must_fit=only)]
+    if not asked:
         raise CirlError(f"there is no tuned recipe agents/paper_*.toml for {environment or algorithm or 'any'}")
-    return rows
+    return [
+        PaperRow(environment=found.name, algorithm=name, settings=how, steps=steps or found.steps, seed=seed)
+        for found, name, how in asked
+        for seed in range(seeds)
+    ]
+
+
+def _environments(name: str | None) -> list[PaperEnvironment]:
+    return list(ENVIRONMENTS.values()) if name is None else [environment_of(name)]
+
+
+def _published(environment: str | None, algorithm: str | None) -> Iterator[tuple[PaperEnvironment, str]]:
+    """Yield the paper's own runs."""
+    for found in _environments(environment):
+        if environment is not None and algorithm not in (None, *found.runs):
+            raise CirlError(f"the paper did not run {algorithm} on {found.name}; it ran {', '.join(found.runs)}")
+        yield from ((found, name) for name in found.runs if algorithm in (None, name))
+
+
+def _tuned(environment: str | None, algorithm: str | None, *, must_fit: bool) -> Iterator[tuple[PaperEnvironment, str]]:
+    """Yield what there are tuned recipes for, with the algorithms that these use."""
+    from cirl_marl.learners.recipe import load_recipe
+
+    for found in _environments(environment):
+        if (name := tuned_recipe(found.name)) is not None:
+            learner = load_recipe(name).learner.algorithm + ("-HER" if found.has_goals else "")
+            if algorithm in (None, learner):
+                yield found, learner
+            elif must_fit:
+                raise CirlError(f"the tuned recipe '{name}' uses {learner}, not {algorithm}")
 
 
 def minutes(row: PaperRow) -> float:
@@ -77,27 +96,3 @@ def tuned_recipe(environment: str) -> str | None:
     """Return the name of the catalogue's recipe for an environment of the paper, ``paper_…``; None if there is none."""
     key = environment.lower()
     return next((name for name in recipes() if name.replace("_", "") == f"paper{key}"), None)
-
-
-def _tuned(
-    environment: str | None, algorithm: str | None, steps: int | None, seeds: int, *, must_exist: bool
-) -> list[PaperRow]:
-    from cirl_marl.learners.recipe import load_recipe
-
-    rows = []
-    for found in [environment_of(environment)] if environment is not None else ENVIRONMENTS.values():
-        name = tuned_recipe(found.name)
-        if name is None:
-            if must_exist and environment is not None:
-                raise CirlError(f"there is no tuned recipe agents/paper_*.toml for {environment}")
-            continue
-        learner = load_recipe(name).learner.algorithm + ("-HER" if found.has_goals else "")
-        if algorithm not in (None, learner):
-            if must_exist and environment is not None:
-                raise CirlError(f"the tuned recipe '{name}' uses {learner}, not {algorithm}")
-            continue
-        rows += [
-            PaperRow(environment=found.name, algorithm=learner, settings="tuned", steps=steps or found.steps, seed=seed)
-            for seed in range(seeds)
-        ]
-    return rows

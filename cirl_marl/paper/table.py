@@ -18,15 +18,12 @@ NOT_RUN = "not run"
 
 def result_line(result: Result) -> str:
     """Say in one line what a row gave."""
-    success = ""
+    figures = f"r_s {number(result.start_return)}, r_e {number(result.end_return)}, ζ {number(result.gain)}"
     if result.evaluation is None:
-        success = f", {_broke(result)}"
+        figures += f", {_broke(result)}"
     elif result.evaluation.success is not None:
-        success = f", s {result.evaluation.success:.1f} %"
-    return (
-        f"{result.row}: r_s {number(result.start_return)}, r_e {number(result.end_return)}, "
-        f"ζ {number(result.gain)}{success}, {result.seconds / 60:.1f} min"
-    )
+        figures += f", s {result.evaluation.success:.1f} %"
+    return f"{result.row}: {figures}, {result.seconds / 60:.1f} min"
 
 
 def environment_table(environment: PaperEnvironment, results: Sequence[Result]) -> Table:
@@ -42,17 +39,14 @@ def environment_table(environment: PaperEnvironment, results: Sequence[Result]) 
 def table_rows(environment: PaperEnvironment, results: Iterable[Result]) -> list[tuple[str, ...]]:
     """Return the cells of one environment: for each algorithm the paper's row and ours, then the tuned rows."""
     own = [result for result in results if result.row.environment == environment.name]
+    kept = {kind: [r for r in own if r.row.settings == kind] for kind in ("published", "tuned")}
     rows = []
-    for algorithm, published in environment.runs.items():
-        rows.append(_paper_row(environment, algorithm, published))
-        found = [r for r in own if (r.row.algorithm, r.row.settings) == (algorithm, "published")]
-        rows.append(_our_row(environment, algorithm, "ours", found))
-    tuned = {result.row.algorithm: None for result in own if result.row.settings == "tuned"}
-    for algorithm in tuned:
-        found = [r for r in own if (r.row.algorithm, r.row.settings) == (algorithm, "tuned")]
-        rows.append(_our_row(environment, algorithm, "tuned", found))
-    if not tuned:
-        rows.append(_our_row(environment, "", "tuned", []))
+    for name, published in environment.runs.items():
+        found = [result for result in kept["published"] if result.row.algorithm == name]
+        rows += [_paper_row(environment, name, published), _our_row(environment, name, "ours", found)]
+    for name in dict.fromkeys(result.row.algorithm for result in kept["tuned"]) or ("",):
+        found = [result for result in kept["tuned"] if result.row.algorithm == name]
+        rows.append(_our_row(environment, name, "tuned", found))
     return rows
 
 
@@ -103,9 +97,8 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
     """Average the seeds that have as many steps as the paper; failing these, those with the most steps."""
     if not found:
         return (algorithm, run, *("" for _ in NUMERIC), "", NOT_RUN)
-    steps = environment.steps
-    if all(result.row.steps != steps for result in found):
-        steps = max(result.row.steps for result in found)
+    done = [result.row.steps for result in found]
+    steps = environment.steps if environment.steps in done else max(done)
     seeds = sorted((result for result in found if result.row.steps == steps), key=lambda result: result.row.seed)
 
     def cell(figure: Callable[[Result], float]) -> str:
@@ -155,14 +148,12 @@ def notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
     """Say what final policies played and how much episodes vary, what is the best possible, and what differs."""
     best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
     mine = [result for result in results if result.row.environment == environment.name]
-    evaluations = [result.evaluation for result in mine if result.evaluation is not None]
     tuned = [result for result in mine if result.row.settings == "tuned"]
     sentences = []
-    if evaluations:
-        episodes = " or ".join(distinct(evaluation.episodes for evaluation in evaluations))
+    if episodes := distinct(result.evaluation.episodes for result in mine if result.evaluation is not None):
         spread = [result.evaluation for result in tuned if result.evaluation is not None]
         varied = f"; {_spread(spread)}" if spread else ""
-        sentences.append(f"Final policy: {episodes} episodes a seed{varied}.")
+        sentences.append(f"Final policy: {' or '.join(episodes)} episodes a seed{varied}.")
     ended = [result.published_ends.mean for result in tuned if result.published_ends is not None]
     if ended:
         sentences.append(f"Tuned ones where episodes end as the published class ends them: {over_seeds(ended)}.")

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from cirl_marl.evaluation.comparison import FIGURES, Comparison, Entry
-from cirl_marl.evaluation.provenance import provenance
+from cirl_marl.evaluation.comparison import FIGURES, Comparison
+from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, defined
 from cirl_marl.records.files import published, write_json, write_table
-from cirl_marl.report.fronts import PointSeries, save_fronts
+from cirl_marl.report.curves import PointSeries, save_fronts
 
 FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
 
@@ -25,16 +25,7 @@ def comparison_table(comparison: Comparison) -> Table:
     table = Table(
         title=f"{comparison.episodes} fresh episodes, the same for all; 95 % confidence intervals in brackets"
     )
-    columns = (
-        "policy",
-        "seeds",
-        f"λ̄ ({unit})",
-        "gain over neutral",
-        "service level",
-        f"bound ({unit})",
-        "gap to bound",
-    )
-    for column in columns:
+    for column in ("policy", "seeds", f"λ̄ ({unit})", *_units(comparison)[1:]):
         table.add_column(column, justify="left" if column == "policy" else "right")
     for row in comparison.rows:
         marked = f"{len(row.seeds)} (few)" if row.few else str(len(row.seeds) or "")
@@ -75,11 +66,7 @@ def _aggregate(found: Aggregate | None, form: str) -> str:
 def save_comparison(path: str | Path, comparison: Comparison) -> Path:
     """Save where each policy and controller of a comparison is, training seed by training seed."""
     series = [
-        PointSeries(
-            row.name,
-            np.array([entry.service.mean() for entry in row.entries]),
-            np.array([entry.circularity.mean() for entry in row.entries]),
-        )
+        PointSeries(row.name, *np.array([[each.service.mean(), each.circularity.mean()] for each in row.entries]).T)
         for row in comparison.rows
     ]
     title = f"{comparison.network.title or comparison.network.name}: {comparison.episodes} episodes"
@@ -87,20 +74,17 @@ def save_comparison(path: str | Path, comparison: Comparison) -> Path:
 
 
 def write_comparison(comparison: Comparison, folder: Path, **options: Any) -> list[Path]:
-    """Write the files of a comparison, all of them or none.
+    """Write the files of a comparison, all of them or none, and return them; ``options`` are for the provenance.
 
-    Args:
-        comparison: what to write.
-        folder: made if missing; files of an earlier comparison in it are replaced.
-        **options: what was asked for, for the provenance.
-
-    Returns:
-        The files: ``episodes.csv`` with a row for each episode of each policy and controller, ``summary.csv`` and
-        ``summary.json`` with the figures of the table, and ``comparison.png``.
+    They are ``episodes.csv`` with a row for each episode of each policy and controller, ``summary.csv`` and
+    ``summary.json`` with the figures of the table, and ``comparison.png``. Those of an earlier comparison are replaced.
     """
+    units = _units(comparison)
+    episodes = ["name", "training seed", "run", "episode", *units, "start seed"]
+    rows = ["name", "training seeds", *(f"{name}{end}" for name in units for end in ("", ", low", ", high"))]
     with published(folder) as partial:
-        write_table(partial / FILES[0], [*_columns(comparison), "start seed"], _episodes(comparison))
-        write_table(partial / FILES[1], _summary_columns(comparison), _summary(comparison))
+        write_table(partial / FILES[0], episodes, _episodes(comparison))
+        write_table(partial / FILES[1], rows, _summary(comparison))
         write_json(partial / FILES[2], summary_of(comparison, **options))
         save_comparison(partial / FILES[3], comparison)
     return [folder / name for name in FILES]
@@ -134,26 +118,13 @@ def _units(comparison: Comparison) -> list[str]:
     return [f"circularity ({mass})", "gain over neutral", "service level", f"bound ({mass})", "gap to bound"]
 
 
-def _columns(comparison: Comparison) -> list[str]:
-    return ["name", "training seed", "run", "episode", *_units(comparison)]
-
-
 def _episodes(comparison: Comparison) -> Iterator[list[object]]:
     for entry in comparison.entries:
         for episode in range(comparison.episodes):
-            figures = [_value(entry, which, episode) for which in FIGURES]
-            run = None if entry.run is None else str(entry.run.path)
+            found = [getattr(entry, which) for which in FIGURES]
+            figures = [None if each is None else defined(each[episode]) for each in found]
+            run = None if entry.run is None else entry.run.path
             yield [entry.name, entry.seed, run, episode, *figures, comparison.first_seed + episode]
-
-
-def _value(entry: Entry, which: str, episode: int) -> float | None:
-    values = getattr(entry, which)
-    return None if values is None else defined(values[episode])
-
-
-def _summary_columns(comparison: Comparison) -> list[str]:
-    ends = [column for name in _units(comparison) for column in (name, f"{name}, low", f"{name}, high")]
-    return ["name", "training seeds", *ends]
 
 
 def _summary(comparison: Comparison) -> Iterator[list[object]]:

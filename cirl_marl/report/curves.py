@@ -1,9 +1,10 @@
-"""Curves: circularity and service over time, learning curves, and trajectories."""
+"""Curves: circularity and service over time and against each other, learning curves, and trajectories."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
-from cirl_marl.drawing.style import DASHES, MUTED, SERIES, dressed, save, spoken
+from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dressed, save, shaped, spoken
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law
@@ -24,6 +25,17 @@ WIDTH = 9.0
 AGENT_PANELS = 20
 SHOWN = 10
 """Largest number of compartments in one panel of a trajectory."""
+MARKERS = "osD^vP*X"
+
+
+@dataclass(frozen=True, slots=True)
+class PointSeries:
+    """Points of one kind in the plane of mean service level and λ̄, mass, shape (points,) each; ``joined`` by a line."""
+
+    name: str
+    service: Floats
+    circularity: Floats
+    joined: bool = False
 
 
 def save_circularity(
@@ -34,15 +46,8 @@ def save_circularity(
     Lines are means over episodes; bands are the 95 % confidence intervals of the means (Student's t), where
     there are at least two episodes.
 
-    Args:
-        path: file to write; its folder is made.
-        network: gives the units.
-        time: shape (steps,), time.
-        runs: λ by control, shape (episodes, steps) each, mass.
-        services: service level by control, shape (episodes, steps) each.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
+    ``runs`` are λ, mass, and ``services`` service levels by control, of shape (episodes, steps), ``time`` (steps,);
+    other shapes raise a ``CirlError``.
     """
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
@@ -55,10 +60,8 @@ def save_circularity(
     below.set_ylim(-0.03, 1.06)
     _set_time(below, time, network)
     if names:
-        source = above if runs else below
-        figure.legend(
-            *source.get_legend_handles_labels(), loc="outside upper right", ncols=4, frameon=False, fontsize=9
-        )
+        lines, labels = (above if runs else below).get_legend_handles_labels()
+        figure.legend(lines, labels, loc="outside upper right", ncols=4, frameon=False, fontsize=9)
     return save(figure, path)
 
 
@@ -66,15 +69,8 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
     """Save the episode returns of each agent while it learned as a PNG, one panel per agent; return its path.
 
     Raw returns are light, their centred moving average over a fifteenth of the episodes is bold. Of more
-    than 20 agents the first 20 are shown.
-
-    Args:
-        path: file to write; its folder is made.
-        steps: environment steps at the end of each episode, shape (episodes,).
-        returns: episode returns by agent, shape (episodes,) each.
-
-    Raises:
-        CirlError: if an array has the wrong shape.
+    than 20 agents the first 20 are shown. ``steps`` are environment steps at the end of each episode, and ``returns``
+    those of episodes by agent, shape (episodes,) each; other shapes raise a ``CirlError``.
     """
     shown = list(returns.items())[:AGENT_PANELS]
     columns = max(1, min(len(shown), 3 if len(shown) <= 9 else 4))
@@ -129,40 +125,62 @@ def save_trajectory(
         CirlError: if an array has the wrong shape.
     """
     steps, mass = (len(time),), network.mass_unit
-    stock = _shaped("stock", stock, (len(network.nodes), *steps))
-    flow = _shaped("flow", flow, (len(network.arcs), *steps))
-    circularity = _shaped("circularity", circularity, steps)
+    stock = shaped("stock", stock, (len(network.nodes), *steps))
+    flow = shaped("flow", flow, (len(network.arcs), *steps))
+    circularity = shaped("circularity", circularity, steps)
     held = [node.id for node in network.nodes]
     if load is not None:
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {arc}" for arc in on_the_way]
-        stock = np.concatenate([stock, _shaped("load", load, (len(on_the_way), *steps))])
+        stock = np.concatenate([stock, shaped("load", load, (len(on_the_way), *steps))])
     held_at = time
     if start is not None:
-        stock = np.column_stack([_shaped("start", start, (len(stock),)), stock])
+        stock = np.column_stack([shaped("start", start, (len(stock),)), stock])
         held_at = np.concatenate([[0.0], time])
     heights = (1.25, 1.25, 0.8) if service is None else (1.25, 1.25, 0.8, 0.5)
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
     figure.suptitle(title, fontsize=11, fontweight="bold")
-    above, middle, below, *rest = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-    _draw_largest(above, held_at, stock, held, "Stocks", mass)
-    _draw_largest(middle, time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}")
-    below.plot(time, circularity, color=SERIES[0], linewidth=1.8, marker=_dots(time))
-    dressed(below, title="Circularity", ylabel=f"λ / {mass}")
-    for last in rest:
-        level = _shaped("service", np.asarray(service), steps)
-        last.plot(time, level, color=SERIES[0], linewidth=1.8, marker=_dots(time))
-        dressed(last, title="Service level", ylabel="service level")
-        last.set_ylim(-0.03, 1.06)
-    _set_time([above, middle, below, *rest][-1], held_at, network)
+    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    _draw_largest(panels[0], held_at, stock, held, "Stocks", mass)
+    _draw_largest(panels[1], time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}")
+    _draw_mean(panels[2], time, circularity, "", 0)
+    dressed(panels[2], title="Circularity", ylabel=f"λ / {mass}")
+    if service is not None:
+        _draw_mean(panels[3], time, shaped("service", service, steps), "", 0)
+        dressed(panels[3], title="Service level", ylabel="service level")
+        panels[3].set_ylim(-0.03, 1.06)
+    _set_time(panels[-1], held_at, network)
     return save(figure, path)
 
 
-def _shaped(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
-    found = np.asarray(values, dtype=float)
-    if found.shape != shape:
-        raise CirlError(f"{name} has shape {found.shape}, expected {shape}")
-    return found
+def save_fronts(
+    path: str | Path, network: Network, series: Sequence[PointSeries], bound: Floats, *, title: str
+) -> Path:
+    """Save λ̄ against the service level of policies, plans or controllers as a PNG and return its path.
+
+    ``bound`` is service level and bound on λ̄, shape (points, 2), by service; what lies above is shaded. Empty for none.
+    """
+    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
+    axes = figure.subplots()
+    for place, each in enumerate(series):
+        colour = SERIES[place % len(SERIES)]
+        line = DASHES[place % len(DASHES)] if each.joined else ""
+        axes.plot(
+            each.service,
+            each.circularity,
+            color=colour,
+            marker=MARKERS[(place + place // len(SERIES)) % len(MARKERS)],  # colours come round before pairs do
+            linestyle=line,
+            linewidth=1.4,
+            alpha=0.9,
+            label=spoken(each.name),
+        )
+    if len(bound):
+        _draw_bound(axes, bound)
+    dressed(axes, title=title, ylabel=f"λ̄ / {network.mass_unit}")
+    axes.set_xlabel("mean service level", fontsize=9)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
+    return save(figure, path)
 
 
 def _matching(name: str, values: Floats, time: Floats) -> Floats:
@@ -184,7 +202,7 @@ def _set_time(axes: Axes, time: Floats, network: Network) -> None:
         axes.set_xlim(float(np.min(time)), float(np.max(time)))
 
 
-def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, *, top: float) -> None:
+def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, top: float = math.inf) -> None:
     episodes = np.atleast_2d(values)
     count = len(episodes)
     if count == 0:
@@ -232,3 +250,19 @@ def _draw_largest(axes: Axes, time: Floats, values: Floats, names: Sequence[str]
     dressed(axes, title=title + more, ylabel=unit)
     if len(kept):
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
+
+
+def _draw_bound(axes: Axes, bound: Floats) -> None:
+    """Draw the front of the bounds and shade what it rules out.
+
+    The bound for a service holds for every higher one, so steps are what is proved, for the start that it is of. Where
+    points are means over other starts, as that of their middle, one of them may lie above.
+    """
+    low, high = axes.get_ylim()
+    high = max(high, float(bound[:, 1].max()) + 0.05 * (high - low))
+    service, most = np.append(bound[:, 0], 1.0), np.append(bound[:, 1], bound[-1, 1])
+    axes.step(service, most, where="post", color=INK, linewidth=1.6, label="bound")
+    axes.fill_between(service, most, high, step="post", color=GRID, linewidth=0, zorder=0)
+    note, below = "proved out of reach from a middle start", (-4, -12)
+    axes.annotate(note, (1.0, high), xytext=below, textcoords="offset points", ha="right", fontsize=8, color=MUTED)
+    axes.set_ylim(low, high)

@@ -31,12 +31,7 @@ def evaluate_run(
 ) -> tuple[dict[str, Any], dict[str, Rollout], VectorEnv]:
     """Compare the trained policies with neutral and random control on fresh episodes.
 
-    Args:
-        run: a run with a checkpoint.
-        episodes: number of episodes.
-        seed: different seeds evaluate on different episodes.
-        bounds: whether to hold the episodes against the best possible, which takes longer than the episodes.
-        progress: called with what is being done and the share of all that is done.
+    The other arguments are those of ``compare``; bounds take longer than the episodes.
 
     Returns:
         The figures, which are also written to ``evaluation.json``, the rollouts by controller, and the environment. An
@@ -86,24 +81,13 @@ def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv)
     folder.mkdir(exist_ok=True)
     network = env.network
     before, after = rollouts["neutral"], rollouts["trained"]
-    flows = folder / "flows_before_after.png"
-    save_before_after(
-        flows,
-        network,
-        (before.final_stock, before.mean_flow),
-        (after.final_stock, after.mean_flow),
-        ("neutral: mean flows, last stocks", "trained: mean flows, last stocks"),
-        (float(before.circularity.mean()), float(after.circularity.mean())),
-    )
-    time = interval_ends(network)
-    circularity = folder / "circularity.png"
-    save_circularity(
-        circularity,
-        network,
-        time,
-        {name: run_.circularity for name, run_ in rollouts.items()},
-        {name: run_.service for name, run_ in rollouts.items()},
-    )
+    first, last = ((each.final_stock, each.mean_flow) for each in (before, after))
+    labels = ("neutral: mean flows, last stocks", "trained: mean flows, last stocks")
+    means = float(before.circularity.mean()), float(after.circularity.mean())
+    flows = save_before_after(folder / "flows_before_after.png", network, first, last, labels, means)
+    runs = {name: each.circularity for name, each in rollouts.items()}
+    services = {name: each.service for name, each in rollouts.items()}
+    circularity = save_circularity(folder / "circularity.png", network, interval_ends(network), runs, services)
     curves, metrics = folder / "learning_curves.png", run.metrics()
     curves.unlink(missing_ok=True)
     if not metrics["env_steps"]:

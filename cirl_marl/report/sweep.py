@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from cirl_marl.evaluation.provenance import provenance
+from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.statistics import interquartile_mean
 from cirl_marl.evaluation.sweep import Sweep
 from cirl_marl.records.files import published, write_json, write_table
-from cirl_marl.report.fronts import PointSeries, save_fronts
+from cirl_marl.report.curves import PointSeries, save_fronts
 
 FILES = ("pareto.csv", "pareto.json", "pareto.png")
 

@@ -17,14 +17,10 @@ def networks_table(networks: Mapping[str, Network]) -> Table:
     table = Table(title="Networks")
     _columns(table, "name", "what it is", "compartments", "agents", "services", "scenarios")
     for name, network in networks.items():
-        table.add_row(
-            name,
-            network.title,
-            str(len(network.compartments)),
-            str(len(network.agents)),
-            ", ".join(service.id for service in network.services) or "none",
-            ", ".join([network.scenario_name, *network.scenarios]),
-        )
+        services = ", ".join(service.id for service in network.services) or "none"
+        scenarios = ", ".join([network.scenario_name, *network.scenarios])
+        counts = str(len(network.compartments)), str(len(network.agents))
+        table.add_row(name, network.title, *counts, services, scenarios)
     return table
 
 
@@ -90,32 +86,23 @@ def control_text(network: Network, compartment: Compartment) -> str:
 
 def evaluation_table(figures: Mapping[str, Any]) -> Table:
     """One row a controller: λ̄, gain, service level with confidence intervals; returns as means over the agents."""
-    title = f"{figures['episodes']} fresh episodes, mean ± half-width of the 95 % confidence interval"
-    table = Table(title=title)
-    columns = ["controller", f"λ̄ ({figures['unit']})", "gain over neutral", "service level", "return", "local return"]
-    bounded = all("gap" in row for row in figures["controllers"].values())
-    if bounded:
-        columns.append("gap to bound")
-    weighted = all("time_window_circularity" in row for row in figures["controllers"].values())
-    if weighted:
-        columns.append(f"weighted, time window ({figures['unit']})")
-    for column in columns:
-        table.add_column(column, justify="left" if column == "controller" else "right")
-    for name, row in figures["controllers"].items():
-        mean = {
-            which: float(np.mean([found["value"] for found in row[which].values()]))
-            for which in ("return", "local_return")
-        }
-        table.add_row(
-            name,
-            _figure(row["circularity"], "{:.4g}"),
-            _figure(row["circularity_gain"], "{:+.1%}"),
-            _figure(row["service_level"], "{:.4f}"),
-            f"{mean['return']:.4g}",
-            f"{mean['local_return']:.4g}",
-            *([_figure(row["gap"], "{:.1%}")] if bounded else []),
-            *([_figure(row["time_window_circularity"], "{:.4g}")] if weighted else []),
-        )
+    table = Table(title=f"{figures['episodes']} fresh episodes, mean ± half-width of the 95 % confidence interval")
+    unit, rows = figures["unit"], figures["controllers"]
+    columns = {
+        "circularity": (f"λ̄ ({unit})", "{:.4g}"),
+        "circularity_gain": ("gain over neutral", "{:+.1%}"),
+        "service_level": ("service level", "{:.4f}"),
+        "return": ("return", "{:.4g}"),
+        "local_return": ("local return", "{:.4g}"),
+        "gap": ("gap to bound", "{:.1%}"),
+        "time_window_circularity": (f"weighted, time window ({unit})", "{:.4g}"),
+    }
+    shown = [which for which in columns if all(which in row for row in rows.values())]
+    table.add_column("controller")
+    for which in shown:
+        table.add_column(columns[which][0], justify="right")
+    for name, row in rows.items():
+        table.add_row(name, *(_figure(row[which], columns[which][1]) for which in shown))
     return table
 
 
@@ -131,12 +118,16 @@ def local_returns_table(figures: Mapping[str, Any]) -> Table:
     return table
 
 
-def _figure(found: Mapping[str, float | None], form: str) -> str:
+def _figure(found: Mapping[str, Any], form: str) -> str:
     """Write a mean with the half-width of its interval, which is Student's and so symmetric; alone if it has none.
+
+    Of figures by agent it is the mean over the agents.
 
     >>> _figure({"value": 0.25, "low": 0.2, "high": 0.3}, "{:+.1%}")
     '+25.0% ± 5.0%'
     """
+    if set(found) != {"value", "low", "high"}:
+        return form.format(np.mean([each["value"] for each in found.values()]))
     value, high = found["value"], found["high"]
     if value is None:
         return "–"
