@@ -84,8 +84,8 @@ class Plan(Controller):
             )
         if plan.agents != env.agents:
             raise ControlError(f"plan: it is for agents {list(plan.agents)}, not {list(env.agents)}")
-        nodes = len(theirs.nodes)
-        size = np.concatenate([np.full(nodes, plan.initial[:nodes].sum()), np.abs(plan.initial[nodes:])])
+        size = np.abs(plan.initial)  # a stock is near where it should be, measured by all the mass there is
+        size[env.rows.nodes] = plan.initial[env.rows.nodes].sum()
         distant = np.abs(start[: len(size)] - plan.initial) > SAME * size
         if distant.any():
             row = int(distant.argmax())
