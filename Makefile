@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo check test test-all lint types wheel fast unit every study speed clean
+.PHONY: demo check test test-all written lint types wheel fast unit every study speed clean
 
 demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
 	rm -rf runs/demo
@@ -39,6 +39,9 @@ wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clea
 	$(PYTHON) -m venv build/clean
 	build/clean/bin/python -m pip install --disable-pip-version-check --quiet -c constraints.txt dist/*.whl
 	$(PYTHON) tests/installed.py build/clean
+
+written: $(VENV)/.runtime  ## the JSON schema of networks and docs/format.md, from the declarations of fields
+	$(BIN)/python -m cirl_marl.definitions.guide
 
 study: $(VENV)/.runtime  ## every recipe and controller on every network, against the bound (hours; it can be stopped)
 	$(BIN)/python benchmarks/study.py

@@ -31,7 +31,9 @@ def imported(text: str, known: Iterable[str]) -> set[str]:
     """Return the modules of the package that a file imports, wherever in it; a name counts as its module's."""
     everyone, found = set(known), set()
     for statement in ast.walk(ast.parse(text)):
-        if isinstance(statement, ast.ImportFrom) and statement.level == 0:
+        if isinstance(statement, ast.ImportFrom):
+            if statement.level:
+                raise ValueError("relative imports are not read: name the package")
             named = [f"{statement.module}.{alias.name}" for alias in statement.names]
             found |= {name if name in everyone else str(statement.module) for name in named}
         elif isinstance(statement, ast.Import):

@@ -13,8 +13,9 @@ CHECKOUT = Path(__file__).parent.parent
 LAYERS = (
     ("errors", "records"),
     ("network",),
-    ("compartments", "drawing", "dynamics"),
+    ("compartments", "drawing"),
     ("definitions",),
+    ("dynamics",),
     ("environments",),
     ("__init__", "controllers", "testing"),
     ("optimum",),
@@ -83,6 +84,8 @@ def test_every_kind_of_import_is_read() -> None:
     text = "import numpy\ndef f():\n    import cirl_marl.network.units as u\nfrom cirl_marl.network import Network\n"
     assert imported(text, known) == {f"{PACKAGE}.network", f"{PACKAGE}.network.units"}
     assert imported("from cirl_marl import errors, load_network", known) == {PACKAGE, f"{PACKAGE}.errors"}
+    with pytest.raises(ValueError, match="relative imports"):
+        imported("from ..optimum import bound", known)
 
 
 def test_packages_say_their_subject() -> None:

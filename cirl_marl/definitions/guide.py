@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
+from pathlib import Path
 from typing import Any, get_args
 
 from pydantic import BaseModel
@@ -58,3 +60,9 @@ def _wrapped(line: str, indent: int = 2) -> str:
     return (
         textwrap.fill(line, 120, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False) + "\n"
     )
+
+
+if __name__ == "__main__":
+    Path("docs/format.md").write_text(format_guide(), encoding="utf-8")
+    schema_ = json.dumps(schema.json_schema(), indent=2, ensure_ascii=False) + "\n"
+    Path("envs/network.schema.json").write_text(schema_, encoding="utf-8")

@@ -192,7 +192,7 @@ class MPC(Planner):
         if last is None:
             self._outlooks.pop(copy, None)
         if copy not in self._outlooks:
-            self._outlooks[copy] = self._plan(copy, rest, missing, None)
+            self._outlooks[copy] = self._plan(copy, rest, missing, None, certified=True)  # its multipliers are prices
         outlook = self._outlooks[copy]
         after = window.stop - outlook.intervals.start
         if missing is not None:
@@ -215,7 +215,13 @@ class MPC(Planner):
         return normalised_actions(replace(self._admissible, base=base), problem.layout, planned)
 
     def _plan(
-        self, copy: int, intervals: range, missing: float | None, basis: Basis | None, prices: Floats | None = None
+        self,
+        copy: int,
+        intervals: range,
+        missing: float | None,
+        basis: Basis | None,
+        prices: Floats | None = None,
+        certified: bool = False,
     ) -> _Plan:
         """Plan some intervals.
 
@@ -225,6 +231,7 @@ class MPC(Planner):
             missing: least sum of the service levels of all intervals; None if nothing is demanded.
             basis: from which the solver starts.
             prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
+            certified: whether the multipliers must be good.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
         demanded = None if missing is None else max(0.0, missing / len(intervals))
@@ -232,14 +239,14 @@ class MPC(Planner):
         what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
             problem = self._priced(self._programs, stock, intervals, demanded, prices)
-            solution = solve(problem, basis, what=what, certified=False)
+            solution = solve(problem, basis, what=what, certified=certified)
         except Infeasible:
             if demanded is None:
                 raise
             unit = self._env.network.objective.circularity_scale
             prices = None if prices is None else prices / unit
             problem = self._priced(self._urgent, stock, intervals, 0.0, prices)
-            solution = solve(problem, basis, what=what, certified=False)
+            solution = solve(problem, basis, what=what, certified=certified)
         planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
         actions = self._actions(problem, intervals, planned)
         return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)

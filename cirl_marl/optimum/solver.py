@@ -98,33 +98,34 @@ def solve(
         problem: the program.
         basis: from which to start.
         what: is solved, for the message of an error.
-        certified: whether multipliers must prove the answer good; else a plan that satisfies the rows will do.
+        certified: whether multipliers must prove the answer good; else what HiGHS calls optimal is taken at its word,
+            and of other answers that satisfy the rows the best.
 
     Raises:
         Infeasible: if there is no solution.
         Unsolved: if HiGHS finds no usable answer; names the network, what was not solved, and HiGHS's status.
     """
-    name, found, best, status = problem.layout.network.name, None, math.inf, ""
+    name, found, best, status, refused = problem.layout.network.name, None, math.inf, "", False
     scaled = _Scaled(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
     for settings in (None, *SETTINGS) if basis is not None else SETTINGS:
         highs = scaled.run(settings, basis if settings is None else None)
         ended = highs.getModelStatus()
-        if ended in NO_PLAN:
-            if settings is None:  # for the steadier methods to say
-                continue
-            raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {what}")
-        status = highs.modelStatusToString(ended)
+        status, refused = highs.modelStatusToString(ended), ended in NO_PLAN
+        if refused and settings is not None and not certified:
+            break
         if not scaled.is_feasible(highs):
             continue
         solution = scaled.solution(highs)
-        if not certified:
+        if not certified and ended == highspy.HighsModelStatus.kOptimal:
             return solution
         distance = scaled.distance(problem, solution)
         if distance < best:
             found, best = solution, distance
         if best <= OPTIMAL:
             break
-    if found is None or best > USABLE:
+    if found is None and refused:  # presolve errs now and then, so the last settings, without it, have the last word
+        raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {what}")
+    if found is None or (certified and best > USABLE):
         raise Unsolved(f"network '{name}': HiGHS did not solve {what}: {status}")
     return found
 
@@ -191,13 +192,14 @@ class _Scaled:
         return model
 
     def is_feasible(self, highs: highspy.Highs) -> bool:
-        """Whether HiGHS has values that satisfy every row, whatever it says of them."""
+        """Whether HiGHS has values that satisfy every row and box, whatever it says of them."""
         found = np.array(highs.getSolution().col_value)
         if found.shape != self._size.shape or not np.isfinite(found).all():
             return False
         missed = self._rows @ found - self._to
         missed[: self._equal] = np.abs(missed[: self._equal])
-        return bool(missed.max(initial=0.0) <= FEASIBLE)
+        outside = np.maximum(self.problem.low / self._size - found, found - self.problem.high / self._size)
+        return bool(max(missed.max(initial=0.0), outside.max(initial=0.0)) <= FEASIBLE)
 
     def solution(self, highs: highspy.Highs) -> Solution:
         """Return what HiGHS found, in the units of the network; of a run that failed there is no basis."""
@@ -218,7 +220,7 @@ class _Scaled:
             return math.inf
         proof = verified(problem, solution.certificate, solution.plan)
         # an objective near 0 is measured by the solver's tolerance on its largest term
-        return (proof.bound - proof.objective) / max(abs(proof.bound), self._scale * FEASIBLE / OPTIMAL)
+        return abs(proof.bound - proof.objective) / max(abs(proof.bound), self._scale * FEASIBLE / OPTIMAL)
 
 
 def _highs_basis(basis: Basis) -> highspy.HighsBasis:
