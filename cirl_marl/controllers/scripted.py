@@ -109,12 +109,7 @@ def incinerator(seen: Seen, model: Incinerator) -> Floats:
 HOLD_KJ_MIN, GAIN_KJ_MIN_K = 3.56e5, 3e4
 """Heat that holds 1000 °C at the reference inventory, and a gain that leaves it some degrees off elsewhere. [chosen]"""
 
-SCRIPTS: dict[str, Script] = {
-    "fetch": fetch,
-    "reacher": reacher,
-    "delivery_truck": truck,
-    "incinerator": incinerator,
-}
+SCRIPTS: dict[str, Script] = {"fetch": fetch, "reacher": reacher, "delivery_truck": truck, "incinerator": incinerator}
 """Script of each kind of model; that of a sorting station is its robot's."""
 
 

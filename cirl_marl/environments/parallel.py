@@ -103,11 +103,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
     def step(
         self, actions: Mapping[str, ArrayLike]
     ) -> tuple[
-        dict[str, NDArray[np.float32]],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
+        dict[str, NDArray[np.float32]], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
         """Hold one action per agent, each in its Box(−1, 1), for one control interval.
 
@@ -209,12 +205,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         circularity, service = float(outcome.circularity[0]), float(outcome.service_level[0])
         flows = outcome.flow[:, 0]
         infos: dict[str, dict[str, Any]] = {
-            agent: {
-                "circularity": circularity,
-                "local_reward": local,
-                "flows": flows,
-                "service_level": service,
-            }
+            agent: {"circularity": circularity, "local_reward": local, "flows": flows, "service_level": service}
             for agent, local in zip(self.possible_agents, outcome.local[:, 0].tolist(), strict=True)
         }
         for agent, success in outcome.success.items():

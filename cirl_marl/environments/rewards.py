@@ -118,10 +118,7 @@ class Credit:
             rows = dynamics.network.control_rows[agent]
             imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows, None]
         transition = dynamics.advance(
-            np.tile(state.stock, (1, count)),
-            np.tile(state.inner, (1, count)),
-            imagined,
-            np.tile(state.step, count),
+            np.tile(state.stock, (1, count)), np.tile(state.inner, (1, count)), imagined, np.tile(state.step, count)
         )
         imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
         flow = transition.moved / dynamics.network.episode.control_interval

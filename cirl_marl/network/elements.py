@@ -14,19 +14,7 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 
-from cirl_marl.network.declared import (
-    Amount,
-    Flag,
-    Kind,
-    Names,
-    Nested,
-    Numbers,
-    Quantity,
-    Text,
-    Word,
-    part,
-    settle,
-)
+from cirl_marl.network.declared import Amount, Flag, Kind, Names, Nested, Numbers, Quantity, Text, Word, part, settle
 from cirl_marl.network.model import CompartmentModel
 from cirl_marl.network.rowsum import Floats
 
@@ -312,8 +300,7 @@ class Service:
     weight: Annotated[float, Quantity("factor of the shortfall in the local rewards", low=0.0, required=True)] = 1.0
     measure: Annotated[str, Text('name of the measure, for ``quantity = "measure"``')] = ""
     owed_by: Annotated[
-        tuple[str, ...],
-        Names("compartments whose local reward bears the shortfall; empty means the provider alone"),
+        tuple[str, ...], Names("compartments whose local reward bears the shortfall; empty means the provider alone")
     ] = ()
 
     @property
@@ -367,8 +354,7 @@ class Objective:
     reward: Annotated[str, Word("default reward mode of the environments", of=REWARDS, required=True)] = "mixed"
     circularity_scale: Annotated[float, Quantity("reference |λ|", of="mass", positive=True, required=True)] = 1.0
     circularity_weight: Annotated[
-        float,
-        Quantity("weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local", low=0.0, high=1.0, required=True),
+        float, Quantity("weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local", low=0.0, high=1.0, required=True)
     ] = 0.5
     tracked: Annotated[
         tuple[str, ...],

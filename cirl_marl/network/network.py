@@ -24,13 +24,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from cirl_marl.errors import CirlError, NetworkError, unknown
-from cirl_marl.network.elements import (
-    SINKS,
-    Compartment,
-    Law,
-    Role,
-    Service,
-)
+from cirl_marl.network.elements import SINKS, Compartment, Law, Role, Service
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats, Integers, RowSum
 from cirl_marl.network.validate import problems
@@ -102,10 +96,7 @@ class Network(Parts):
         place[order] = np.arange(size)
         arcs = np.lexsort((place[self.recipients], place[self.donors]))
         return replace(
-            self,
-            nodes=tuple(self.nodes[i] for i in order),
-            arcs=tuple(self.arcs[k] for k in arcs),
-            scenarios={},
+            self, nodes=tuple(self.nodes[i] for i in order), arcs=tuple(self.arcs[k] for k in arcs), scenarios={}
         )
 
     @cached_property

@@ -147,10 +147,7 @@ class _Watched:
         env = self.env
         observations, infos = env.reset(seed=seed)
         require(set(env.agents) <= set(env.possible_agents), f"agents {env.agents} go beyond possible_agents")
-        require(
-            len(set(env.agents)) == len(env.agents) > 0,
-            f"reset: agents {env.agents} are not distinct or none",
-        )
+        require(len(set(env.agents)) == len(env.agents) > 0, f"reset: agents {env.agents} are not distinct or none")
         self._check_keys({"observations": observations, "infos": infos}, list(env.agents), 0)
         self._check_spaces(0)
         self._check_observations(observations, 0)
@@ -182,8 +179,7 @@ class _Watched:
         for name, by_agent in returned.items():
             require(isinstance(by_agent, dict), f"step {step}: {name} are a {type(by_agent).__name__}, not a dict")
             require(
-                set(by_agent) == set(agents),
-                f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}",
+                set(by_agent) == set(agents), f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}"
             )
 
     def _check_spaces(self, step: int) -> None:

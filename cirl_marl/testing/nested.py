@@ -24,8 +24,7 @@ def check_member(space: spaces.Space[Any], value: Any, where: str) -> None:
         return
     if isinstance(space, spaces.Tuple):
         require(
-            isinstance(value, tuple) and len(value) == len(space.spaces),
-            f"{where}: {value!r} does not fit {space}",
+            isinstance(value, tuple) and len(value) == len(space.spaces), f"{where}: {value!r} does not fit {space}"
         )
         for i, part in enumerate(space.spaces):
             check_member(part, value[i], f"{where}[{i}]")
