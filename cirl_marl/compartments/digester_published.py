@@ -72,8 +72,7 @@ class DigesterPublished(ContinuousModel, Outflowing):
 
     def derivative(self, state: Floats, inputs: Floats) -> Floats:
         """Return dz/dt per day, shape (6, B); ``inputs`` are the six dilutions, shape (6, B)."""
-        rate: Floats = self.reaction(state) + inputs * self.process.flushing(state)
-        return rate
+        return self.reaction(state) + inputs * self.process.flushing(state)
 
     def outflow(self, state: Floats, inputs: Floats) -> Floats:
         """Return ṁ12 = f_r·qC, CO₂ emitted per litre, mmol/(L d), shape (B,)."""

@@ -95,8 +95,7 @@ class TransportTruck(ContinuousModel):
         """Return rolling resistance plus drag, in N, shape (B,); it always opposes the motion."""
         rolling = self.rolling_resistance * mass_kg * self.gravity_m_s2 * np.tanh(speed_m_s / self.standstill_m_s)
         drag = 0.5 * self.air_density_kg_m3 * self.drag_area_m2 * speed_m_s * np.abs(speed_m_s)
-        total: Floats = rolling + drag
-        return total
+        return rolling + drag
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −((x* − x)² + 0.1 v² + 0.001 F²), shape (B,)."""

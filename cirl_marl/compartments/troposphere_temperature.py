@@ -70,8 +70,7 @@ class TroposphereTemperature(ContinuousModel):
 
     def effective_emissivity(self, co2_t: Floats) -> Floats:
         """Return ε = ε_n − η·x₁/V₁, shape as x₁."""
-        effective: Floats = self.emissivity - self.greenhouse_m3_mg * (co2_t / self.volume_km3)
-        return effective
+        return self.emissivity - self.greenhouse_m3_mg * (co2_t / self.volume_km3)
 
     def derivative(self, state: Floats, inputs: Floats, *, stock_kg: Floats) -> Floats:
         """Return Ṫ, K/d, shape (1, B).
@@ -84,8 +83,7 @@ class TroposphereTemperature(ContinuousModel):
         co2_t = stock_kg[None] / 1000.0
         absorbed = self.solar_w_m2 * (1.0 - self.albedo)
         emitted = self.effective_emissivity(co2_t) * self.stefan_boltzmann_w_m2_k4 * np.square(np.square(state))
-        rate: Floats = SECONDS_PER_DAY / self.heat_capacity_j_m2_k * (absorbed - emitted)
-        return rate
+        return SECONDS_PER_DAY / self.heat_capacity_j_m2_k * (absorbed - emitted)
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −(T − T*)², K², shape (B,)."""
@@ -96,5 +94,4 @@ class TroposphereTemperature(ContinuousModel):
         """Return T = (S(1 − α)/(εσ))^¼, K; NaN where ε ≤ 0."""
         emissivity = self.effective_emissivity(np.asarray(co2_t, dtype=np.float64))
         usable = np.where(emissivity > 0.0, emissivity, np.nan)
-        steady: Floats = (self.solar_w_m2 * (1.0 - self.albedo) / (usable * self.stefan_boltzmann_w_m2_k4)) ** 0.25
-        return steady
+        return (self.solar_w_m2 * (1.0 - self.albedo) / (usable * self.stefan_boltzmann_w_m2_k4)) ** 0.25

@@ -110,10 +110,9 @@ def rollout(
 
 def interval_ends(network: Network) -> Floats:
     """Return the time at which each control interval of an episode ends, shape (steps,)."""
-    ends: Floats = np.multiply(
+    return (np.multiply(
         np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64
-    )
-    return ends
+    ))
 
 
 def first_seed(seed: int) -> int:

@@ -103,8 +103,7 @@ class Control:
     def action(self, value: Floats) -> Floats:
         """Return the normalised actions, in [-1, 1], that come closest to physical values."""
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        action: Floats = np.clip((value - middle) / half, -1.0, 1.0)
-        return action
+        return np.clip((value - middle) / half, -1.0, 1.0)
 
 
 CONTROL = Nested("its actuator; None if it cannot act")

@@ -118,8 +118,7 @@ class Fetch(DiscreteTimeModel, GoalTask):
 
     def success(self, state: Floats, inputs: Floats) -> NDArray[np.bool_]:
         """Return whether the object is at the target, shape (B,)."""
-        found: NDArray[np.bool_] = self.reward(state, inputs) >= 0.0
-        return found
+        return self.reward(state, inputs) >= 0.0
 
     def _goals(self, state: Floats) -> tuple[Floats, Floats]:
         first = len(OBSERVATION)
