@@ -19,7 +19,7 @@ from cirl_marl.compartments.delivery_truck import DeliveryTruck
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.compartments.incinerator import PUBLISHED_FLOWS, Incinerator
-from cirl_marl.compartments.light import light_response
+from cirl_marl.compartments.microalgae import light_response
 from cirl_marl.compartments.microalgae_droop import MicroalgaeDroop
 from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
 from cirl_marl.compartments.transport_truck import TransportTruck

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import check_positive
+from cirl_marl.compartments.parameters import Positive
+from cirl_marl.network.declared import part
 from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
+@part
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Atmosphere(ContinuousModel):
     """Stock of CO₂ that rises by what is emitted and falls by what is removed: ṁ = ṁ12 − ṁ23 (arXiv 2502.02382).
@@ -20,9 +22,6 @@ class Atmosphere(ContinuousModel):
     emission and removal are arcs, as in ``net_zero``, the node is the box and needs no model: the network integrates
     its stock, and given the same flows both are equal. There is one form. No reward is published; it is −|ṁ12 − ṁ23|,
     zero at net zero.
-
-    Attributes:
-        volume_l: volume of the box, L.
     """
 
     kind: ClassVar[str] = "atmosphere"
@@ -32,11 +31,7 @@ class Atmosphere(ContinuousModel):
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
-    volume_l: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        check_positive(self.kind, volume_l=self.volume_l)
+    volume_l: Annotated[float, Positive("volume of the box, L")] = 1.0
 
     def derivative(self, state: Floats, inputs: Floats) -> Floats:
         """Return ṁ, mmol/d, shape (1, B)."""

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.compartments.parameters import check_positive
+from cirl_marl.compartments.parameters import Positive
+from cirl_marl.network.declared import Declared, Flag, part
 from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
+@part
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DigesterPublished(ContinuousModel, Outflowing):
     """AM2 after arXiv 2502.02382: ż = f(z) + G(z)·(D̄ + φ) with one dilution D̄ + φ_i for each state.
@@ -24,12 +26,6 @@ class DigesterPublished(ContinuousModel, Outflowing):
     gives ṁ12 = 175.08 instead of 66.96 mmol/(L d), and with it the ratio of digester to algae emission: published
     175.08/0.28 = 625 (exactly 175.08/0.2702 = 648); corrected 66.96/0.2702 = 248; and 66.96/0.0135 = 4960 when the
     uptake per litre is ρX, not ρ.
-
-    Attributes:
-        process: the parameters, and what both forms share.
-        dilution_per_day: D̄ at the equilibrium z̄. [published]
-        settling_day: T_max of the controller, d. [published]
-        misprint: whether P_C has the published product. [published: True]
     """
 
     kind: ClassVar[str] = "digester_published"
@@ -39,14 +35,12 @@ class DigesterPublished(ContinuousModel, Outflowing):
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
-    process: Digester = field(default_factory=Digester)
-    dilution_per_day: float = 0.5
-    settling_day: float = 3.5
-    misprint: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        check_positive(self.kind, dilution_per_day=self.dilution_per_day, settling_day=self.settling_day)
+    process: Annotated[Digester, Declared("the parameters, and what both forms share")] = field(
+        default_factory=Digester
+    )
+    dilution_per_day: Annotated[float, Positive("D̄ at the equilibrium z̄ [published]")] = 0.5
+    settling_day: Annotated[float, Positive("T_max of the controller, d [published]")] = 3.5
+    misprint: Annotated[bool, Flag("whether P_C has the published product [published: True]")] = True
 
     @property
     def equilibrium(self) -> Floats:

@@ -110,9 +110,7 @@ def rollout(
 
 def interval_ends(network: Network) -> Floats:
     """Return the time at which each control interval of an episode ends, shape (steps,)."""
-    return (np.multiply(
-        np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64
-    ))
+    return np.multiply(np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64)
 
 
 def first_seed(seed: int) -> int:

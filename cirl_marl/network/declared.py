@@ -111,10 +111,10 @@ class Quantity(Declared):
         within = self.low <= value <= self.high and (value > 0 or not self.positive)
         if self.joint or (math.isfinite(value) and within):
             return ""
+        if math.isfinite(self.high):
+            return f"must lie in {'(0' if self.positive else f'[{self.low:g}'}, {self.high:g}]"
         if self.positive:
             return "must be positive and finite"
-        if math.isfinite(self.high):
-            return f"must lie in [{self.low:g}, {self.high:g}]"
         if self.low == 0:
             return "must be finite and not negative"
         return f"must be at least {self.low:g}" if math.isfinite(self.low) else "must be finite"

@@ -18,6 +18,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.errors import NetworkError
+from cirl_marl.network.declared import bound_problems, settle
 from cirl_marl.network.rowsum import Floats
 
 RewardState = Literal["before", "after"]
@@ -53,6 +55,16 @@ class CompartmentModel(ABC):
     reward_state: ClassVar[RewardState] = STATED
     input_unit: ClassVar[str | None] = None
     context_names: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse parameters of another kind, or out of other bounds, than they are declared with.
+
+        Raises:
+            NetworkError: naming every parameter and its value.
+        """
+        settle(self.kind, self)
+        if found := list(bound_problems(self)):
+            raise NetworkError(self.kind, found)
 
     @property
     @abstractmethod
