@@ -16,7 +16,7 @@ from enum import StrEnum
 from functools import cache
 from numbers import Real
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import Any, Literal, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -76,23 +76,27 @@ class Word(Declared):
     called: str = ""
 
 
+class Kinds(NamedTuple):
+    """A kind of quantity that depends on the value of the field ``by``: one ``of`` those named, or ``otherwise``."""
+
+    by: str
+    of: Mapping[str, Kind]
+    otherwise: Kind
+
+
 @dataclass(frozen=True, slots=True)
 class Quantity(Declared):
     """A number with a unit.
 
     Attributes:
-        of: kind of quantity; or, by the value of the field ``by``, the kinds that differ from ``otherwise``.
-        by: the field that decides; empty if ``of`` is the same for all.
-        otherwise: kind for values of ``by`` that ``of`` does not name.
+        of: kind of quantity.
         low: lowest value; a ``positive`` one lies above 0.
         high: highest value.
         positive: whether it lies above 0.
         joint: whether its bounds depend on other fields, so that they are checked with these.
     """
 
-    of: Kind | Mapping[str, Kind] = "1"
-    by: str = ""
-    otherwise: Kind = "1"
+    of: Kind | Kinds = "1"
     low: float = -math.inf
     high: float = math.inf
     positive: bool = False
@@ -100,7 +104,8 @@ class Quantity(Declared):
 
     def kind(self, part: object) -> Kind:
         """Return the kind of quantity in ``part``, a part of a network or its table in a definition file."""
-        return self.of if isinstance(self.of, str) else self.of.get(getattr(part, self.by), self.otherwise)
+        kinds = self.of
+        return kinds if isinstance(kinds, str) else kinds.of.get(getattr(part, kinds.by), kinds.otherwise)
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
@@ -134,13 +139,11 @@ class Numbers(Declared):
     """Several numbers, which definition files spell in a table of their own.
 
     Attributes:
-        of: kind of quantity of each column.
         form: how they are given in Python.
         shape: their shape, None being any length.
         spelled: which table of definition files holds them; empty if that of another field does.
     """
 
-    of: tuple[Kind, ...] = ()
     form: str = ""
     shape: tuple[int | None, ...] = (None,)
     spelled: str = ""

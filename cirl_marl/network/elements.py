@@ -14,7 +14,7 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 
-from cirl_marl.network.declared import Amount, Flag, Kind, Names, Nested, Numbers, Quantity, Text, Word, part, settle
+from cirl_marl.network.declared import Amount, Flag, Kinds, Names, Nested, Numbers, Quantity, Text, Word, part, settle
 from cirl_marl.network.model import CompartmentModel
 from cirl_marl.network.rowsum import Floats
 
@@ -78,10 +78,11 @@ TAKEN: Mapping[Law, tuple[str, ...]] = {
 }
 """What each law takes, of the fields that only some laws take."""
 
-RATE_OF: Mapping[str, Kind] = {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}
-"""Kind of quantity of an arc's rate, where it is not 1/time."""
-MEASURED: Mapping[str, Kind] = {"stock": "mass", "measure": "1"}
-"""Kind of quantity of a service's band, where it is no flow."""
+RATE_OF = Kinds("law", {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}, "rate")
+SCALE_OF = Kinds("law", {Law.BATCH: "mass"}, "flow")
+BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
+
+Pair = tuple[float, float]
 
 
 @part
@@ -108,7 +109,12 @@ class Control:
 
 CONTROL = Nested("its actuator; None if it cannot act")
 MODEL = Nested("inner physics; None for a plain store or transport", of="model")
-PAIRS = "((low, high), …), one pair for each inner state"
+INNER = Numbers(
+    "(low, high) of the initial value of each inner state of the model, drawn uniformly; empty for a model that draws "
+    "its own start",
+    "((low, high), …), one pair for each inner state",
+    (None, 2),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,24 +126,19 @@ class Compartment:
     scale: float = 1.0
     control: Annotated[Control | None, CONTROL] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
-    inner: Annotated[
-        tuple[tuple[float, float], ...],
-        Numbers(
-            "(low, high) of the initial value of each inner state of the model, drawn uniformly; empty for a model "
-            "that draws its own start",
-            form=PAIRS,
-            shape=(None, 2),
-        ),
-    ] = ()
+    inner: Annotated[tuple[Pair, ...], INNER] = ()
     reward_scale: Annotated[float, Quantity("the model's reward is divided by it", positive=True)] = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no number; take roles and laws as definitions spell them."""
+        settle(f"{type(self).__name__.lower()} '{self.id}'", self)
 
     @property
     def actions(self) -> int:
         """Number of entries of its action."""
-        if self.control is None:
-            return 0
-        takes_inputs = self.control.kind is ControlKind.INPUT and self.model is not None
-        return len(self.model.input_names) if takes_inputs and self.model is not None else 1
+        if self.control is not None and self.control.kind is ControlKind.INPUT and self.model is not None:
+            return len(self.model.input_names)
+        return int(self.control is not None)
 
 
 @part
@@ -152,15 +153,8 @@ class Node(Compartment):
         Role.TECHNOSPHERE
     )
     initial: Annotated[
-        tuple[float, float],
-        Numbers(
-            "(low, high) of the initial stock, drawn uniformly, mass",
-            of=("mass",),
-            form="(low, high)",
-            spelled="range",
-            shape=(2,),
-            required=True,
-        ),
+        Pair,
+        Numbers("(low, high) of the initial stock, drawn uniformly, mass", "(low, high)", (2,), "range", required=True),
     ] = (0.0, 0.0)
     set_point: Annotated[float | None, Quantity("stock aimed at, mass; None if there is none", of="mass")] = None
     scale: Annotated[
@@ -169,10 +163,6 @@ class Node(Compartment):
             "reference stock of observations and rewards; files may leave it to scales.stock", of="mass", positive=True
         ),
     ] = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse what is no number; take a role as definitions spell it."""
-        settle(f"node '{self.id}'", self)
 
 
 @part
@@ -194,8 +184,6 @@ class Arc(Compartment):
             "a, 1/time (donor and recipient laws), mass/time per unit of the model's output, or mass per unit that the "
             "donor's model releases (batch law)",
             of=RATE_OF,
-            by="law",
-            otherwise="rate",
             low=0.0,
         ),
     ] = 0.0
@@ -204,13 +192,12 @@ class Arc(Compartment):
     ] = ""
     port: Annotated[str, Text("what ``by`` releases into this arc, one of the ports of its model (batch law)")] = ""
     batches: Annotated[
-        tuple[tuple[float, float], ...],
+        tuple[Pair, ...],
         Numbers(
             "(time, mass) of batches that leave on schedule (batch law without ``by``)",
-            of=("time", "mass"),
-            form="((time, mass), …)",
+            "((time, mass), …)",
+            (None, 2),
             spelled="batches",
-            shape=(None, 2),
         ),
     ] = ()
     delay: Annotated[
@@ -225,16 +212,13 @@ class Arc(Compartment):
         tuple[float, ...],
         Numbers(
             "e, mass/time (exogenous law); with ``times`` the values of a step function, else a single value",
-            of=("flow",),
-            form="(value, …)",
+            "(value, …)",
             spelled="flow",
         ),
     ] = (0.0,)
     times: Annotated[
         tuple[float, ...],
-        Numbers(
-            "starts of the steps of an exogenous series, time; empty for a constant", of=("time",), form="(time, …)"
-        ),
+        Numbers("starts of the steps of an exogenous series, time; empty for a constant", "(time, …)"),
     ] = ()
     pollutant: Annotated[bool, Flag("whether material that enters an environment here is a pollutant")] = True
     set_point: Annotated[float | None, Quantity("mean flow aimed at, mass/time; None if there is none", of="flow")] = (
@@ -245,16 +229,10 @@ class Arc(Compartment):
         Quantity(
             "reference flow of observations and rewards, of a batch arc reference mass; files may leave it to "
             "scales.flow and scales.stock",
-            of={Law.BATCH: "mass"},
-            by="law",
-            otherwise="flow",
+            of=SCALE_OF,
             positive=True,
         ),
     ] = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse what is no number; take a law as definitions spell it."""
-        settle(f"arc '{self.id}'", self)
 
 
 @part
@@ -278,23 +256,11 @@ class Service:
     ]
     low: Annotated[
         float,
-        Quantity(
-            "lower end of the band: mass, mass/time or the measure's",
-            of=MEASURED,
-            by="quantity",
-            otherwise="flow",
-            joint=True,
-        ),
+        Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True),
     ]
     high: Annotated[
         float,
-        Quantity(
-            "upper end of the band, likewise; none if left out",
-            of=MEASURED,
-            by="quantity",
-            otherwise="flow",
-            joint=True,
-        ),
+        Quantity("upper end of the band, likewise; none if left out", of=BAND_OF, joint=True),
     ] = math.inf
     weight: Annotated[float, Quantity("factor of the shortfall in the local rewards", low=0.0, required=True)] = 1.0
     measure: Annotated[str, Text('name of the measure, for ``quantity = "measure"``')] = ""
