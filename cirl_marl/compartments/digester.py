@@ -11,12 +11,12 @@ import numpy as np
 
 from cirl_marl.compartments.parameters import NotNegative, Positive, Share
 from cirl_marl.errors import CirlError
-from cirl_marl.network.declared import Quantity, part
+from cirl_marl.network.declared import Quantity, itemised
 from cirl_marl.network.model import ContinuousModel, Measuring, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Digester(ContinuousModel, Outflowing, Measuring):
     """AM2 with one dilution rate D, the control: the physically sound form.

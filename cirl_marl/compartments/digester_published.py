@@ -9,12 +9,12 @@ import numpy as np
 
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.parameters import Positive
-from cirl_marl.network.declared import Declared, Flag, part
+from cirl_marl.network.declared import Declared, Flag, itemised
 from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DigesterPublished(ContinuousModel, Outflowing):
     """AM2 after arXiv 2502.02382: ż = f(z) + G(z)·(D̄ + φ) with one dilution D̄ + φ_i for each state.

@@ -10,7 +10,7 @@ import numpy as np
 
 from cirl_marl.compartments.microalgae import Microalgae
 from cirl_marl.compartments.parameters import Form, NotNegative, Positive
-from cirl_marl.network.declared import part
+from cirl_marl.network.declared import itemised
 from cirl_marl.network.model import RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -18,7 +18,7 @@ from cirl_marl.network.rowsum import Floats
 # at 446 to 473). The light changes the return by no more than 0.1 %.
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MicroalgaeDroop(Microalgae):
     """Chemostat with biomass X, cell quota Q and dissolved nutrient S; the control is the light I.

@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl.compartments.microalgae import Microalgae
 from cirl_marl.compartments.parameters import Form, NotNegative, Positive
-from cirl_marl.network.declared import part
+from cirl_marl.network.declared import itemised
 from cirl_marl.network.model import RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -18,7 +18,7 @@ from cirl_marl.network.rowsum import Floats
 # more S at most 0.2 more: the paper's best end, its untrained policies, its DDPG stuck at full light.
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MicroalgaeMonod(Microalgae):
     """Chemostat with biomass X and dissolved nutrient S; the control is the light I.

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from cirl_marl.compartments.parameters import Form, NotNegative, Positive
-from cirl_marl.network.declared import part
+from cirl_marl.network.declared import itemised
 from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -16,7 +16,7 @@ from cirl_marl.network.rowsum import Floats
 # published returns of −1.2·10⁸ are out of reach (the best is −1.99992·10⁸).
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransportTruck(ContinuousModel):
     """Point mass on a straight road, driven by a force F.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from cirl_marl.controllers.basic import Controller
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declared import itemised
 
 EVALUATION_SEEDS = 2**31
 """First seed of evaluations; training draws its seeds below it, so no evaluated episode was trained on."""
@@ -19,35 +21,22 @@ SEED_SPACING = 1_000_000
 """Distance between the first seeds of two evaluations with different ``seed``, so that they share no episode."""
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """One episode of each of B copies under one controller.
+    """One episode of each of B copies under one controller."""
 
-    Attributes:
-        circularity: λ at the end of each interval, shape (B, steps), mass.
-        circularity_mean: mean of λ over each interval, shape (B, steps), mass.
-        service: service level, shape (B, steps).
-        local_returns: sum of the local rewards of each agent, shape (agents, B).
-        returns: sum of the rewards of each agent, shape (agents, B).
-        stock: stocks after each interval in the first copy, shape (steps, nodes), mass.
-        flow: mean flows of each interval in the first copy, shape (steps, arcs), mass/time.
-        load: masses that batch arcs hold after each interval in the first copy, shape (steps, batch arcs), mass.
-        inner: inner states after each interval in the first copy, those that an agent may see, shape (steps, states).
-        final_stock: mean over copies of the last stocks, shape (nodes,), mass.
-        mean_flow: mean over copies and time of the flows, shape (arcs,), mass/time.
-    """
-
-    circularity: Floats
-    circularity_mean: Floats
-    service: Floats
-    local_returns: Floats
-    returns: Floats
-    stock: Floats
-    flow: Floats
-    load: Floats
-    inner: Floats
-    final_stock: Floats
-    mean_flow: Floats
+    circularity: Annotated[Floats, "λ at the end of each interval, shape (B, steps), mass"]
+    circularity_mean: Annotated[Floats, "mean of λ over each interval, shape (B, steps), mass"]
+    service: Annotated[Floats, "service level, shape (B, steps)"]
+    local_returns: Annotated[Floats, "sum of the local rewards of each agent, shape (agents, B)"]
+    returns: Annotated[Floats, "sum of the rewards of each agent, shape (agents, B)"]
+    stock: Annotated[Floats, "stocks after each interval in the first copy, shape (steps, nodes), mass"]
+    flow: Annotated[Floats, "mean flows of each interval in the first copy, shape (steps, arcs), mass/time"]
+    load: Annotated[Floats, "masses that batch arcs hold, likewise, shape (steps, batch arcs), mass"]
+    inner: Annotated[Floats, "inner states that an agent may see, likewise, shape (steps, states)"]
+    final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (nodes,), mass"]
+    mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
 
     @property
     def episode_circularity(self) -> Floats:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from cirl_marl.dynamics.inner import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import MAX_STEPS, Law
 from cirl_marl.network.rowsum import RowSum, disposable
 
@@ -30,24 +32,18 @@ RUNGE_KUTTA = {"rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), "eul
 """Nodes and weights of the explicit schemes; each stage starts from the slope of the one before."""
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """What one control interval did.
+    """What one control interval did."""
 
-    Attributes:
-        stock: stocks after the interval with batch rows and unit row, shape (masses, B), mass.
-        inner: inner states of the models after the interval, shape (states, B).
-        moved: mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass.
-        flow: realised continuous flows at the end of the interval, shape (arcs, B), mass/time.
-        batched: m_fb of the interval, net batch mass moved finite-time sustainably at its start and at its end, not
-            through and through the environment, shape (2, 2, B), mass; None without batch arcs.
-    """
-
-    stock: Floats
-    inner: Floats
-    moved: Floats
-    flow: Floats
-    batched: Floats | None = None
+    stock: Annotated[Floats, "stocks after the interval with batch rows and unit row, shape (masses, B), mass"]
+    inner: Annotated[Floats, "inner states of the models after the interval, shape (states, B)"]
+    moved: Annotated[Floats, "mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass"]
+    flow: Annotated[Floats, "realised continuous flows at the end of the interval, shape (arcs, B), mass/time"]
+    batched: Annotated[
+        Floats | None, "m_fb of its start and of its end, as in ``Network.circularity``, shape (2, 2, B), mass, if any"
+    ] = None
 
 
 class Dynamics(FlowLaws):

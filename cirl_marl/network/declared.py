@@ -164,11 +164,11 @@ class Nested(Declared):
     of: Literal["control", "model"] = "control"
 
 
-def part(made: type[Part]) -> type[Part]:
-    """Let the docstring of a frozen dataclass list its declared fields with their meanings."""
+def itemised(made: type[Part]) -> type[Part]:
+    """Let the docstring of a dataclass list its fields with what their annotations declare or, as plain text, say."""
     lines = [
-        textwrap.fill(f"{name}: {declared.meaning}.", 120, initial_indent=" " * 8, subsequent_indent=" " * 12)
-        for name, declared in declarations(made).items()
+        textwrap.fill(f"        {name}: {getattr(told, 'meaning', told)}.", 120, subsequent_indent=" " * 12)
+        for name, told in _annotated(made).items()
     ]
     made.__doc__ = "\n".join([str(made.__doc__).rstrip(), "", "    Attributes:", *lines, "    "])
     return made
@@ -182,9 +182,13 @@ def declarations(made: type[Any]) -> Mapping[str, Declared]:
 
 @cache
 def _declarations(made: Any) -> Mapping[str, Declared]:
+    return MappingProxyType({name: told for name, told in _annotated(made).items() if isinstance(told, Declared)})
+
+
+def _annotated(made: Any) -> dict[str, Any]:
     hints = get_type_hints(made, include_extras=True)
     found = {each.name: getattr(hints[each.name], "__metadata__", ()) for each in fields(made)}
-    return MappingProxyType({name: told[0] for name, told in found.items() if told})
+    return {name: told[0] for name, told in found.items() if told}
 
 
 def default_of(made: type[Any], name: str) -> Any:

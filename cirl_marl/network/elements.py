@@ -14,7 +14,19 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 
-from cirl_marl.network.declared import Amount, Flag, Kinds, Names, Nested, Numbers, Quantity, Text, Word, part, settle
+from cirl_marl.network.declared import (
+    Amount,
+    Flag,
+    Kinds,
+    Names,
+    Nested,
+    Numbers,
+    Quantity,
+    Text,
+    Word,
+    itemised,
+    settle,
+)
 from cirl_marl.network.model import CompartmentModel
 from cirl_marl.network.rowsum import Floats
 
@@ -85,7 +97,7 @@ BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
 Pair = tuple[float, float]
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high]."""
@@ -141,7 +153,7 @@ class Compartment:
         return int(self.control is not None)
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Node(Compartment):
     """A compartment that stores material, with an ``id`` of its own among nodes and arcs.
@@ -165,7 +177,7 @@ class Node(Compartment):
     ] = 1.0
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arc(Compartment):
     """A compartment that moves material from ``donor`` to ``recipient``, with an ``id`` of its own.
@@ -235,7 +247,7 @@ class Arc(Compartment):
     ] = 1.0
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
     """What the network is there for: a stock or flow to be kept within a band, under an ``id`` of its own.
@@ -274,7 +286,7 @@ class Service:
         return self.owed_by or (self.provider,)
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Episode:
     """Time and solver of an episode."""
@@ -300,7 +312,7 @@ class Episode:
     ] = None
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Objective:
     """How circularity and rewards are read off the network."""
@@ -334,7 +346,7 @@ class Objective:
     ] = None
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observation:
     """What agents see by default."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.compartments.robots.engine import Engine, Robot, one_per_thread
-from cirl_marl.network.declared import Quantity, part
+from cirl_marl.network.declared import Quantity, itemised
 from cirl_marl.network.model import Task
 from cirl_marl.network.rowsum import Floats
 
@@ -43,7 +43,7 @@ class ReacherEngine(Engine):
         return np.array([*self.env._get_obs(), np.linalg.norm(apart)])
 
 
-@part
+@itemised
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reacher(Robot, Task):
     """Gymnasium's Reacher-v5, unchanged, as in the paper.
