@@ -17,7 +17,7 @@ from cirl_marl.definitions.guide import format_guide
 from cirl_marl.definitions.mistakes import mistakes_of
 from cirl_marl.definitions.schema import NetworkTable, table_of
 from cirl_marl.definitions.writing import _Writer, definition_of, fingerprint
-from cirl_marl.network.declared import Names, Quantity, Word, bound_problems, declarations, itemised, settle
+from cirl_marl.network.declared import Declared, Quantity, Word, bound_problems, declarations, itemised, settle
 from cirl_marl.network.elements import Control, Episode, Objective, Observation, Service
 
 DOCUMENT = tomllib.loads((folder("envs") / "copper_net.toml").read_text(encoding="utf-8"))
@@ -31,7 +31,7 @@ class Warmed(Episode):
 
     warm_up: Annotated[float, Quantity("time before the first decision", of="time", low=0.0)] = 0.0
     mode: Annotated[str, Word("how it warms up", of=MODES)] = "slow"
-    heated: Annotated[tuple[str, ...], Names("what is warmed up", key="what")] = ()
+    heated: Annotated[tuple[str, ...], Declared("what is warmed up", key="what")] = ()
 
     def __post_init__(self) -> None:
         """Refuse what is no number."""

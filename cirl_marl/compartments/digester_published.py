@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.parameters import Positive
-from cirl_marl.network.declared import Declared, Flag, itemised
+from cirl_marl.network.declared import Declared, itemised
 from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -40,7 +40,7 @@ class DigesterPublished(ContinuousModel, Outflowing):
     )
     dilution_per_day: Annotated[float, Positive("D̄ at the equilibrium z̄ [published]")] = 0.5
     settling_day: Annotated[float, Positive("T_max of the controller, d [published]")] = 3.5
-    misprint: Annotated[bool, Flag("whether P_C has the published product [published: True]")] = True
+    misprint: Annotated[bool, Declared("whether P_C has the published product [published: True]")] = True
 
     @property
     def equilibrium(self) -> Floats:

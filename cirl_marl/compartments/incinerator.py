@@ -20,7 +20,7 @@ from cirl_marl.network.rowsum import Floats
 
 KELVIN = 273.15
 Temperature = partial(Quantity, low=1.0 - KELVIN)
-Form = Literal["published", "energy_balance", "sound"]
+_Form = Literal["published", "energy_balance", "sound"]
 
 
 class Flows(NamedTuple):
@@ -93,7 +93,7 @@ class Incinerator(ContinuousModel, Outflowing):
     time_unit: ClassVar[str] = "min"
     reward_state: ClassVar[RewardState] = "after"
 
-    form: Annotated[Form, Word("which equations", of=get_args(Form))] = "sound"
+    form: Annotated[_Form, Word("which equations", of=get_args(_Form))] = "sound"
     feed_kg_min: Annotated[float, NotNegative("F_in unless ``derivative`` is given another [published]")] = 100.0
     air_bed_kg_min: Annotated[float, NotNegative("F_aI [published]")] = 5.0
     air_freeboard_kg_min: Annotated[float, NotNegative("F_aII [published]")] = 3.0

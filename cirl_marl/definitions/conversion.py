@@ -9,7 +9,7 @@ from cirl_marl.definitions.mistakes import parameter_mistakes
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable, QuantityTable, Range
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network import Network
-from cirl_marl.network.declared import Declared, Names, Numbers, Quantity, declarations
+from cirl_marl.network.declared import Declared, Numbers, Quantity, declarations
 from cirl_marl.network.elements import (
     TAKEN,
     Arc,
@@ -110,7 +110,7 @@ class Converter:
             return self._batches(given, where)
         if isinstance(declared, Numbers):
             return (self._value(given, "flow", where),)
-        return tuple(given) if isinstance(declared, Names) else given
+        return tuple(given) if isinstance(given, list) else given
 
     def _compartment(self, made: type[Node] | type[Arc], id_: str, table: Any, where: str) -> Any:
         """Return a node or an arc, whose control depends on its model, with the scale of all that state none."""

@@ -12,7 +12,7 @@ import tomlkit
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
-from cirl_marl.network.declared import Flag, Names, Nested, Numbers, Quantity, declarations, default_of, is_required
+from cirl_marl.network.declared import Nested, Numbers, Quantity, declarations, default_of, is_required
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 
 SOURCE = "network built in Python"
@@ -101,7 +101,9 @@ class _Writer:
             elif isinstance(declared, Nested):
                 table[key] = self._control(part) if declared.of == "control" else self._model(part)
             else:
-                table[key] = {Names: list, Flag: bool}.get(type(declared), str)(value)
+                table[key] = (
+                    value if isinstance(value, bool) else list(value) if isinstance(value, tuple) else str(value)
+                )
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
 

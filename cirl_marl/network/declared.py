@@ -30,7 +30,7 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """What is known of a field of whatever kind.
+    """What is known of a field; by itself, of a text, of ids in a fixed order, or of one that is true or false.
 
     Attributes:
         meaning: for docstrings, schema and documents.
@@ -46,21 +46,6 @@ class Declared:
     def problem(self, value: object) -> str:
         """Return what the field must be, and what to write instead, if ``value`` is of another kind; else nothing."""
         return ""
-
-
-@dataclass(frozen=True, slots=True)
-class Text(Declared):
-    """The id of a compartment, or other text."""
-
-
-@dataclass(frozen=True, slots=True)
-class Names(Declared):
-    """Ids in a fixed order."""
-
-
-@dataclass(frozen=True, slots=True)
-class Flag(Declared):
-    """True or false."""
 
 
 @dataclass(frozen=True, slots=True)

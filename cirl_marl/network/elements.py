@@ -14,19 +14,7 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 
-from cirl_marl.network.declared import (
-    Amount,
-    Flag,
-    Kinds,
-    Names,
-    Nested,
-    Numbers,
-    Quantity,
-    Text,
-    Word,
-    itemised,
-    settle,
-)
+from cirl_marl.network.declared import Amount, Declared, Kinds, Nested, Numbers, Quantity, Word, itemised, settle
 from cirl_marl.network.model import CompartmentModel
 from cirl_marl.network.rowsum import Floats
 
@@ -187,8 +175,8 @@ class Arc(Compartment):
     discrete masses.
     """
 
-    donor: Annotated[str, Text("id of the node that gives", key="from")]
-    recipient: Annotated[str, Text("id of the node that receives", key="to")]
+    donor: Annotated[str, Declared("id of the node that gives", key="from")]
+    recipient: Annotated[str, Declared("id of the node that receives", key="to")]
     law: Annotated[Law, Word("how much it carries", of=Law, required=True)] = Law.DONOR
     rate: Annotated[
         float,
@@ -200,9 +188,9 @@ class Arc(Compartment):
         ),
     ] = 0.0
     by: Annotated[
-        str, Text("compartment whose model gives the flow (compartment law) or releases the batches (batch law)")
+        str, Declared("compartment whose model gives the flow (compartment law) or releases the batches (batch law)")
     ] = ""
-    port: Annotated[str, Text("what ``by`` releases into this arc, one of the ports of its model (batch law)")] = ""
+    port: Annotated[str, Declared("what ``by`` releases into this arc, one of the ports of its model (batch law)")] = ""
     batches: Annotated[
         tuple[Pair, ...],
         Numbers(
@@ -232,7 +220,7 @@ class Arc(Compartment):
         tuple[float, ...],
         Numbers("starts of the steps of an exogenous series, time; empty for a constant", "(time, …)"),
     ] = ()
-    pollutant: Annotated[bool, Flag("whether material that enters an environment here is a pollutant")] = True
+    pollutant: Annotated[bool, Declared("whether material that enters an environment here is a pollutant")] = True
     set_point: Annotated[float | None, Quantity("mean flow aimed at, mass/time; None if there is none", of="flow")] = (
         None
     )
@@ -257,7 +245,7 @@ class Service:
     """
 
     id: str
-    provider: Annotated[str, Text("compartment at which it is measured")]
+    provider: Annotated[str, Declared("compartment at which it is measured")]
     quantity: Annotated[
         str,
         Word(
@@ -275,9 +263,9 @@ class Service:
         Quantity("upper end of the band, likewise; none if left out", of=BAND_OF, joint=True),
     ] = math.inf
     weight: Annotated[float, Quantity("factor of the shortfall in the local rewards", low=0.0, required=True)] = 1.0
-    measure: Annotated[str, Text('name of the measure, for ``quantity = "measure"``')] = ""
+    measure: Annotated[str, Declared('name of the measure, for ``quantity = "measure"``')] = ""
     owed_by: Annotated[
-        tuple[str, ...], Names("compartments whose local reward bears the shortfall; empty means the provider alone")
+        tuple[str, ...], Declared("compartments whose local reward bears the shortfall; empty means the provider alone")
     ] = ()
 
     @property
@@ -335,7 +323,7 @@ class Objective:
     ] = 0.5
     tracked: Annotated[
         tuple[str, ...],
-        Names(
+        Declared(
             "compartments whose distance to the set-point enters their local reward; empty means every compartment "
             "with a set-point"
         ),
@@ -363,5 +351,5 @@ class Observation:
     ] = "local"
     nodes: Annotated[
         tuple[str, ...],
-        Names("in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``)"),
+        Declared("in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``)"),
     ] = ()
