@@ -14,6 +14,7 @@ import numpy as np
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Law, Role
+from cirl_marl.network.rowsum import spans
 
 
 @itemised
@@ -77,10 +78,7 @@ class Rows:
         self.owners = tuple(models)
         self.state_names = tuple(f"{owner}.{name}" for owner, model in models.items() for name in model.state_names)
         self.start_names = (*network.node_index, *self.state_names)
-        self.states: dict[str, slice] = {}
-        first = 0
-        for owner, model in models.items():
-            self.states[owner] = slice(first, first := first + len(model.state_names))
+        self.states = dict(zip(models, spans(len(model.state_names) for model in models.values()), strict=True))
         self.outputs = {owner: self.masses + i for i, owner in enumerate(self.owners)}
 
     def start_of(self, masses: Floats, inner: Floats) -> Floats:

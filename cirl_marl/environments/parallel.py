@@ -14,11 +14,12 @@ from pettingzoo.utils import conversions
 
 from cirl_marl.environments.actuators import wrong_shape
 from cirl_marl.environments.state import Outcome, Snapshot
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
 
 RENDER_MODES = ("rgb_array", "human")
+_Seen = dict[str, NDArray[np.float32]]
 OPTIONS = ("observe", "circularity", "circularity_weight", "horizon")
 
 
@@ -90,9 +91,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         """The action of each agent that leaves it neutral."""
         return {agent: action.astype(np.float32) for agent, action in self.batch.neutral_action.items()}
 
-    def reset(
-        self, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[_Seen, Infos]:
         """Start an episode; ``options={"initial_state": {node: stock}}`` starts it from a given state."""
         observation = self.batch.reset(seed, options)
         self.agents = list(self.possible_agents)
@@ -102,9 +101,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
     def step(
         self, actions: Mapping[str, ArrayLike]
-    ) -> tuple[
-        dict[str, NDArray[np.float32]], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
-    ]:
+    ) -> tuple[_Seen, dict[str, float], dict[str, bool], dict[str, bool], Infos]:
         """Hold one action per agent, each in its Box(−1, 1), for one control interval.
 
         Raises:
@@ -121,8 +118,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             self.agents = []
         if self.render_mode == "human":
             self.render()
-        seen = outcome.observation[:, 0]
-        slices = self.layout.slices
+        seen, slices = outcome.observation[:, 0], self.layout.slices
         return (
             {agent: seen[slices[agent]] for agent in agents},
             dict(zip(agents, outcome.reward[:, 0].tolist(), strict=True)),
@@ -144,7 +140,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         """Return a copy of the whole environment state, random streams included."""
         return self.batch.snapshot()
 
-    def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
+    def restore(self, snapshot: Snapshot) -> _Seen:
         """Go back to a snapshot and return the observations there."""
         observation = self.batch.restore(snapshot)
         over = int(self.batch.physical.step[0]) >= self.network.episode.horizon
@@ -158,9 +154,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             CirlError: if the environment was made without a ``render_mode``.
         """
         if self.render_mode is None:
-            raise CirlError(
-                f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when making the environment"
-            )
+            raise CirlError(f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when it is made")
         from cirl_marl.drawing.digraph import Canvas
 
         if self._canvas is None:
@@ -186,11 +180,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             stacked = np.array([actions[agent] for agent in self.possible_agents])
         except (KeyError, ValueError):
             stacked = np.empty(0)
-        if (
-            stacked.dtype.kind not in "biuf"
-            or stacked.shape != (self._entries, 1)
-            or len(actions) != len(self.possible_agents)
-        ):
+        fits = stacked.shape == (self._entries, 1) and len(actions) == len(self.possible_agents)
+        if not fits or stacked.dtype.kind not in "biuf":
             return self.batch.stack({agent: self._checked(agent, action)[None] for agent, action in actions.items()})
         return stacked
 
@@ -201,10 +192,10 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             raise ControlError(wrong_shape(agent, found.shape, space.shape))
         return found
 
-    def _infos(self, outcome: Outcome) -> dict[str, dict[str, Any]]:
+    def _infos(self, outcome: Outcome) -> Infos:
         circularity, service = float(outcome.circularity[0]), float(outcome.service_level[0])
         flows = outcome.flow[:, 0]
-        infos: dict[str, dict[str, Any]] = {
+        infos: Infos = {
             agent: {"circularity": circularity, "local_reward": local, "flows": flows, "service_level": service}
             for agent, local in zip(self.possible_agents, outcome.local[:, 0].tolist(), strict=True)
         }

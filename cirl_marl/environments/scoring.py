@@ -54,12 +54,9 @@ class Scoring:
         sums = self._everyone.column_sums()
         counted = np.flatnonzero(sums)
         self._all = RowSum(np.zeros(len(counted), dtype=np.intp), counted, sums[counted], (1, terms))
-        self._weighted_shortfall = RowSum(
-            [0] * len(services), range(len(services)), [s.weight for s in services], (1, len(services))
-        )
-        self._sum_of_levels = RowSum(
-            [0] * len(services), range(len(services)), [1.0] * len(services), (1, len(services))
-        )
+        every, shape = range(len(services)), (1, len(services))
+        self._weighted_shortfall = RowSum([0] * len(services), every, [s.weight for s in services], shape)
+        self._sum_of_levels = RowSum([0] * len(services), every, [1.0] * len(services), shape)
 
     def levels(self, quantities: Floats) -> Floats:
         """Return the level of each service in [0, 1], shape (services, B)."""

@@ -74,17 +74,9 @@ class Outcome:
 
     def infos(self, agents: Sequence[str]) -> dict[str, dict[str, Any]]:
         """Return λ, local reward, flows (B, arcs) and service level for each agent; success where it is defined."""
-        flows = self.flow.T
         self.circularity.flags.writeable = self.service_level.flags.writeable = False  # the same for all agents
-        infos: dict[str, dict[str, Any]] = {
-            agent: {
-                "circularity": self.circularity,
-                "local_reward": self.local[i],
-                "flows": flows,
-                "service_level": self.service_level,
-            }
-            for i, agent in enumerate(agents)
-        }
+        team = {"circularity": self.circularity, "flows": self.flow.T, "service_level": self.service_level}
+        infos = {agent: {**team, "local_reward": local} for agent, local in zip(agents, self.local, strict=True)}
         for agent in self.success.keys() & infos.keys():
             infos[agent]["success"] = self.success[agent]
         return infos

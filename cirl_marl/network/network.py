@@ -26,7 +26,7 @@ from scipy.sparse import csgraph
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network.elements import SINKS, Compartment, Law, Role, Service
 from cirl_marl.network.parts import Parts
-from cirl_marl.network.rowsum import Floats, Integers, RowSum
+from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.validate import problems
 
 if TYPE_CHECKING:
@@ -132,8 +132,8 @@ class Network(Parts):
     @cached_property
     def control_rows(self) -> Mapping[str, slice]:
         """Rows of each controllable compartment in control arrays: one, or one per input of its model."""
-        edges = np.cumsum([0, *(self.compartments[id_].actions for id_ in self.controllable)]).tolist()
-        return MappingProxyType({id_: slice(edges[i], edges[i + 1]) for i, id_ in enumerate(self.controllable)})
+        rows = spans(self.compartments[id_].actions for id_ in self.controllable)
+        return MappingProxyType(dict(zip(self.controllable, rows, strict=True)))
 
     @cached_property
     def agents(self) -> tuple[str, ...]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
@@ -16,6 +19,15 @@ Integers = NDArray[np.intp]
 
 NOTHING = 1e-290
 """Stock that gives nothing away: emptied again and again it would become subnormal, which does not round well."""
+
+
+def spans(sizes: Iterable[int]) -> list[slice]:
+    """Return the rows of parts of given sizes, one after the other.
+
+    >>> spans([2, 1])
+    [slice(0, 2, None), slice(2, 3, None)]
+    """
+    return [slice(first, last) for first, last in pairwise(np.cumsum([0, *sizes]).tolist())]
 
 
 def disposable(stock: Floats, parts: int) -> Floats:
