@@ -40,8 +40,7 @@ class BatchTransport:
         self._receiving = sorted({line.recipient for line in self.lines})
         count, every, lines = len(self.lines), np.arange(len(self.lines)), self.lines
         self._delivery = RowSum([line.recipient for line in lines], every, np.ones(count), (rows.masses, count))
-        parts = [line.part for line in lines]
-        self._arrivals = RowSum(parts, every, [line.arrives for line in lines], (2, count))
+        self._arrivals = RowSum([line.part for line in lines], every, [line.arrives for line in lines], (2, count))
         self._held = RowSum(
             [i for i, line in enumerate(lines) for _ in line.rows],
             [row for line in lines for row in line.rows],
@@ -87,16 +86,10 @@ class BatchTransport:
         return self._departures(mass)
 
     def settle(self, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> tuple[Floats, Floats]:
-        """Deliver, release and send off, in place, what is due at the end of the interval.
+        """Deliver, release and send off, in place, what is due at the end of the interval ``step``, shape (B,).
 
-        Args:
-            stock: all masses and the unit row, shape (rows, B).
-            inner: inner states, shape (states, B); vehicles turn, plants receive.
-            step: index of the interval in each copy, shape (B,).
-            physics: the models that release batches, drive vehicles and receive deliveries.
-
-        Returns:
-            Mass delivered by each batch arc, shape (batch arcs, B), and m_fb of the interval's end, shape (2, B).
+        Vehicles turn and plants receive in ``inner``. Returned are the mass delivered by each batch arc, shape (batch
+        arcs, B), and m_fb of the interval's end, shape (2, B).
         """
         delivered = np.empty((len(self.lines), stock.shape[1]))
         slots, copies = self._first + step % self._slots, np.arange(stock.shape[1])

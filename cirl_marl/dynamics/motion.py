@@ -71,10 +71,8 @@ class Dynamics(FlowLaws):
         episode = network.episode
         self.physical = episode.solver != "euler"
         self._exact = episode.solver == "exact"
-        stock_driven = self.driver < rows.nodes.stop
-        turnover = np.bincount(
-            self.driver[stock_driven], weights=self.max_rate[stock_driven], minlength=rows.nodes.stop
-        ).astype(float)
+        driven = self.driver < rows.nodes.stop  # by a stock
+        turnover = np.bincount(self.driver[driven], self.max_rate[driven], rows.nodes.stop).astype(float)
         fastest = float(turnover.max(initial=0.0))
         self._check_turnover(turnover)
         if self._exact:
@@ -111,11 +109,7 @@ class Dynamics(FlowLaws):
         return k
 
     def _check_turnover(self, turnover: Floats) -> None:
-        """Refuse rates that the solver cannot follow.
-
-        Raises:
-            CirlError: naming the fastest node, its rate and the largest usable step.
-        """
+        """Refuse rates that the solver cannot follow, naming the fastest node, its rate and the largest usable step."""
         episode = self.network.episode
         if not self.physical or not len(turnover):
             return
@@ -127,14 +121,11 @@ class Dynamics(FlowLaws):
                 f"{where}; a control interval of {episode.control_interval:g} {self.network.time_unit} would need more "
                 f"than {MAX_STEPS:,} solver steps. Is a rate in the wrong unit?"
             )
-        if (
-            episode.solver == "rk4"
-            and episode.solver_step is not None
-            and turnover[node] * episode.solver_step > MAX_TURNOVER
-        ):
+        step = episode.solver_step or 0.0
+        if episode.solver == "rk4" and turnover[node] * step > MAX_TURNOVER:
             raise CirlError(
                 f"{where}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / turnover[node]:.4g} "
-                f"{self.network.time_unit}, not {episode.solver_step:g}"
+                f"{self.network.time_unit}, not {step:g}"
             )
 
     def _compile_orders(self) -> None:
@@ -154,17 +145,10 @@ class Dynamics(FlowLaws):
         )
 
     def advance(self, stock: Floats, inner: Floats, controls: Floats, step: Integers | None = None) -> Transition:
-        """Hold ``controls`` for one control interval.
+        """Hold ``controls`` for one control interval; arguments are as in ``Transition`` and ``FlowLaws.rate``.
 
         In the physical mode scheduled flows are first cut to what their donor can deliver, so the realised flows may be
-        lower than those asked for.
-
-        Args:
-            stock: stocks with batch rows and unit row, shape (masses, B).
-            inner: inner states of the models, shape (states, B).
-            controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
-            step: index of the control interval in each environment, shape (B,); networks without time series and
-                batches need none.
+        lower than those asked for. Networks without time series and batches need no ``step``.
 
         Raises:
             CirlError: if ``step`` is missing though an arc needs it, or if a state is no longer a finite number, as the
@@ -308,15 +292,7 @@ class Dynamics(FlowLaws):
         Proportional and scheduled flows never overdraw. A recipient or a model that asks for more than there is gets
         its share: all outflows of the overdrawn node, and their rates, are scaled to the stock it started with. They
         are then settled, and the others follow from them, lest the recipient passes on what it did not get. Each pass
-        settles at least one more node.
-
-        Args:
-            stock: stocks at the start of the substep, shape (masses, B).
-            rate: rates of the flows, shape (arcs, B).
-            passing: what moves at given rates.
-
-        Returns:
-            Stocks at the end, mass moved, and the rates realised.
+        settles at least one more node. Returned are the stocks at the end, the mass moved, and the rates realised.
         """
         moved = passing(rate)
         after = self.incidence.add_to(stock.copy(), moved)
