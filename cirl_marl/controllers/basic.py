@@ -15,13 +15,10 @@ Arrays = Mapping[str, NDArray[np.floating]]
 
 
 class Controller(ABC):
-    """Maps the observations of all agents to their actions.
-
-    Attributes:
-        note: once started, what is to be said beside its figures; empty if nothing is.
-    """
+    """Maps the observations of all agents to their actions."""
 
     note: str = ""
+    """Once started, what is to be said beside its figures; empty if nothing is."""
 
     @abstractmethod
     def start(self, env: VectorEnv, seed: int) -> None:
@@ -33,13 +30,10 @@ class Controller(ABC):
 
 
 class Planner(Controller):
-    """A controller that plans when it is started, for so long that it tells how far it is.
-
-    Attributes:
-        ahead: about what share of the work of an episode is done before it begins.
-    """
+    """A controller that plans when it is started, for so long that it tells how far it is."""
 
     ahead: float
+    """About what share of the work of an episode is done before it begins."""
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Plan without telling how far it is."""

@@ -55,12 +55,7 @@ class LinearSystem:
     def of(
         cls, network: Network, agents: Sequence[str] | None = None, set_points: Mapping[str, float] | None = None
     ) -> LinearSystem:
-        """Read the system off the flows of unit stocks and unit controls.
-
-        Args:
-            network: under the scenario of interest.
-            agents: who acts; the others are neutral. None: the network's own choice.
-            set_points: node → stock, in place of the tracked set-points of the network.
+        """Read the system off the flows of unit stocks and unit controls; arguments are as in ``LQR``.
 
         Raises:
             CirlError: if an agent or node is unknown, no state can be moved, or the laws are not linear in x and u.

@@ -59,26 +59,17 @@ def rollout(
     start: Mapping[str, float] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Rollout:
-    """Run one whole episode in every copy of ``env``.
+    """Run one whole episode in every copy of ``env``, of which copy i is reset with ``seed + i``.
 
-    Args:
-        env: copy i is reset with ``seed + i``.
-        controller: who acts.
-        seed: first seed; the same seed gives every controller the same start states.
-        start: initial stocks and inner states that are given instead of drawn; see ``VectorEnv.reset``.
-        progress: called with the number of intervals done.
+    The same seed gives every controller the same start states; what stands in ``start`` is not drawn (see
+    ``VectorEnv.reset``). ``progress`` is called with the number of intervals done.
     """
     observations = env.reset(seed=seed, options={"initial_state": start or {}})
     controller.start(env, seed)
-    steps = env.network.episode.horizon
-    shape = (env.num_envs, steps)
-    circularity, mean, service = np.empty(shape), np.empty(shape), np.empty(shape)
-    local = np.zeros((len(env.agents), env.num_envs))
-    returns = np.zeros_like(local)
-    rows = env.rows
-    stock = np.empty((steps, len(env.network.nodes)))
-    flow = np.empty((steps, len(env.network.arcs)))
-    batches, physics = env.dynamics.batches, env.dynamics.inner
+    steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
+    circularity, mean, service = np.empty((3, env.num_envs, steps))
+    local, returns = np.zeros((2, len(env.agents), env.num_envs))
+    stock, flow = np.empty((steps, len(env.network.nodes))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
     for t in range(steps):

@@ -42,9 +42,8 @@ def fetch(seen: Seen, model: Any = None) -> Floats:
     its height where the fingers, which open in y, pass on both sides of it; around the object they close; once they
     hold, it is lifted, carried and set down; at the target it is let go.
     """
-    grip, item, target = (
-        np.stack([seen[f"{what}_{axis}"] for axis in "xyz"]) for what in ("grip", "object", "desired")
-    )
+    whats = ("grip", "object", "desired")
+    grip, item, target = (np.stack([seen[f"{what}_{axis}"] for axis in "xyz"]) for what in whats)
     away = grip - item
     aside = np.hypot(*away[:2])
     around = (aside < 0.02) & (np.abs(away[2]) < 0.02)
@@ -135,14 +134,10 @@ class Scripted(Controller):
             model, control = compartment.model, compartment.control
             if model is None or agent in self._held or control is None or control.kind is not ControlKind.INPUT:
                 continue
-            script = SCRIPTS.get(model.robot.kind)
-            if script is None:
-                continue
-            own = f"{agent}."
-            columns = {
-                name.removeprefix(own): i for i, name in enumerate(env.layout.names[agent]) if name.startswith(own)
-            }
-            self._scripts[agent] = script, model, columns, control
+            if script := SCRIPTS.get(model.robot.kind):
+                places = {name: i for i, name in enumerate(env.layout.names[agent]) if name.startswith(f"{agent}.")}
+                columns = {name.removeprefix(f"{agent}."): i for name, i in places.items()}
+                self._scripts[agent] = script, model, columns, control
 
     @property
     def scripted(self) -> tuple[str, ...]:

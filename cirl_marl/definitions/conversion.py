@@ -154,17 +154,12 @@ class Converter:
         """Return the model of a compartment and the initial ranges of its inner states, as keywords."""
         if table is None:
             return {}
+        form = {} if table.form is None else {"form": table.form}
         try:
             kind = model_class(table.kind)
-        except CirlError as error:
-            self.mistakes.append(f"{where}: {error}")
-            return {}
-        form = {} if table.form is None else {"form": table.form}
-        mistakes = list(parameter_mistakes(kind, table.parameters, form))
-        self.mistakes += (f"{where}: {mistake}" for mistake in mistakes)
-        if mistakes:
-            return {}
-        try:
+            if mistakes := list(parameter_mistakes(kind, table.parameters, form)):
+                self.mistakes += (f"{where}: {mistake}" for mistake in mistakes)
+                return {}
             model = kind(**table.parameters | form)
         except CirlError as error:
             self.mistakes.append(f"{where}: {error}")
@@ -190,16 +185,12 @@ class Converter:
         where = f"{where}.control"
         if control is None:
             return None
-        target = {
-            ControlKind.RATE: "1",
-            ControlKind.FLOW: "flow",
-            ControlKind.INPUT: control.unit if model is None else model.input_unit,
-        }[control.kind]
+        taken = control.unit if model is None else model.input_unit
+        target = {ControlKind.RATE: "1", ControlKind.FLOW: "flow", ControlKind.INPUT: taken}[control.kind]
         if target is None and model is not None and control.unit != "1":
-            self.mistakes.append(
-                f"{where}: unit '{control.unit}': model '{model.kind}' states no input_unit to convert to; "
-                f"give its class one, or write unit = '1' and the numbers as the model takes them"
-            )
+            remedy = "give its class one, or write unit = '1' and the numbers as the model takes them"
+            stated = f"unit '{control.unit}': model '{model.kind}' states no input_unit to convert to"
+            self.mistakes.append(f"{where}: {stated}; {remedy}")
             return None
         unit = self._factor(control.unit, target or "1", where)
         low, neutral, high = (value * unit for value in (control.low, control.neutral, control.high))

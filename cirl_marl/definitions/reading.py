@@ -6,8 +6,7 @@ import copy
 import difflib
 import hashlib
 import tomllib
-import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +114,7 @@ def _without(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[s
     return kept
 
 
-def _lost(document: Mapping[str, Any], paths: Any, where: str) -> typing.Iterator[str]:
+def _lost(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
     """Yield what is wrong with the dotted paths of a scenario's ``without``."""
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         yield f"{where}without: must be a list of dotted paths, such as ['nodes.digester.model']"
@@ -135,7 +134,7 @@ def _lost(document: Mapping[str, Any], paths: Any, where: str) -> typing.Iterato
             table = table[key]
 
 
-def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> typing.Iterator[str]:
+def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> Iterator[str]:
     """Yield the compartments and services that a scenario names but the network does not have."""
     yield from _lost(document, override.get("without", []), where)
     for table in ("nodes", "arcs", "services"):

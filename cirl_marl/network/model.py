@@ -26,13 +26,8 @@ RewardState = Literal["before", "after"]
 Bools = NDArray[np.bool_]
 
 
-class _Stated:
-    """Stands for an attribute that the class of a model has to state: Python takes it for abstract."""
-
-    __isabstractmethod__ = True
-
-
-STATED: Any = _Stated()
+STATED: Any = abstractmethod(lambda: None)
+"""Stands for an attribute that the class of a model has to state: Python takes it for abstract."""
 
 
 class CompartmentModel(ABC):

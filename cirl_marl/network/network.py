@@ -71,14 +71,12 @@ class Network(Parts):
         >>> load_network("copper_net").with_options(episode={"horizon": 3}).episode.horizon
         3
         """
-        known_groups = ("episode", "objective", "observation")
         for group, values in groups.items():
-            if group not in known_groups:
-                raise CirlError(f"with_options: {unknown('group', group, known_groups)}")
+            if group not in (known := ["episode", "objective", "observation"]):
+                raise CirlError(f"with_options: {unknown('group', group, known)}")
             known = [each.name for each in fields(getattr(self, group))]
-            for name in values:
-                if name not in known:
-                    raise CirlError(f"with_options: {group}: {unknown('field', name, known)}")
+            for name in [each for each in values if each not in known]:
+                raise CirlError(f"with_options: {group}: {unknown('field', name, known)}")
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
         return replace(self, **changes, scenarios={})
 
@@ -179,7 +177,7 @@ class Network(Parts):
         return graph
 
     def circularity(self, flow: Floats, batched: Floats | None = None) -> Floats:
-        """Return λ(N;t) = −(m_fb + Δ·σᵀf), σᵀf summed over the continuous flows.
+        """Return λ(N;t) = −(m_fb + Δ·σᵀf), shape (...), mass, with σᵀf summed over the continuous flows.
 
         With ``net_zero = "abs"`` the part through the environment enters by its absolute value,
         λ = −(m_rest + Δ·σ_rest·f) − |m_env + Δ·σ_env·f|. Given mean flows this is λ of the mean flows, which for
@@ -190,19 +188,14 @@ class Network(Parts):
             batched: m_fb, net batch mass moved finite-time sustainably so far, not through and through the environment,
                 shape (2, ...), mass; None if nothing moves in batches.
 
-        Returns:
-            λ, shape (...), mass.
-
         Raises:
             CirlError: if there is not one flow for each arc.
 
         References: Zocco et al., CiRL (arXiv 2505.21536), Definition 2.
         """
         if flow.shape[:1] != (len(self.arcs),):
-            raise CirlError(
-                f"network '{self.name}': flows of shape {flow.shape}; the first axis is that of its {len(self.arcs)} "
-                f"arcs, {', '.join(self.arc_index)}"
-            )
+            wanted = f"the first axis is that of its {len(self.arcs)} arcs, {', '.join(self.arc_index)}"
+            raise CirlError(f"network '{self.name}': flows of shape {flow.shape}; {wanted}")
         columns = (2, math.prod(flow.shape[1:]))
         parts = self._circularity_parts(flow.reshape(len(self.arcs), columns[1]))
         if batched is not None:

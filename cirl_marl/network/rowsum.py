@@ -46,24 +46,20 @@ class RowSum:
         """Build W from its entries; entries at the same place are added."""
         matrix = sparse.csc_array((weights, (rows, columns)), shape=shape, dtype=np.float64)
         matrix.sort_indices()
-        self.shape = shape
-        self._starts = matrix.indptr
-        self._rows = matrix.indices
+        self.shape, self._starts, self._rows = shape, matrix.indptr, matrix.indices
         self._weights: Floats = matrix.data
 
     def __call__(self, values: Floats) -> Floats:
         """Return W x for x of shape (columns, B)."""
-        result = np.zeros((self.shape[0], values.shape[1]))
-        return self.add_to(result, values)
+        return self.add_to(np.zeros((self.shape[0], values.shape[1])), values)
 
     def add_to(self, result: Floats, values: Floats) -> Floats:
         """Add W x to ``result``, shape (rows, B), in place, and return it; both arrays are C-contiguous."""
-        rows, columns = self.shape
-        batch = values.shape[1]
+        batch, entries = values.shape[1], (self._starts, self._rows, self._weights)
         if batch == 1:
-            csc_matvec(rows, columns, self._starts, self._rows, self._weights, values, result)
+            csc_matvec(*self.shape, *entries, values, result)
         else:
-            csc_matvecs(rows, columns, batch, self._starts, self._rows, self._weights, values, result)
+            csc_matvecs(*self.shape, batch, *entries, values, result)
         return result
 
     def scaled(self, factor: float) -> RowSum:

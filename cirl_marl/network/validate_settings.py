@@ -26,12 +26,11 @@ def setting_problems(network: Parts) -> Iterator[str]:
             yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
         moving = any(isinstance(c.model, ContinuousModel | OwnStepModel) for c in (*network.nodes, *network.arcs))
         if moving or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
-            yield (
-                "solver 'exact' knows no continuous inner physics: a network with models needs solver 'rk4' or 'euler'"
-            )
-    for compartment in (*network.nodes, *network.arcs):
+            yield "solver 'exact' knows no continuous inner physics: a network with models needs 'rk4' or 'euler'"
+    everyone = (*network.nodes, *network.arcs)
+    for compartment in everyone:
         yield from _clock_problems(network, compartment)
-    tracked = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None)
+    tracked = dict.fromkeys(c.id for c in everyone if c.set_point is not None)
     yield from repeated("objective.tracked", objective.tracked)
     yield from repeated("observation.nodes", network.observation.nodes)
     for name in objective.tracked:
@@ -39,10 +38,8 @@ def setting_problems(network: Parts) -> Iterator[str]:
             yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
     if (network.observation.mode == "stocks") != bool(network.observation.nodes):
         yield "observation: mode 'stocks', and only that mode, lists its nodes"
-    signals = dict.fromkeys(node.id for node in network.nodes)
-    for compartment in (*network.nodes, *network.arcs):
-        if compartment.model is not None:
-            signals |= dict.fromkeys(f"{compartment.id}.{name}" for name in compartment.model.state_names)
+    inner = [f"{c.id}.{name}" for c in everyone if c.model is not None for name in c.model.state_names]
+    signals = dict.fromkeys((*(node.id for node in network.nodes), *inner))
     for name in network.observation.nodes:
         if name not in signals:
             yield f"observation: {unknown('node or inner state', name, signals)}"
@@ -62,11 +59,9 @@ def _clock_problems(network: Parts, compartment: Compartment) -> Iterator[str]:
     except CirlError:
         return  # a problem of its own, units.time
     if isinstance(model, DiscreteTimeModel) and not math.isclose(interval, model.interval, rel_tol=1e-9):
-        unit = model.time_unit
-        yield (
-            f"'{compartment.id}': model '{model.kind}' moves in steps of {model.interval:g} {unit}; "
-            f"the control interval is {interval:g} {unit}"
-        )
+        steps = f"in steps of {model.interval:g} {model.time_unit}"
+        given = f"the control interval is {interval:g} {model.time_unit}"
+        yield f"'{compartment.id}': model '{model.kind}' moves {steps}; {given}"
 
 
 def _step_problems(episode: Episode, unit: str) -> Iterator[str]:
@@ -74,19 +69,14 @@ def _step_problems(episode: Episode, unit: str) -> Iterator[str]:
     if step is None or not (math.isfinite(step) and step > 0):
         yield f"solver '{episode.solver}' needs a positive solver_step, got {step}"
         return
-    ratio = episode.control_interval / step
-    if not math.isfinite(episode.control_interval):
+    interval, ratio = episode.control_interval, episode.control_interval / step
+    if not math.isfinite(interval):
         return  # a problem of its own
     if ratio > MAX_STEPS:
-        yield (
-            f"control_interval {episode.control_interval:g} {unit} is {ratio:.6g} solver steps of {step:g} {unit}, "
-            f"more than {MAX_STEPS:,}. Is solver_step in the wrong unit?"
-        )
+        excess = f"{ratio:.6g} solver steps of {step:g} {unit}, more than {MAX_STEPS:,}"
+        yield f"control_interval {interval:g} {unit} is {excess}. Is solver_step in the wrong unit?"
     elif not is_whole(ratio) or round(ratio) < 1:
-        yield (
-            f"control_interval {episode.control_interval} is not a whole number of solver steps of {step} "
-            f"({ratio:.6g} steps)"
-        )
+        yield f"control_interval {interval} is not a whole number of solver steps of {step} ({ratio:.6g} steps)"
 
 
 def repeated(where: str, names: Iterable[str]) -> Iterator[str]:
