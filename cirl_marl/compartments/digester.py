@@ -109,12 +109,7 @@ class Digester(ContinuousModel, Outflowing, Measuring):
         return rate
 
     def partial_pressure(self, state: Floats, dissolved_mmol_l: Floats | None = None) -> Floats:
-        """Return P_C, atm, shape (B,).
-
-        Args:
-            state: shape (6, B).
-            dissolved_mmol_l: w under the root, shape (B,); None takes C + S2 − Z.
-        """
+        """Return P_C, atm, shape (B,); w under the root is C + S2 − Z unless another is given, shape (B,)."""
         free = state[5] + state[3] - state[4]
         saturated = self.henry_mmol_l_atm * self.pressure_atm
         phi = free + saturated + self.k6 / self.transfer_per_day * self.growth(state)[1]
@@ -152,13 +147,14 @@ class Digester(ContinuousModel, Outflowing, Measuring):
         Raises:
             CirlError: if there is none; at that dilution a population is washed out.
         """
+        washed_out = CirlError(
+            f"digester: no equilibrium with living biomass at a dilution of {dilution_per_day!r}/day."
+        )
         needed = self.suspended_share * dilution_per_day
         half = self.inhibition2**2 * (self.growth2_per_day - needed) / (2.0 * needed) if needed > 0.0 else 0.0
         square = half**2 - self.half_saturation2_mmol_l * self.inhibition2**2
         if not (0.0 < needed < self.growth1_per_day and half > 0.0 and square >= 0.0):
-            raise CirlError(
-                f"digester: no equilibrium with living biomass at a dilution of {dilution_per_day!r} 1/day."
-            )
+            raise washed_out
         s1 = needed * self.half_saturation1_g_l / (self.growth1_per_day - needed)
         # the smaller root of S2² − 2·half·S2 + K_S2·K_I2² = 0, without cancellation
         s2 = self.half_saturation2_mmol_l * self.inhibition2**2 / (half + square**0.5)
@@ -166,9 +162,7 @@ class Digester(ContinuousModel, Outflowing, Measuring):
         acids = self.k2 * needed * x1 + dilution_per_day * (self.acids_in_mmol_l - s2)
         x2 = acids / (self.k3 * needed)
         if x1 <= 0.0 or x2 <= 0.0:
-            raise CirlError(
-                f"digester: no equilibrium with living biomass at a dilution of {dilution_per_day!r} 1/day."
-            )
+            raise washed_out
         alkalinity = float(self.feed[4])
         carbon = self._equilibrium_carbon(dilution_per_day, needed * x1, needed * x2, alkalinity - s2)
         return np.array([x1, s1, x2, s2, alkalinity, carbon])

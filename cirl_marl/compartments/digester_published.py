@@ -80,10 +80,6 @@ class DigesterPublished(ContinuousModel, Outflowing):
         """Return the published six dilutions D̄ + φ that bring ``start`` to z̄ at ``settling_day``, shape (6, B).
 
         q = T/(1 + T), p = ½|x̃0|^(2/(1 + T))/q². They are not finite where a flushing rate is zero (z = feed).
-
-        Args:
-            state: z, shape (6, B).
-            start: z at time 0, shape (6, B).
         """
         middle = self.equilibrium[:, None]
         q = self.settling_day / (1.0 + self.settling_day)

@@ -26,28 +26,18 @@ _Form = Literal["published", "energy_balance", "sound"]
 class Flows(NamedTuple):
     """Flows and conversions, kg/min, each of shape (B,) or a number."""
 
-    feed: Floats | float
-    ash: Floats | float
-    consumed: Floats | float
-    char_made: Floats | float
-    char_burnt: Floats | float
-    char_out: Floats | float
-    gas_made: Floats | float
-    to_freeboard: Floats | float
-    flue: Floats | float
+    feed: Floats | float = 100.0
+    ash: Floats | float = 10.0
+    consumed: Floats | float = 70.0
+    char_made: Floats | float = 6.0
+    char_burnt: Floats | float = 3.0
+    char_out: Floats | float = 2.0
+    gas_made: Floats | float = 1.0
+    to_freeboard: Floats | float = 2.0
+    flue: Floats | float = 2.0
 
 
-PUBLISHED_FLOWS = Flows(
-    feed=100.0,
-    ash=10.0,
-    consumed=70.0,
-    char_made=6.0,
-    char_burnt=3.0,
-    char_out=2.0,
-    gas_made=1.0,
-    to_freeboard=2.0,
-    flue=2.0,
-)
+PUBLISHED_FLOWS = Flows()
 """F_in, F_out, R_w, P, R_c, F_c, R_g, F_w, F_g. [published] They leave 3 kg/min of gas in the freeboard for ever."""
 
 
@@ -80,13 +70,8 @@ class Incinerator(ContinuousModel, Outflowing):
     """
 
     kind: ClassVar[str] = "incinerator"
-    state_names: ClassVar[tuple[str, ...]] = (
-        "waste_kg",
-        "char_kg",
-        "wastebed_degc",
-        "wastebed_gas_kg",
-        "freeboard_gas_kg",
-        "freeboard_degc",
+    state_names: ClassVar[tuple[str, ...]] = tuple(
+        "waste_kg char_kg wastebed_degc wastebed_gas_kg freeboard_gas_kg freeboard_degc".split()
     )
     input_names: ClassVar[tuple[str, ...]] = ("heat_taken_kj_min",)
     input_unit: ClassVar[str] = "kJ/min"
@@ -156,13 +141,7 @@ class Incinerator(ContinuousModel, Outflowing):
         )
 
     def derivative(self, state: Floats, inputs: Floats, *, feed_kg_min: Floats | float | None = None) -> Floats:
-        """Return dz/dt per minute, shape (6, B).
-
-        Args:
-            state: (M, M_c, T_w, M_w, M_f, T_g), shape (6, B).
-            inputs: (Q_ext,), shape (1, B).
-            feed_kg_min: waste that arrives, shape (B,) or a number; None takes the parameter.
-        """
+        """Return d(M, M_c, T_w, M_w, M_f, T_g)/dt per minute, shape (6, B); another feed is a number or shape (B,)."""
         flows = self.flows(state, feed_kg_min)
         bed_power, freeboard_power = self.powers(state, inputs, flows)
         bed_capacity, freeboard_capacity = self.capacities(state)

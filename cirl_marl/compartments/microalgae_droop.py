@@ -70,9 +70,8 @@ class MicroalgaeDroop(Microalgae):
         growth = self.growth_per_day * self.light(inputs) * (1.0 - self.minimal_quota_umol_um3 / quota)
         rho = self.uptake(state, inputs)
         supply = self.dilution_per_day * (self.nutrient_in_umol_l - nutrient)
-        return np.stack(
-            [growth * biomass - self.dilution_per_day * biomass, rho - growth * quota, supply - rho * biomass]
-        )
+        grown = growth * biomass - self.dilution_per_day * biomass
+        return np.stack([grown, rho - growth * quota, supply - rho * biomass])
 
     def integrate(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
         """Return the state after an interval of constant light, (3, B), and the mean ``outflow`` over it, (B,).
@@ -89,12 +88,7 @@ class MicroalgaeDroop(Microalgae):
             S ← S_in + (S − S_in)E − U,   Q ← Q + U/(X E).
 
         Hence N = S + XQ is S_in + (N₀ − S_in)e^(−D·interval) to round-off, and Q stays above k_q. The mean is that of
-        ρX (sound) or ρ (published) along the exact S.
-
-        Args:
-            state: X ≥ 0, Q > k_q, S ≥ 0, shape (3, B).
-            inputs: I ≥ 0, shape (1, B).
-            interval: days, > 0.
+        ρX (sound) or ρ (published) along the exact S. All this holds for X ≥ 0, Q > k_q, S ≥ 0, I ≥ 0.
         """
         biomass, quota, nutrient = state
         steps, half, kept, draw = self._halves(interval)

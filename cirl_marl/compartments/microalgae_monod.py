@@ -78,12 +78,8 @@ class MicroalgaeMonod(Microalgae):
             S ← S_in + (S − S_in)E − U,   X ← X E + Y U.
 
         Hence N = S + X/Y is S_in + (N₀ − S_in)e^(−D·interval) to round-off, S and X stay positive for any step, and S
-        ends at its quasi-steady value. The mean is that of ρX (sound) or ρ (published) along the exact S.
-
-        Args:
-            state: X, S ≥ 0, shape (2, B).
-            inputs: I ≥ 0, shape (1, B).
-            interval: days, > 0.
+        ends at its quasi-steady value. The mean is that of ρX (sound) or ρ (published) along the exact S. All this
+        holds for X, S, I ≥ 0.
         """
         biomass, nutrient = state
         steps, _, kept, draw = self._halves(interval)

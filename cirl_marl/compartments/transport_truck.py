@@ -53,13 +53,7 @@ class TransportTruck(ContinuousModel):
     standstill_m_s: Annotated[float, Positive("v_s of the smoothed sign [chosen]")] = 0.05
 
     def derivative(self, state: Floats, inputs: Floats, *, load_kg: Floats | float | None = None) -> Floats:
-        """Return (ẋ, v̇) in m/s and m/s², shape (2, B).
-
-        Args:
-            state: (x, v), shape (2, B).
-            inputs: (F,), shape (1, B).
-            load_kg: mass carried, shape (B,) or a number; None takes the parameter.
-        """
+        """Return (ẋ, v̇) in m/s and m/s², shape (2, B); another load than the parameter is a number or shape (B,)."""
         mass_kg = self.truck_kg + (self.load_kg if load_kg is None else load_kg)
         force_n = inputs[0]
         if self.form == "sound":

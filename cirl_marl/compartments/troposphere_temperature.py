@@ -49,13 +49,7 @@ class TroposphereTemperature(ContinuousModel):
         return self.emissivity - self.greenhouse_m3_mg * (co2_t / self.volume_km3)
 
     def derivative(self, state: Floats, inputs: Floats, *, stock_kg: Floats) -> Floats:
-        """Return Ṫ, K/d, shape (1, B).
-
-        Args:
-            state: (T,), shape (1, B).
-            inputs: none, shape (0, B).
-            stock_kg: x₁, the carbon dioxide that the network holds there, kg, shape (B,).
-        """
+        """Return Ṫ, K/d, shape (1, B); ``stock_kg`` is x₁, the CO₂ that the network holds there, shape (B,)."""
         co2_t = stock_kg[None] / 1000.0
         absorbed = self.solar_w_m2 * (1.0 - self.albedo)
         emitted = self.effective_emissivity(co2_t) * self.stefan_boltzmann_w_m2_k4 * np.square(np.square(state))

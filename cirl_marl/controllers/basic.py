@@ -53,11 +53,7 @@ class Constant(Controller):
         self._actions: dict[str, NDArray[np.floating]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
-        """Take the actions of ``env``'s agents.
-
-        Raises:
-            ControlError: if a named agent does not act or its value is out of bounds.
-        """
+        """Take the actions of ``env``'s agents; an agent that does not act or a value out of bounds is refused."""
         for agent, value in self._wanted.items():
             if agent not in env.agents:
                 raise ControlError(f"constant control: {unknown('agent', agent, env.agents)}")

@@ -94,11 +94,7 @@ def interval_ends(network: Network) -> Floats:
 
 
 def first_seed(seed: int) -> int:
-    """Return the seed of the first episode of the evaluation ``seed``.
-
-    Raises:
-        CirlError: if ``seed`` is negative.
-    """
+    """Return the seed of the first episode of the evaluation ``seed``, which a ``CirlError`` refuses if negative."""
     if seed < 0:
         raise CirlError(f"seed must not be negative, got {seed}")
     return EVALUATION_SEEDS + SEED_SPACING * seed

@@ -28,11 +28,7 @@ class Schedule:
     rollout: Rollout
 
     def write(self, path: Path) -> None:
-        """Write a CSV file, whole or not at all; its folder must be there.
-
-        Raises:
-            CirlError: if there is no such folder.
-        """
+        """Write a CSV file, whole or not at all; a ``CirlError`` says so if its folder is not there."""
         if not path.parent.is_dir():
             raise CirlError(f"{path}: the folder {path.parent} does not exist")
         rows = [[f"{value:.10g}" for value in row] for row in self.columns.T]

@@ -122,11 +122,7 @@ class Scripted(Controller):
         self._scripts: dict[str, tuple[Script, CompartmentModel, dict[str, int], Control]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
-        """Find the script of each agent and what it reads.
-
-        Raises:
-            ControlError: if an agent that is held constant does not act or its value is out of bounds.
-        """
+        """Find the script of each agent and what it reads; those held constant are refused as by ``Constant``."""
         self._constant.start(env, seed)
         self._scripts = {}
         for agent in env.agents:
@@ -145,11 +141,7 @@ class Scripted(Controller):
         return tuple(self._scripts)
 
     def act(self, observations: Arrays) -> Arrays:
-        """Return each agent's action.
-
-        Raises:
-            ControlError: if an agent does not see a state that its script needs.
-        """
+        """Return each agent's action; a ``ControlError`` names a state that its script needs and it does not see."""
         actions = dict(self._constant.act(observations))
         for agent, (script, model, columns, control) in self._scripts.items():
             seen = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}

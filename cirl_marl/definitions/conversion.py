@@ -48,11 +48,7 @@ class Converter:
         self.scales: dict[str, float] = {}
 
     def network(self, scenario: str) -> Network:
-        """Return the network.
-
-        Raises:
-            NetworkError: with every inconsistent unit and every fault of the network.
-        """
+        """Return the network; a ``NetworkError`` has every inconsistent unit, or else every fault of the network."""
         table = self.table
         for key, unit, base in (("mass", table.units.mass, "kg"), ("time", table.units.time, "s")):
             try:

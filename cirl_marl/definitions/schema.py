@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, create_model
 
 from cirl_marl.network.declared import (
-    Amount,
     Declared,
     Nested,
     Numbers,
@@ -104,7 +103,7 @@ def table_of(made: type[Any], **more: Any) -> Any:
     told, hints = declarations(made), get_type_hints(made)
     spelled = {name: _spelled(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
     keys = {name: _key(made, name, kind) for name, kind in spelled.items() if kind is not None}
-    if any(isinstance(declared, Amount) for declared in told.values()):
+    if Number in spelled.values():
         more |= {"unit": (str, ...), "source": (Source, ...)}
     summary = str(made.__doc__).partition("\n")[0]
     return create_model(f"{made.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
@@ -126,12 +125,13 @@ def _spelled(declared: Declared, hint: Any) -> Any:
     if isinstance(declared, Word):
         return declared.of if isinstance(declared.of, type) else Literal[declared.of]
     if isinstance(declared, Numbers):
-        return {"range": Range, "batches": Batches, "flow": QuantityTable}.get(declared.spelled)
+        tables = {"range": Range, "batches": Batches, "flow": QuantityTable, "amount": Number}
+        return tables.get(declared.spelled)
     if isinstance(declared, Nested):
         return ControlTable if declared.of == "control" else ModelTable
     if isinstance(declared, Quantity):
         return QuantityTable
-    return {float: Number, bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
+    return {bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
 
 
 TITLE: Any = (str, "")

@@ -148,11 +148,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         return {agent: seen[0] for agent, seen in observation.items()}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``.
-
-        Raises:
-            CirlError: if the environment was made without a ``render_mode``.
-        """
+        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``."""
         if self.render_mode is None:
             raise CirlError(f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when it is made")
         from cirl_marl.drawing.digraph import Canvas
@@ -206,12 +202,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
 
 def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParallelEnv:
-    """Return the network as a PettingZoo ParallelEnv.
-
-    Args:
-        network: catalogue name, path of a definition file, or a network.
-        **options: ``scenario``, ``agents``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``,
-            ``horizon``, ``render_mode``.
+    """Return the network as a PettingZoo ParallelEnv; options are those of ``VectorEnv``, and ``render_mode``.
 
     >>> env = parallel_env("copper_net", agents=["mine", "use_to_collection"])
     >>> observations, infos = env.reset(seed=0)

@@ -116,11 +116,7 @@ class VectorEnv:
 
     @property
     def physical(self) -> State:
-        """The current physical state; its arrays must not be written to.
-
-        Raises:
-            ControlError: before the first ``reset``.
-        """
+        """The current physical state; its arrays must not be written to. Before ``reset`` there is none."""
         if self._state is None:
             raise ControlError("the environment has no state yet: call reset() first")
         return self._state
@@ -143,13 +139,9 @@ class VectorEnv:
         return self.by_agent(self._observe(self._state))
 
     def step(self, actions: Mapping[str, ArrayLike]) -> tuple[_Seen, dict[str, Floats], _Flags, _Flags, Infos]:
-        """Hold the actions for one control interval.
+        """Hold the actions, agent → array (num_envs, entries of its action) in [−1, 1], for one control interval.
 
-        Args:
-            actions: agent → array of shape (num_envs, entries of its action) in [−1, 1].
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos, each by agent.
+        Returned are observations, rewards, terminations, truncations and infos, each by agent.
 
         Raises:
             ControlError: for missing or unknown agents, wrong shapes, NaN or values out of bounds.

@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, MISSING, dataclass, fields
 from enum import StrEnum
-from functools import cache
+from functools import cache, partial
 from numbers import Real
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeVar, get_type_hints
@@ -111,15 +111,6 @@ class Quantity(Declared):
 
 
 @dataclass(frozen=True, slots=True)
-class Amount(Declared):
-    """A number whose unit is that of the table in which it stands."""
-
-    def problem(self, value: object) -> str:
-        """See ``Declared.problem``."""
-        return _problem(value, "a number", ())
-
-
-@dataclass(frozen=True, slots=True)
 class Numbers(Declared):
     """Several numbers, which definition files spell in a table of their own.
 
@@ -138,13 +129,13 @@ class Numbers(Declared):
         return _problem(value, self.form, self.shape)
 
 
+Amount = partial(Numbers, form="a number", shape=(), spelled="amount")
+"""A number whose unit is that of the table in which it stands."""
+
+
 @dataclass(frozen=True, slots=True)
 class Nested(Declared):
-    """A part of its own, with a table of its own.
-
-    Attributes:
-        of: which.
-    """
+    """A part of its own, with a table of its own."""
 
     of: Literal["control", "model"] = "control"
 

@@ -52,11 +52,7 @@ class CompartmentModel(ABC):
     context_names: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        """Refuse parameters of another kind, or out of other bounds, than they are declared with.
-
-        Raises:
-            NetworkError: naming every parameter and its value.
-        """
+        """Refuse parameters of another kind, or out of other bounds, than declared; a ``NetworkError`` names all."""
         settle(self.kind, self)
         if found := list(bound_problems(self)):
             raise NetworkError(self.kind, found)

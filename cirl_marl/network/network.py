@@ -48,11 +48,7 @@ class Network(Parts):
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def scenario(self, name: str | None) -> Network:
-        """Return this network under scenario ``name`` (None: as it is).
-
-        Raises:
-            CirlError: if the definition has no such scenario.
-        """
+        """Return this network under scenario ``name`` (None: as it is); a ``CirlError`` lists those there are."""
         if name is None or name == self.scenario_name:
             return self
         if name not in self.scenarios:

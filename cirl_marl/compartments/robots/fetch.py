@@ -27,14 +27,9 @@ def _names(*groups: tuple[str, str]) -> tuple[str, ...]:
 
 
 OBSERVATION = _names(
-    ("grip", "xyz"),
-    ("object", "xyz"),
-    ("object_from_grip", "xyz"),
+    *((what, "xyz") for what in ("grip", "object", "object_from_grip")),
     ("finger", "rl"),
-    ("object_angle", "xyz"),
-    ("object_slip", "xyz"),
-    ("object_spin", "xyz"),
-    ("grip_move", "xyz"),
+    *((what, "xyz") for what in ("object_angle", "object_slip", "object_spin", "grip_move")),
     ("finger_move", "rl"),
 )
 ACHIEVED, DESIRED = _names(("achieved", "xyz")), _names(("desired", "xyz"))

@@ -14,17 +14,8 @@ from cirl_marl.network.declared import Quantity, itemised
 from cirl_marl.network.model import Task
 from cirl_marl.network.rowsum import Floats
 
-OBSERVED = (
-    "cos_0",
-    "cos_1",
-    "sin_0",
-    "sin_1",
-    "target_x_m",
-    "target_y_m",
-    "speed_0_rad_s",
-    "speed_1_rad_s",
-    "to_target_x_m",
-    "to_target_y_m",
+OBSERVED = tuple(
+    "cos_0 cos_1 sin_0 sin_1 target_x_m target_y_m speed_0_rad_s speed_1_rad_s to_target_x_m to_target_y_m".split()
 )
 
 
