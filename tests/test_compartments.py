@@ -44,7 +44,7 @@ from cirl_marl.network.model import (
 from cirl_marl.network.rowsum import Floats
 from cirl_marl.network.units import factor
 
-HELPERS = {"microalgae", "nutrient", "parameters"}
+HELPERS = {"microalgae", "nutrient"}
 """Modules of the package that hold no model."""
 
 DISCRETE = {"fetch", "reacher", "sorting_station"}

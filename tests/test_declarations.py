@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,15 +17,14 @@ from cirl_marl.definitions.guide import format_guide
 from cirl_marl.definitions.mistakes import mistakes_of
 from cirl_marl.definitions.schema import NetworkTable, table_of
 from cirl_marl.definitions.writing import _Writer, definition_of, fingerprint
-from cirl_marl.network.declared import Declared, Quantity, Word, bound_problems, declarations, itemised, settle
+from cirl_marl.network.declared import Declared, Quantity, Word, bound_problems, declarations, frozen, settle
 from cirl_marl.network.elements import Control, Episode, Objective, Observation, Service
 
 DOCUMENT = tomllib.loads((folder("envs") / "copper_net.toml").read_text(encoding="utf-8"))
 MODES = ("slow", "fast")
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Warmed(Episode):
     """An episode that begins with a warm-up."""
 

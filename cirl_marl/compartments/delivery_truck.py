@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.parameters import NotNegative, Positive
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.errors import CirlError
-from cirl_marl.network.declared import Quantity, itemised
+from cirl_marl.network.declared import NotNegative, Positive, Quantity, frozen
 from cirl_marl.network.model import RewardState, Vehicle
 from cirl_marl.network.rowsum import Floats
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class DeliveryTruck(TransportTruck, Vehicle):
     """The point mass of ``TransportTruck`` with the load that the network gives it, on a road of ``target_m``.
 

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import NotNegative, Positive, Share
 from cirl_marl.errors import CirlError
-from cirl_marl.network.declared import Quantity, itemised
+from cirl_marl.network.declared import NotNegative, Positive, Quantity, Share, frozen
 from cirl_marl.network.model import ContinuousModel, Measuring, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Digester(ContinuousModel, Outflowing, Measuring):
     """AM2 with one dilution rate D, the control: the physically sound form.
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.compartments.parameters import Positive
-from cirl_marl.network.declared import Declared, itemised
+from cirl_marl.network.declared import Declared, Positive, frozen
 from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class DigesterPublished(ContinuousModel, Outflowing):
     """AM2 after arXiv 2502.02382: ż = f(z) + G(z)·(D̄ + φ) with one dilution D̄ + φ_i for each state.
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import NotNegative, Positive, Share
-from cirl_marl.network.declared import Quantity, Word, itemised
+from cirl_marl.network.declared import NotNegative, Positive, Quantity, Share, Word, frozen
 from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -41,8 +39,7 @@ PUBLISHED_FLOWS = Flows()
 """F_in, F_out, R_w, P, R_c, F_c, R_g, F_w, F_g. [published] They leave 3 kg/min of gas in the freeboard for ever."""
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Incinerator(ContinuousModel, Outflowing):
     """Masses and temperatures of wastebed (waste M, char M_c, gas M_w, T_w) and freeboard (gas M_f, T_g).
 

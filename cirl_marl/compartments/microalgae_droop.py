@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from cirl_marl.compartments.microalgae import Microalgae
-from cirl_marl.compartments.parameters import Form, NotNegative, Positive
-from cirl_marl.network.declared import itemised
-from cirl_marl.network.model import RewardState
+from cirl_marl.network.declared import NotNegative, Positive, frozen
+from cirl_marl.network.model import Form, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred (mean return 454; the paper's end
 # at 446 to 473). The light changes the return by no more than 0.1 %.
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class MicroalgaeDroop(Microalgae):
     """Chemostat with biomass X, cell quota Q and dissolved nutrient S; the control is the light I.
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from cirl_marl.compartments.microalgae import Microalgae
-from cirl_marl.compartments.parameters import Form, NotNegative, Positive
-from cirl_marl.network.declared import itemised
-from cirl_marl.network.model import RewardState
+from cirl_marl.network.declared import NotNegative, Positive, frozen
+from cirl_marl.network.model import Form, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[1, 5] µmol/L is inferred: from S = 0 constant darkness
@@ -18,8 +16,7 @@ from cirl_marl.network.rowsum import Floats
 # more S at most 0.2 more: the paper's best end, its untrained policies, its DDPG stuck at full light.
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class MicroalgaeMonod(Microalgae):
     """Chemostat with biomass X and dissolved nutrient S; the control is the light I.
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import Form, NotNegative, Positive
-from cirl_marl.network.declared import itemised
-from cirl_marl.network.model import ContinuousModel, RewardState
+from cirl_marl.network.declared import NotNegative, Positive, frozen
+from cirl_marl.network.model import ContinuousModel, Form, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ s, an episode 0.01 s. x(0) ~ U[0, 500] m is inferred: from 0 the
 # published returns of −1.2·10⁸ are out of reach (the best is −1.99992·10⁸).
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class TransportTruck(ContinuousModel):
     """Point mass on a straight road, driven by a force F.
 

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import NotNegative, Positive, Share
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declared import NotNegative, Positive, Share, frozen
 from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 SECONDS_PER_DAY = 86400.0
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class TroposphereTemperature(ContinuousModel):
     """Radiation balance C·Ṫ = S(1 − α) − ε·σ·T⁴ with the emissivity ε = ε_n − η·x₁/V₁ of air that holds x₁ of CO₂.
 

@@ -23,7 +23,7 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declared import frozen
 from cirl_marl.network.elements import ControlKind, Law, Role
 
 RANK, DECAY = 1e-9, 1e-7
@@ -32,8 +32,7 @@ ITERATIONS, CONVERGED = 500, 1e-12
 """Most steps of the fixed point of output feedback, and the relative change at which it has converged."""
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class LinearSystem:
     """The linear laws ẋ = A x + B u + c of a network, read off its compiled flow laws.
 

@@ -16,7 +16,7 @@ from enum import StrEnum
 from functools import cache, partial
 from numbers import Real
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, TypeVar, get_type_hints
+from typing import Any, Literal, NamedTuple, TypeVar, dataclass_transform, get_type_hints
 
 import numpy as np
 
@@ -110,6 +110,11 @@ class Quantity(Declared):
         return f"must be at least {self.low:g}" if math.isfinite(self.low) else "must be finite"
 
 
+Positive = partial(Quantity, positive=True)
+NotNegative = partial(Quantity, low=0.0)
+Share = partial(Quantity, low=0.0, high=1.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Numbers(Declared):
     """Several numbers, which definition files spell in a table of their own.
@@ -148,6 +153,12 @@ def itemised(made: type[Part]) -> type[Part]:
     ]
     made.__doc__ = "\n".join([str(made.__doc__).rstrip(), "", "    Attributes:", *lines, "    "])
     return made
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+def frozen(made: type[Part]) -> type[Part]:
+    """Make a dataclass of keywords that cannot be changed, and whose docstring lists them."""
+    return itemised(dataclass(frozen=True, slots=True, kw_only=True)(made))
 
 
 def declarations(made: type[Any]) -> Mapping[str, Declared]:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Literal, get_args
 
 import numpy as np
 
-from cirl_marl.network.declared import Amount, Declared, Kinds, Nested, Numbers, Quantity, Word, itemised, settle
+from cirl_marl.network.declared import Amount, Declared, Kinds, Nested, Numbers, Quantity, Word, frozen, settle
 from cirl_marl.network.model import CompartmentModel
 from cirl_marl.network.rowsum import Floats
 
@@ -51,19 +50,13 @@ class ControlKind(StrEnum):
     INPUT = "input"
 
 
-Solver = Literal["exact", "rk4", "euler"]
-NetZero = Literal["signed", "abs"]
 Reward = Literal["local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team"]
 Observe = Literal["local", "neighbours", "full", "stocks", "model"]
 Moment = Literal["end", "mean"]
-ServiceQuantity = Literal["stock", "outflow", "flow", "measure"]
 
-SOLVERS: tuple[str, ...] = get_args(Solver)
-NET_ZERO: tuple[str, ...] = get_args(NetZero)
 REWARDS: tuple[str, ...] = get_args(Reward)
 OBSERVE: tuple[str, ...] = get_args(Observe)
 MOMENTS: tuple[str, ...] = get_args(Moment)
-QUANTITIES: tuple[str, ...] = get_args(ServiceQuantity)
 SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})
 MAX_STEPS = 10_000
 """Solver steps of a control interval, or control intervals of a delay, beyond which a unit is taken for a mistake."""
@@ -85,8 +78,7 @@ BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
 Pair = tuple[float, float]
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Control:
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high]."""
 
@@ -117,7 +109,7 @@ INNER = Numbers(
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Compartment:
     """What nodes and arcs have in common."""
 
@@ -141,8 +133,7 @@ class Compartment:
         return int(self.control is not None)
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Node(Compartment):
     """A compartment that stores material, with an ``id`` of its own among nodes and arcs.
 
@@ -165,8 +156,7 @@ class Node(Compartment):
     ] = 1.0
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Arc(Compartment):
     """A compartment that moves material from ``donor`` to ``recipient``, with an ``id`` of its own.
 
@@ -235,8 +225,7 @@ class Arc(Compartment):
     ] = 1.0
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Service:
     """What the network is there for: a stock or flow to be kept within a band, under an ``id`` of its own.
 
@@ -251,7 +240,7 @@ class Service:
         Word(
             "``stock`` (of a node, or on the way along a batch arc), ``outflow`` of a node (sum of its outflows, none "
             "of them in batches), ``flow`` of an arc, or ``measure``, one that the provider's model offers",
-            of=QUANTITIES,
+            of=("stock", "outflow", "flow", "measure"),
         ),
     ]
     low: Annotated[
@@ -274,8 +263,7 @@ class Service:
         return self.owed_by or (self.provider,)
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Episode:
     """Time and solver of an episode."""
 
@@ -289,7 +277,7 @@ class Episode:
             "``exact`` (zero-order-hold solution, for networks without inner physics), ``rk4`` (classical Runge-Kutta, "
             "for those with it), both keeping stocks non-negative; or ``euler`` (the explicit step of the published "
             "environments; stocks may become negative)",
-            of=SOLVERS,
+            of=("exact", "rk4", "euler"),
         ),
     ] = "exact"
     solver_step: Annotated[
@@ -300,8 +288,7 @@ class Episode:
     ] = None
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Objective:
     """How circularity and rewards are read off the network."""
 
@@ -312,7 +299,7 @@ class Objective:
         str,
         Word(
             "``signed`` counts over-removal from the environment as positive; ``abs`` penalises it like emission",
-            of=NET_ZERO,
+            of=("signed", "abs"),
             required=True,
         ),
     ] = "signed"
@@ -334,8 +321,7 @@ class Objective:
     ] = None
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Observation:
     """What agents see by default."""
 

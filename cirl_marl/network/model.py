@@ -13,16 +13,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from inspect import isabstract
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.errors import NetworkError
-from cirl_marl.network.declared import bound_problems, settle
+from cirl_marl.network.declared import Word, bound_problems, settle
 from cirl_marl.network.rowsum import Floats
 
 RewardState = Literal["before", "after"]
+Form = Annotated[Literal["published", "sound"], Word("``published`` or ``sound``", of=("published", "sound"))]
+"""Which equations, of a model that has those that were published and physically sound ones."""
 Bools = NDArray[np.bool_]
 
 

@@ -13,8 +13,7 @@ from cirl_marl.network.elements import MAX_STEPS, TAKEN, Arc, Compartment, Contr
 from cirl_marl.network.model import CompartmentModel, Outflowing, Releasing, Vehicle, model_faults
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.units import factor
-from cirl_marl.network.validate_services import service_problems
-from cirl_marl.network.validate_settings import is_whole, repeated, setting_problems
+from cirl_marl.network.validate_settings import is_whole, repeated, service_problems, setting_problems
 
 IDENTIFIER = r"^[a-z][a-z0-9_]*$"
 """How compartments and services may be called; their names are keys of definition files and names of files."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import gymnasium
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.compartments.robots.engine import Engine, Robot, one_per_thread
-from cirl_marl.network.declared import Quantity, itemised
+from cirl_marl.network.declared import Quantity, frozen
 from cirl_marl.network.model import Task
 from cirl_marl.network.rowsum import Floats
 
@@ -34,8 +33,7 @@ class ReacherEngine(Engine):
         return np.array([*self.env._get_obs(), np.linalg.norm(apart)])
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Reacher(Robot, Task):
     """Gymnasium's Reacher-v5, unchanged, as in the paper.
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.parameters import Positive
 from cirl_marl.compartments.robots.fetch import Fetch
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.errors import CirlError
-from cirl_marl.network.declared import Quantity, Word, itemised
+from cirl_marl.network.declared import Positive, Quantity, Word, frozen
 from cirl_marl.network.model import DiscreteTimeModel, Releasing, RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -21,8 +19,7 @@ BOOKS = ("busy", "attempt_step", "done_in_batch", "sorted_now", "missed_now", "c
 BUSY, STEP, DONE, SORTED, MISSED, COMPLETE, KEY, ATTEMPT = range(len(BOOKS))
 
 
-@itemised
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class SortingStation(DiscreteTimeModel, Releasing):
     """A robot makes one attempt at each item; what it does not finish in time is missed.
 
