@@ -13,7 +13,20 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 
-from cirl_marl.network.declared import Amount, Declared, Kinds, Nested, Numbers, Quantity, Word, frozen, settle
+from cirl_marl.network.declared import (
+    Amount,
+    Declared,
+    Kinds,
+    Nested,
+    NotNegative,
+    Numbers,
+    Positive,
+    Quantity,
+    Share,
+    Word,
+    frozen,
+    settle,
+)
 from cirl_marl.network.model import CompartmentModel
 from cirl_marl.network.rowsum import Floats
 
@@ -119,7 +132,7 @@ class Compartment:
     control: Annotated[Control | None, CONTROL] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
     inner: Annotated[tuple[Pair, ...], INNER] = ()
-    reward_scale: Annotated[float, Quantity("the model's reward is divided by it", positive=True)] = 1.0
+    reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0
 
     def __post_init__(self) -> None:
         """Refuse what is no number; take roles and laws as definitions spell them."""
@@ -149,10 +162,7 @@ class Node(Compartment):
     ] = (0.0, 0.0)
     set_point: Annotated[float | None, Quantity("stock aimed at, mass; None if there is none", of="mass")] = None
     scale: Annotated[
-        float,
-        Quantity(
-            "reference stock of observations and rewards; files may leave it to scales.stock", of="mass", positive=True
-        ),
+        float, Positive("reference stock of observations and rewards; files may leave it to scales.stock", of="mass")
     ] = 1.0
 
 
@@ -170,11 +180,10 @@ class Arc(Compartment):
     law: Annotated[Law, Word("how much it carries", of=Law, required=True)] = Law.DONOR
     rate: Annotated[
         float,
-        Quantity(
+        NotNegative(
             "a, 1/time (donor and recipient laws), mass/time per unit of the model's output, or mass per unit that the "
             "donor's model releases (batch law)",
             of=RATE_OF,
-            low=0.0,
         ),
     ] = 0.0
     by: Annotated[
@@ -216,11 +225,10 @@ class Arc(Compartment):
     )
     scale: Annotated[
         float,
-        Quantity(
+        Positive(
             "reference flow of observations and rewards, of a batch arc reference mass; files may leave it to "
             "scales.flow and scales.stock",
             of=SCALE_OF,
-            positive=True,
         ),
     ] = 1.0
 
@@ -243,15 +251,9 @@ class Service:
             of=("stock", "outflow", "flow", "measure"),
         ),
     ]
-    low: Annotated[
-        float,
-        Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True),
-    ]
-    high: Annotated[
-        float,
-        Quantity("upper end of the band, likewise; none if left out", of=BAND_OF, joint=True),
-    ] = math.inf
-    weight: Annotated[float, Quantity("factor of the shortfall in the local rewards", low=0.0, required=True)] = 1.0
+    low: Annotated[float, Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True)]
+    high: Annotated[float, Quantity("upper end, likewise; none if left out", of=BAND_OF, joint=True)] = math.inf
+    weight: Annotated[float, NotNegative("factor of the shortfall in the local rewards", required=True)] = 1.0
     measure: Annotated[str, Declared('name of the measure, for ``quantity = "measure"``')] = ""
     owed_by: Annotated[
         tuple[str, ...], Declared("compartments whose local reward bears the shortfall; empty means the provider alone")
@@ -267,9 +269,7 @@ class Service:
 class Episode:
     """Time and solver of an episode."""
 
-    control_interval: Annotated[
-        float, Quantity("h, time between two decisions", of="time", positive=True, required=True)
-    ] = 1.0
+    control_interval: Annotated[float, Positive("h, time between two decisions", of="time", required=True)] = 1.0
     horizon: Annotated[int, Quantity("decisions per episode", of="steps", low=1, required=True)] = 50
     solver: Annotated[
         str,
@@ -292,9 +292,7 @@ class Episode:
 class Objective:
     """How circularity and rewards are read off the network."""
 
-    reference_interval: Annotated[
-        float, Quantity("Δ of λ = −(m_fb + Δ·ṁ_fc)", of="time", positive=True, required=True)
-    ] = 1.0
+    reference_interval: Annotated[float, Positive("Δ of λ = −(m_fb + Δ·ṁ_fc)", of="time", required=True)] = 1.0
     net_zero: Annotated[
         str,
         Word(
@@ -304,20 +302,17 @@ class Objective:
         ),
     ] = "signed"
     reward: Annotated[str, Word("default reward mode of the environments", of=REWARDS, required=True)] = "mixed"
-    circularity_scale: Annotated[float, Quantity("reference |λ|", of="mass", positive=True, required=True)] = 1.0
+    circularity_scale: Annotated[float, Positive("reference |λ|", of="mass", required=True)] = 1.0
     circularity_weight: Annotated[
-        float, Quantity("weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local", low=0.0, high=1.0, required=True)
+        float, Share("weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local", required=True)
     ] = 0.5
     tracked: Annotated[
         tuple[str, ...],
-        Declared(
-            "compartments whose distance to the set-point enters their local reward; empty means every compartment "
-            "with a set-point"
-        ),
+        Declared("compartments whose distance to the set-point enters their local reward; empty means all with one"),
     ] = ()
     criticality: Annotated[
         float | None,
-        Quantity("c of the material; evaluations then report the time-window circularity of CIRO7.2 too", low=0.0),
+        NotNegative("c of the material; evaluations then report the time-window circularity of CIRO7.2 too"),
     ] = None
 
 
