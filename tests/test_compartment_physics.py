@@ -126,10 +126,9 @@ def check_digester_published() -> None:
 
 def check_atmosphere() -> None:
     """The stock changes by the net flow."""
-    box = Atmosphere(volume_l=4.0)
+    box = Atmosphere()
     found = solve(box, np.array([10.0]), np.array([3.0, 1.0]), [2.0])
     assert found[0, -1] == pytest.approx(14.0)
-    assert box.concentration_mmol_l(found)[0] == pytest.approx(3.5)
     assert box.reward(found, np.array([[3.0], [1.0]]))[0] == -2.0
 
 

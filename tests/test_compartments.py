@@ -67,7 +67,7 @@ FORMS: list[ContinuousModel] = [
     MicroalgaeDroop(),
     Digester(),
     DigesterPublished(),
-    Atmosphere(volume_l=2.0),
+    Atmosphere(),
     TroposphereTemperature(),
 ]
 """Every form of every model that is continuous in time."""
@@ -304,7 +304,6 @@ class TestRegistry:
             (lambda: Digester().equilibrium(3.0), "no equilibrium"),
             (lambda: Digester().equilibrium(0.0), "no equilibrium"),
             (lambda: DigesterPublished(settling_day=0.0), "settling_day"),
-            (lambda: Atmosphere(volume_l=0.0), "volume_l"),
             (lambda: TroposphereTemperature(albedo=1.1), "albedo 1.1"),
             (lambda: TroposphereTemperature(greenhouse_m3_mg=float("inf")), "greenhouse_m3_mg inf"),
         ],

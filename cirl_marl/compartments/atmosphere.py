@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from cirl_marl.network.declared import Positive, frozen
+from cirl_marl.network.declared import frozen
 from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -28,8 +28,6 @@ class Atmosphere(ContinuousModel):
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
-    volume_l: Annotated[float, Positive("volume of the box, L")] = 1.0
-
     def derivative(self, state: Floats, inputs: Floats) -> Floats:
         """Return ṁ, mmol/d, shape (1, B)."""
         return inputs[:1] - inputs[1:2]
@@ -38,8 +36,3 @@ class Atmosphere(ContinuousModel):
         """Return −|ṁ12 − ṁ23|, mmol/d, shape (B,)."""
         imbalance: Floats = np.abs(inputs[0] - inputs[1])
         return -imbalance
-
-    def concentration_mmol_l(self, state: Floats) -> Floats:
-        """Return the concentration, mmol/L, shape (B,)."""
-        concentration: Floats = state[0] / self.volume_l
-        return concentration

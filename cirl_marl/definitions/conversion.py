@@ -8,20 +8,9 @@ from cirl_marl.compartments import CompartmentModel, model_class
 from cirl_marl.definitions.mistakes import parameter_mistakes
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable, QuantityTable, Range
 from cirl_marl.errors import CirlError, NetworkError, unknown
-from cirl_marl.network import Network
+from cirl_marl.network import Network, elements
 from cirl_marl.network.declared import Declared, Numbers, Quantity, declarations
-from cirl_marl.network.elements import (
-    TAKEN,
-    Arc,
-    Control,
-    ControlKind,
-    Episode,
-    Law,
-    Node,
-    Objective,
-    Observation,
-    Service,
-)
+from cirl_marl.network.elements import TAKEN, Arc, Control, ControlKind, Law, Node
 from cirl_marl.network.units import factor
 
 GIVEN = ("rate", "flow", "series", "batches")
@@ -63,11 +52,12 @@ class Converter:
             "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
             "arcs": tuple(self._compartment(Arc, id_, arc, f"arcs.{id_}") for id_, arc in table.arcs.items()),
             "services": tuple(
-                self._part(Service, service, f"services.{id_}", id=id_) for id_, service in table.services.items()
+                self._part(elements.Service, service, f"services.{id_}", id=id_)
+                for id_, service in table.services.items()
             ),
-            "episode": self._part(Episode, table.episode, "episode"),
-            "objective": self._part(Objective, table.objective, "objective"),
-            "observation": self._part(Observation, table.observation, "observation"),
+            "episode": self._part(elements.Episode, table.episode, "episode"),
+            "objective": self._part(elements.Objective, table.objective, "objective"),
+            "observation": self._part(elements.Observation, table.observation, "observation"),
         }
         if self.mistakes:
             raise NetworkError(table.name, self.mistakes)

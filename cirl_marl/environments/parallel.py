@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,13 @@ from cirl_marl.network import Floats, Network
 RENDER_MODES = ("rgb_array", "human")
 _Seen = dict[str, NDArray[np.float32]]
 OPTIONS = ("observe", "circularity", "circularity_weight", "horizon")
+
+
+def check_options(options: Iterable[str], known: Sequence[str], *named: str) -> None:
+    """Refuse options that are not ``known``; ``named`` are those that are arguments of their own."""
+    for option in options:
+        if option not in known:
+            raise CirlError(unknown("option", option, (*known, *named)))
 
 
 class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
@@ -57,9 +64,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         **options: Any,
     ) -> None:
         """Make the environment; ``options`` and errors are those of ``VectorEnv``."""
-        for option in options:
-            if option not in OPTIONS:
-                raise CirlError(unknown("option", option, (*OPTIONS, "scenario", "agents", "reward", "render_mode")))
+        check_options(options, OPTIONS, "scenario", "agents", "reward", "render_mode")
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise CirlError(unknown("render_mode", render_mode, RENDER_MODES))
         self.batch = VectorEnv(network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options)
@@ -225,8 +230,5 @@ def vector_env(network: str | Path | Network, num_envs: int = 64, **options: Any
     >>> env.reset(seed=0)["mine"].shape
     (3, 4)
     """
-    known = ("scenario", "agents", "reward", *OPTIONS)
-    for option in options:
-        if option not in known:
-            raise CirlError(unknown("option", option, known))
+    check_options(options, (*OPTIONS, "scenario", "agents", "reward"))
     return VectorEnv(network, num_envs=num_envs, **options)

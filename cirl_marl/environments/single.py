@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.parallel import OPTIONS, NetworkParallelEnv
+from cirl_marl.environments.parallel import OPTIONS, NetworkParallelEnv, check_options
 from cirl_marl.environments.state import Snapshot
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 
 SHARED = ("reward", "render_mode")
@@ -60,10 +60,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if "agents" in options:
             raise CirlError("a single-agent environment takes agent=, not agents=")
-        for option in options:
-            if option not in (*OPTIONS, *SHARED):
-                own = ("agent", "scenario", "legacy_episode")
-                raise CirlError(unknown("option", option, (*OPTIONS, *own, *SHARED)))
+        check_options(options, (*OPTIONS, *SHARED), "agent", "scenario", "legacy_episode")
         if not isinstance(agent, str | None):
             raise CirlError(f"agent must be the name of one agent, got {agent!r}")
         chosen = None if agent is None else [agent]

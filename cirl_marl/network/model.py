@@ -127,9 +127,7 @@ class OwnStepModel(Outflowing):
     __slots__ = ()
 
     @abstractmethod
-    def integrate(
-        self, state: Floats, inputs: Floats, interval: float, *_: Any, **context: Any
-    ) -> tuple[Floats, Floats]:
+    def integrate(self, state: Floats, inputs: Floats, interval: float, *_: Any, **more: Any) -> tuple[Floats, Floats]:
         """Return the state after ``interval`` ``time_unit``, (k, B), and the mean of ``outflow`` over it, (B,)."""
 
 
@@ -158,11 +156,7 @@ class DiscreteTimeModel(CompartmentModel):
 
 
 class Measuring(CompartmentModel):
-    """A model of which services and observers may read more than its states.
-
-    Attributes:
-        measure_names: what it measures, with units, in order.
-    """
+    """A model of which services and observers may read more than states: ``measure_names``, with units, in order."""
 
     __slots__ = ()
     measure_names: ClassVar[tuple[str, ...]] = STATED
@@ -183,13 +177,7 @@ class Task(CompartmentModel):
 
 
 class GoalTask(Task):
-    """A task with goals, for ``GoalEnv``; all names are of states that are observed.
-
-    Attributes:
-        observation_names: what is seen besides the goals.
-        achieved_names: the goal as it is.
-        desired_names: the goal as it should be.
-    """
+    """A task with goals, for ``GoalEnv``: names of observed states besides the goal, of it as it is and should be."""
 
     __slots__ = ()
     observation_names: ClassVar[tuple[str, ...]] = STATED
@@ -202,11 +190,7 @@ class GoalTask(Task):
 
 
 class Releasing(CompartmentModel):
-    """A model that releases units of its node's stock into batch arcs.
-
-    Attributes:
-        ports: where it releases; each port has a batch arc.
-    """
+    """A model that releases units of its node's stock into batch arcs, of which each of its ``ports`` has one."""
 
     __slots__ = ()
     ports: ClassVar[tuple[str, ...]] = STATED
