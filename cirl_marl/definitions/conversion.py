@@ -48,13 +48,11 @@ class Converter:
             self.scales[kind] = self._value(scale, kind, f"scales.{key}")
             if self.scales[kind] <= 0:
                 self.mistakes.append(f"scales.{key}: {scale.value} must be positive")
+        services = table.services.items()
         parts: dict[str, Any] = {
             "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
             "arcs": tuple(self._compartment(Arc, id_, arc, f"arcs.{id_}") for id_, arc in table.arcs.items()),
-            "services": tuple(
-                self._part(elements.Service, service, f"services.{id_}", id=id_)
-                for id_, service in table.services.items()
-            ),
+            "services": tuple(self._part(elements.Service, each, f"services.{id_}", id=id_) for id_, each in services),
             "episode": self._part(elements.Episode, table.episode, "episode"),
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),

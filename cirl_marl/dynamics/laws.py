@@ -69,12 +69,8 @@ class FlowLaws:
         self.network = network
         arcs = len(network.arcs)
         self.rows = rows = Rows(network)
-        self.incidence = RowSum(
-            np.concatenate([network.donors, network.recipients]),
-            np.tile(np.arange(arcs), 2),
-            np.repeat([-1.0, 1.0], arcs),
-            (rows.masses, arcs),
-        )
+        ends, twice = np.concatenate([network.donors, network.recipients]), np.tile(np.arange(arcs), 2)
+        self.incidence = RowSum(ends, twice, np.repeat([-1.0, 1.0], arcs), (rows.masses, arcs))
         laws = [LAWS[arc.law] for arc in network.arcs]
         self.scheduled = np.array([law.scheduled for law in laws], dtype=bool)
         drivers = [law.driver(arc, network, rows) for law, arc in zip(laws, network.arcs, strict=True)]

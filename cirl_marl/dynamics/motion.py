@@ -84,7 +84,7 @@ class Dynamics(FlowLaws):
         self.terms = self._series_terms() if self._exact else 0
         self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
         shape = (rows.masses, len(network.arcs))
-        self._outgoing = RowSum(network.donors, np.arange(shape[1]), np.ones(shape[1]), shape)
+        self._outgoing = RowSum(network.donors, np.arange(shape[1]), 1.0, shape)
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._pulls = Law.RECIPIENT in laws
@@ -137,12 +137,8 @@ class Dynamics(FlowLaws):
         slot = {int(node): i for i, node in enumerate(self._order_donors)}
         exits = [k for k, d in enumerate(network.donors) if int(d) in slot and network.arcs[k].law is Law.DONOR]
         exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
-        self._orders_and_exits = RowSum(
-            np.concatenate([order_slot, np.array(exit_slot, dtype=np.intp)]),
-            np.concatenate([self._order_arcs, np.array(exits, dtype=np.intp)]),
-            np.ones(len(self._order_arcs) + len(exits)),
-            (2 * len(slot), len(network.arcs)),
-        )
+        rows, columns = [*order_slot, *exit_slot], [*self._order_arcs, *exits]
+        self._orders_and_exits = RowSum(rows, columns, 1.0, (2 * len(slot), len(network.arcs)))
 
     def advance(self, stock: Floats, inner: Floats, controls: Floats, step: Integers | None = None) -> Transition:
         """Hold ``controls`` for one control interval; arguments are as in ``Transition`` and ``FlowLaws.rate``.

@@ -43,7 +43,8 @@ class RowSum:
     """
 
     def __init__(self, rows: ArrayLike, columns: ArrayLike, weights: ArrayLike, shape: tuple[int, int]) -> None:
-        """Build W from its entries; entries at the same place are added."""
+        """Build W from its entries, or from places that share one weight; entries at the same place are added."""
+        weights = np.broadcast_to(np.asarray(weights, dtype=np.float64), np.shape(rows))
         matrix = sparse.csc_array((weights, (rows, columns)), shape=shape, dtype=np.float64)
         matrix.sort_indices()
         self.shape, self._starts, self._rows = shape, matrix.indptr, matrix.indices
