@@ -44,7 +44,7 @@ from cirl_marl.network.model import (
 from cirl_marl.network.rowsum import Floats
 from cirl_marl.network.units import factor
 
-HELPERS = {"light", "nutrient", "parameters"}
+HELPERS = {"microalgae", "nutrient"}
 """Modules of the package that hold no model."""
 
 DISCRETE = {"fetch", "reacher", "sorting_station"}
@@ -67,7 +67,7 @@ FORMS: list[ContinuousModel] = [
     MicroalgaeDroop(),
     Digester(),
     DigesterPublished(),
-    Atmosphere(volume_l=2.0),
+    Atmosphere(),
     TroposphereTemperature(),
 ]
 """Every form of every model that is continuous in time."""
@@ -288,26 +288,25 @@ class TestRegistry:
         ("build", "message"),
         [
             (lambda: TransportTruck(form="publised"), "Did you mean 'published'"),  # type: ignore[arg-type]
-            (lambda: TransportTruck(truck_kg=-1.0), "truck_kg = -1.0"),
-            (lambda: TransportTruck(force_weight=-1.0), "force_weight = -1.0"),
-            (lambda: TransportTruck(target_m=float("nan")), "target_m = nan"),
-            (lambda: DeliveryTruck(target_m=0.0), "target_m = 0.0"),
+            (lambda: TransportTruck(truck_kg=-1.0), "truck_kg -1.0"),
+            (lambda: TransportTruck(force_weight=-1.0), "force_weight -1.0"),
+            (lambda: TransportTruck(target_m=float("nan")), "target_m nan"),
+            (lambda: DeliveryTruck(target_m=0.0), "target_m 0.0"),
             (lambda: DeliveryTruck(target_m=1.0), "reach_m = 0.5"),
-            (lambda: DeliveryTruck(rest_m_s=-1.0), "rest_m_s = -1.0"),
-            (lambda: Incinerator(gas_residence_min=0.0), "gas_residence_min = 0.0"),
-            (lambda: Incinerator(reference_degc=-300.0), "reference_k"),
-            (lambda: Incinerator(ambient_degc=float("nan")), "ambient_k"),
-            (lambda: Incinerator(bed_share=1.5), "bed_share = 1.5"),
-            (lambda: MicroalgaeMonod(light_half_saturation=0.0), "light_half_saturation = 0.0"),
-            (lambda: MicroalgaeDroop(dilution_per_day=float("nan")), "dilution_per_day = nan"),
-            (lambda: Digester(k1=0.0), "k1 = 0.0"),
-            (lambda: Digester(released_share=1.2), "released_share = 1.2"),
+            (lambda: DeliveryTruck(rest_m_s=-1.0), "rest_m_s -1.0"),
+            (lambda: Incinerator(gas_residence_min=0.0), "gas_residence_min 0.0"),
+            (lambda: Incinerator(reference_degc=-300.0), "reference_degc"),
+            (lambda: Incinerator(ambient_degc=float("nan")), "ambient_degc"),
+            (lambda: Incinerator(bed_share=1.5), "bed_share 1.5"),
+            (lambda: MicroalgaeMonod(light_half_saturation=0.0), "light_half_saturation 0.0"),
+            (lambda: MicroalgaeDroop(dilution_per_day=float("nan")), "dilution_per_day nan"),
+            (lambda: Digester(k1=0.0), "k1 0.0"),
+            (lambda: Digester(released_share=1.2), "released_share 1.2"),
             (lambda: Digester().equilibrium(3.0), "no equilibrium"),
             (lambda: Digester().equilibrium(0.0), "no equilibrium"),
             (lambda: DigesterPublished(settling_day=0.0), "settling_day"),
-            (lambda: Atmosphere(volume_l=0.0), "volume_l"),
-            (lambda: TroposphereTemperature(albedo=1.0), "albedo = 1.0"),
-            (lambda: TroposphereTemperature(greenhouse_m3_mg=float("inf")), "greenhouse_m3_mg = inf"),
+            (lambda: TroposphereTemperature(albedo=1.1), "albedo 1.1"),
+            (lambda: TroposphereTemperature(greenhouse_m3_mg=float("inf")), "greenhouse_m3_mg inf"),
         ],
     )
     def test_bad_parameters(self, build: Callable[[], Any], message: str) -> None:

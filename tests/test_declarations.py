@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,21 +17,20 @@ from cirl_marl.definitions.guide import format_guide
 from cirl_marl.definitions.mistakes import mistakes_of
 from cirl_marl.definitions.schema import NetworkTable, table_of
 from cirl_marl.definitions.writing import _Writer, definition_of, fingerprint
-from cirl_marl.network.declared import Names, Quantity, Word, bound_problems, declarations, part, settle
+from cirl_marl.network.declared import Declared, Quantity, Word, bound_problems, declarations, frozen, settle
 from cirl_marl.network.elements import Control, Episode, Objective, Observation, Service
 
 DOCUMENT = tomllib.loads((folder("envs") / "copper_net.toml").read_text(encoding="utf-8"))
 MODES = ("slow", "fast")
 
 
-@part
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Warmed(Episode):
     """An episode that begins with a warm-up."""
 
     warm_up: Annotated[float, Quantity("time before the first decision", of="time", low=0.0)] = 0.0
     mode: Annotated[str, Word("how it warms up", of=MODES)] = "slow"
-    heated: Annotated[tuple[str, ...], Names("what is warmed up", key="what")] = ()
+    heated: Annotated[tuple[str, ...], Declared("what is warmed up", key="what")] = ()
 
     def __post_init__(self) -> None:
         """Refuse what is no number."""

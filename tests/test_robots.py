@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from cirl_marl.compartments import model_class, models
 from cirl_marl.compartments.robots import sorting_station
-from cirl_marl.compartments.robots.fetch import BIN, Fetch, WasteSorting, engine
+from cirl_marl.compartments.robots.fetch import BIN, Fetch, WasteSorting
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.compartments.robots.sorting_station import BOOKS, SortingStation
 from cirl_marl.controllers.scripted import Seen, fetch, reacher
@@ -174,7 +174,7 @@ class TestTasks:
         """The target is out of the range in which objects appear, so nothing is sorted by doing nothing."""
         state = starts(Fetch(), 40)
         assert not Fetch().success(state, np.zeros((4, 40))).any()
-        robot = engine().env
+        robot = Fetch.engine().env
         centre, reach = robot.initial_gripper_xpos[:2, None], robot.obj_range
         offset = np.abs(state[3:5] - centre)
         assert 0.8 * reach < offset.max() <= reach
@@ -364,7 +364,7 @@ class TestSortingStation:
             ({"form": "fetcher"}, "Did you mean 'fetch'"),
             ({"items_per_batch": 0}, "items_per_batch = 0"),
             ({"attempt_steps": 2.5}, r"attempt_steps = 2\.5"),
-            ({"item_kg": 0.0}, r"item_kg = 0\.0"),
+            ({"item_kg": 0.0}, r"item_kg 0\.0"),
         ],
     )
     def test_errors(self, given_: dict[str, Any], message: str) -> None:

@@ -11,8 +11,8 @@ import typer
 
 from cirl_marl.cli.common import MinService, NetworkName, Scenario, Seed, app, bar, console, errors, plain, say
 from cirl_marl.controllers import Controller
+from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Rollout, interval_ends, rollout
-from cirl_marl.controllers.watched import Watched
 from cirl_marl.definitions.catalogue import load_network, networks, recipes
 from cirl_marl.definitions.reading import Definition
 from cirl_marl.environments.vector import VectorEnv

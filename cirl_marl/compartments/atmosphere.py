@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import check_positive
+from cirl_marl.network.declared import frozen
 from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Atmosphere(ContinuousModel):
     """Stock of CO₂ that rises by what is emitted and falls by what is removed: ṁ = ṁ12 − ṁ23 (arXiv 2502.02382).
 
@@ -20,9 +19,6 @@ class Atmosphere(ContinuousModel):
     emission and removal are arcs, as in ``net_zero``, the node is the box and needs no model: the network integrates
     its stock, and given the same flows both are equal. There is one form. No reward is published; it is −|ṁ12 − ṁ23|,
     zero at net zero.
-
-    Attributes:
-        volume_l: volume of the box, L.
     """
 
     kind: ClassVar[str] = "atmosphere"
@@ -32,12 +28,6 @@ class Atmosphere(ContinuousModel):
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
-    volume_l: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        check_positive(self.kind, volume_l=self.volume_l)
-
     def derivative(self, state: Floats, inputs: Floats) -> Floats:
         """Return ṁ, mmol/d, shape (1, B)."""
         return inputs[:1] - inputs[1:2]
@@ -46,8 +36,3 @@ class Atmosphere(ContinuousModel):
         """Return −|ṁ12 − ṁ23|, mmol/d, shape (B,)."""
         imbalance: Floats = np.abs(inputs[0] - inputs[1])
         return -imbalance
-
-    def concentration_mmol_l(self, state: Floats) -> Floats:
-        """Return the concentration, mmol/L, shape (B,)."""
-        concentration: Floats = state[0] / self.volume_l
-        return concentration

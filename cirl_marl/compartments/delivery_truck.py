@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.parameters import check_positive
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.errors import CirlError
+from cirl_marl.network.declared import NotNegative, Positive, Quantity, frozen
 from cirl_marl.network.model import RewardState, Vehicle
 from cirl_marl.network.rowsum import Floats
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class DeliveryTruck(TransportTruck, Vehicle):
     """The point mass of ``TransportTruck`` with the load that the network gives it, on a road of ``target_m``.
 
@@ -24,13 +23,6 @@ class DeliveryTruck(TransportTruck, Vehicle):
     slower than ``rest_m_s``. Reward: −((destination − x)² + 0.1 v² + weight·F²), after the step.
 
     Source: the paper's truck and reward (arXiv 2505.21536); the trips are ours, the paper has one trip that never ends.
-
-    Attributes:
-        load_kg: 0 and nothing else, the network knows the load.
-        target_m: length of the road. [chosen: scaled to the robot's clock; the paper's is 1000 m]
-        force_weight: weight of F² in the reward, m²/N². [chosen: 10 kN for a second weigh as much as 10 m]
-        reach_m: distance at which the truck is there. [chosen]
-        rest_m_s: speed below which it can be loaded. [chosen]
     """
 
     kind: ClassVar[str] = "delivery_truck"
@@ -38,16 +30,19 @@ class DeliveryTruck(TransportTruck, Vehicle):
     reward_state: ClassVar[RewardState] = "after"
     context_names: ClassVar[tuple[str, ...]] = ("load_kg",)
 
-    load_kg: float = 0.0
-    target_m: float = 10.0
-    force_weight: float = 1e-8
-    reach_m: float = 0.5
-    rest_m_s: float = 1.0
+    load_kg: Annotated[float, Quantity("0 and nothing else, the network knows the load")] = 0.0
+    target_m: Annotated[
+        float, Positive("length of the road [chosen: scaled to the robot's clock; the paper's is 1000 m]")
+    ] = 10.0
+    force_weight: Annotated[
+        float, NotNegative("weight of F² in the reward, m²/N² [chosen: 10 kN for a second weigh as much as 10 m]")
+    ] = 1e-8
+    reach_m: Annotated[float, Positive("distance at which the truck is there [chosen]")] = 0.5
+    rest_m_s: Annotated[float, Positive("speed below which it can be loaded [chosen]")] = 1.0
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""
         TransportTruck.__post_init__(self)
-        check_positive(self.kind, target_m=self.target_m, reach_m=self.reach_m, rest_m_s=self.rest_m_s)
         if self.load_kg != 0.0:
             raise CirlError(
                 f"{self.kind}: load_kg = {self.load_kg!r}, but the network knows what is aboard: leave it out, and let "

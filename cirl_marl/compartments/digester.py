@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import check_not_negative, check_positive, check_share
 from cirl_marl.errors import CirlError
+from cirl_marl.network.declared import NotNegative, Positive, Quantity, Share, frozen
 from cirl_marl.network.model import ContinuousModel, Measuring, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Digester(ContinuousModel, Outflowing, Measuring):
     """AM2 with one dilution rate D, the control: the physically sound form.
 
@@ -30,29 +29,6 @@ class Digester(ContinuousModel, Outflowing, Measuring):
 
     Source: published code of arXiv 2502.02382, after Bernard et al., Biotechnol. Bioeng. 75 (2001) 424, and
     Campos-Rodríguez et al., J. Process Control 76 (2019) 141. Operation is stable for 0.05 < D < 1.2 1/d.
-
-    Attributes:
-        growth1_per_day: μ̄1. [published]
-        growth2_per_day: μ̄2. [published]
-        half_saturation1_g_l: K_S1. [published]
-        half_saturation2_mmol_l: K_S2. [published]
-        inhibition2: K_I2, √(mmol/L). [published]
-        suspended_share: α, share of the biomass that is suspended and so washed out. [published]
-        k1: g S1 per g X1. [published]
-        k2: mmol S2 per g X1. [published]
-        k3: mmol S2 per g X2. [published]
-        k4: mmol CO₂ per g X1. [published]
-        k5: mmol CO₂ per g X2. [published]
-        k6: mmol CH₄ per g X2. [published]
-        substrate_in_g_l: S1in. [published]
-        acids_in_mmol_l: S2in. [published]
-        carbon_in_mmol_l: Cin. [published: "chosen"]
-        acidity_constant_mol_l: K_a. [published]
-        ph_in: pH of the feed; Zin = K_a·S2in/(K_a + 10^−pH) = 212.188. [published]
-        henry_mmol_l_atm: K_H. [published]
-        pressure_atm: P_T. [published]
-        transfer_per_day: kLa. [published]
-        released_share: f_r, share of the CO₂ that reaches the atmosphere. [published: "added by this paper"]
     """
 
     kind: ClassVar[str] = "digester"
@@ -71,35 +47,31 @@ class Digester(ContinuousModel, Outflowing, Measuring):
     bounds: ClassVar[Mapping[str, tuple[float, float]]] = dict.fromkeys((*state_names, *input_names), (0.0, math.inf))
     reward_state: ClassVar[RewardState] = "before"
 
-    growth1_per_day: float = 1.2
-    growth2_per_day: float = 0.744
-    half_saturation1_g_l: float = 7.1
-    half_saturation2_mmol_l: float = 9.28
-    inhibition2: float = 16.0
-    suspended_share: float = 0.5
-    k1: float = 42.14
-    k2: float = 116.5
-    k3: float = 268.0
-    k4: float = 50.6
-    k5: float = 343.6
-    k6: float = 453.0
-    substrate_in_g_l: float = 30.0
-    acids_in_mmol_l: float = 750.0
-    carbon_in_mmol_l: float = 40.0
-    acidity_constant_mol_l: float = 1.5e-5
-    ph_in: float = 4.42
-    henry_mmol_l_atm: float = 16.0
-    pressure_atm: float = 1.0
-    transfer_per_day: float = 19.8
-    released_share: float = 0.15
-
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        values = {name: getattr(self, name) for name in (f.name for f in fields(self))}
-        feed = ("substrate_in_g_l", "acids_in_mmol_l", "carbon_in_mmol_l", "released_share")
-        check_not_negative(self.kind, **{name: values.pop(name) for name in feed})
-        check_positive(self.kind, **values)
-        check_share(self.kind, suspended_share=self.suspended_share, released_share=self.released_share)
+    growth1_per_day: Annotated[float, Positive("μ̄1 [published]")] = 1.2
+    growth2_per_day: Annotated[float, Positive("μ̄2 [published]")] = 0.744
+    half_saturation1_g_l: Annotated[float, Positive("K_S1 [published]")] = 7.1
+    half_saturation2_mmol_l: Annotated[float, Positive("K_S2 [published]")] = 9.28
+    inhibition2: Annotated[float, Positive("K_I2, √(mmol/L) [published]")] = 16.0
+    suspended_share: Annotated[
+        float, Quantity("α, suspended share of the biomass, which is washed out [published]", positive=True, high=1.0)
+    ] = 0.5
+    k1: Annotated[float, Positive("g S1 per g X1 [published]")] = 42.14
+    k2: Annotated[float, Positive("mmol S2 per g X1 [published]")] = 116.5
+    k3: Annotated[float, Positive("mmol S2 per g X2 [published]")] = 268.0
+    k4: Annotated[float, Positive("mmol CO₂ per g X1 [published]")] = 50.6
+    k5: Annotated[float, Positive("mmol CO₂ per g X2 [published]")] = 343.6
+    k6: Annotated[float, Positive("mmol CH₄ per g X2 [published]")] = 453.0
+    substrate_in_g_l: Annotated[float, NotNegative("S1in [published]")] = 30.0
+    acids_in_mmol_l: Annotated[float, NotNegative("S2in [published]")] = 750.0
+    carbon_in_mmol_l: Annotated[float, NotNegative('Cin [published: "chosen"]')] = 40.0
+    acidity_constant_mol_l: Annotated[float, Positive("K_a [published]")] = 1.5e-5
+    ph_in: Annotated[float, Positive("pH of the feed; Zin = K_a·S2in/(K_a + 10^−pH) = 212.188 [published]")] = 4.42
+    henry_mmol_l_atm: Annotated[float, Positive("K_H [published]")] = 16.0
+    pressure_atm: Annotated[float, Positive("P_T [published]")] = 1.0
+    transfer_per_day: Annotated[float, Positive("kLa [published]")] = 19.8
+    released_share: Annotated[
+        float, Share('f_r, share of the CO₂ that reaches the atmosphere [published: "added by this paper"]')
+    ] = 0.15
 
     @property
     def feed(self) -> Floats:
@@ -134,12 +106,7 @@ class Digester(ContinuousModel, Outflowing, Measuring):
         return rate
 
     def partial_pressure(self, state: Floats, dissolved_mmol_l: Floats | None = None) -> Floats:
-        """Return P_C, atm, shape (B,).
-
-        Args:
-            state: shape (6, B).
-            dissolved_mmol_l: w under the root, shape (B,); None takes C + S2 − Z.
-        """
+        """Return P_C, atm, shape (B,); w under the root is C + S2 − Z unless another is given, shape (B,)."""
         free = state[5] + state[3] - state[4]
         saturated = self.henry_mmol_l_atm * self.pressure_atm
         phi = free + saturated + self.k6 / self.transfer_per_day * self.growth(state)[1]
@@ -177,13 +144,14 @@ class Digester(ContinuousModel, Outflowing, Measuring):
         Raises:
             CirlError: if there is none; at that dilution a population is washed out.
         """
+        washed_out = CirlError(
+            f"digester: no equilibrium with living biomass at a dilution of {dilution_per_day!r}/day."
+        )
         needed = self.suspended_share * dilution_per_day
         half = self.inhibition2**2 * (self.growth2_per_day - needed) / (2.0 * needed) if needed > 0.0 else 0.0
         square = half**2 - self.half_saturation2_mmol_l * self.inhibition2**2
         if not (0.0 < needed < self.growth1_per_day and half > 0.0 and square >= 0.0):
-            raise CirlError(
-                f"digester: no equilibrium with living biomass at a dilution of {dilution_per_day!r} 1/day."
-            )
+            raise washed_out
         s1 = needed * self.half_saturation1_g_l / (self.growth1_per_day - needed)
         # the smaller root of S2² − 2·half·S2 + K_S2·K_I2² = 0, without cancellation
         s2 = self.half_saturation2_mmol_l * self.inhibition2**2 / (half + square**0.5)
@@ -191,9 +159,7 @@ class Digester(ContinuousModel, Outflowing, Measuring):
         acids = self.k2 * needed * x1 + dilution_per_day * (self.acids_in_mmol_l - s2)
         x2 = acids / (self.k3 * needed)
         if x1 <= 0.0 or x2 <= 0.0:
-            raise CirlError(
-                f"digester: no equilibrium with living biomass at a dilution of {dilution_per_day!r} 1/day."
-            )
+            raise washed_out
         alkalinity = float(self.feed[4])
         carbon = self._equilibrium_carbon(dilution_per_day, needed * x1, needed * x2, alkalinity - s2)
         return np.array([x1, s1, x2, s2, alkalinity, carbon])

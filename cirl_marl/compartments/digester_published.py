@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import field
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.compartments.parameters import check_positive
+from cirl_marl.network.declared import Declared, Positive, frozen
 from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class DigesterPublished(ContinuousModel, Outflowing):
     """AM2 after arXiv 2502.02382: ż = f(z) + G(z)·(D̄ + φ) with one dilution D̄ + φ_i for each state.
 
@@ -24,12 +24,6 @@ class DigesterPublished(ContinuousModel, Outflowing):
     gives ṁ12 = 175.08 instead of 66.96 mmol/(L d), and with it the ratio of digester to algae emission: published
     175.08/0.28 = 625 (exactly 175.08/0.2702 = 648); corrected 66.96/0.2702 = 248; and 66.96/0.0135 = 4960 when the
     uptake per litre is ρX, not ρ.
-
-    Attributes:
-        process: the parameters, and what both forms share.
-        dilution_per_day: D̄ at the equilibrium z̄. [published]
-        settling_day: T_max of the controller, d. [published]
-        misprint: whether P_C has the published product. [published: True]
     """
 
     kind: ClassVar[str] = "digester_published"
@@ -39,14 +33,12 @@ class DigesterPublished(ContinuousModel, Outflowing):
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
-    process: Digester = field(default_factory=Digester)
-    dilution_per_day: float = 0.5
-    settling_day: float = 3.5
-    misprint: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        check_positive(self.kind, dilution_per_day=self.dilution_per_day, settling_day=self.settling_day)
+    process: Annotated[Digester, Declared("the parameters, and what both forms share")] = field(
+        default_factory=Digester
+    )
+    dilution_per_day: Annotated[float, Positive("D̄ at the equilibrium z̄ [published]")] = 0.5
+    settling_day: Annotated[float, Positive("T_max of the controller, d [published]")] = 3.5
+    misprint: Annotated[bool, Declared("whether P_C has the published product [published: True]")] = True
 
     @property
     def equilibrium(self) -> Floats:
@@ -72,8 +64,7 @@ class DigesterPublished(ContinuousModel, Outflowing):
 
     def derivative(self, state: Floats, inputs: Floats) -> Floats:
         """Return dz/dt per day, shape (6, B); ``inputs`` are the six dilutions, shape (6, B)."""
-        rate: Floats = self.reaction(state) + inputs * self.process.flushing(state)
-        return rate
+        return self.reaction(state) + inputs * self.process.flushing(state)
 
     def outflow(self, state: Floats, inputs: Floats) -> Floats:
         """Return ṁ12 = f_r·qC, CO₂ emitted per litre, mmol/(L d), shape (B,)."""
@@ -87,10 +78,6 @@ class DigesterPublished(ContinuousModel, Outflowing):
         """Return the published six dilutions D̄ + φ that bring ``start`` to z̄ at ``settling_day``, shape (6, B).
 
         q = T/(1 + T), p = ½|x̃0|^(2/(1 + T))/q². They are not finite where a flushing rate is zero (z = feed).
-
-        Args:
-            state: z, shape (6, B).
-            start: z at time 0, shape (6, B).
         """
         middle = self.equilibrium[:, None]
         q = self.settling_day / (1.0 + self.settling_day)

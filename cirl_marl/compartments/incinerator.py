@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import ClassVar, Literal, NamedTuple
+from functools import partial
+from typing import Annotated, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive, check_share
+from cirl_marl.network.declared import NotNegative, Positive, Quantity, Share, Word, frozen
 from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -17,37 +17,29 @@ from cirl_marl.network.rowsum import Floats
 # released 20 °C a step costs 9.6·10⁵, while the paper's whole episodes cost 3.2·10⁵ to 3.8·10⁵.
 
 KELVIN = 273.15
+Temperature = partial(Quantity, low=1.0 - KELVIN)
+_Form = Literal["published", "energy_balance", "sound"]
 
 
 class Flows(NamedTuple):
     """Flows and conversions, kg/min, each of shape (B,) or a number."""
 
-    feed: Floats | float
-    ash: Floats | float
-    consumed: Floats | float
-    char_made: Floats | float
-    char_burnt: Floats | float
-    char_out: Floats | float
-    gas_made: Floats | float
-    to_freeboard: Floats | float
-    flue: Floats | float
+    feed: Floats | float = 100.0
+    ash: Floats | float = 10.0
+    consumed: Floats | float = 70.0
+    char_made: Floats | float = 6.0
+    char_burnt: Floats | float = 3.0
+    char_out: Floats | float = 2.0
+    gas_made: Floats | float = 1.0
+    to_freeboard: Floats | float = 2.0
+    flue: Floats | float = 2.0
 
 
-PUBLISHED_FLOWS = Flows(
-    feed=100.0,
-    ash=10.0,
-    consumed=70.0,
-    char_made=6.0,
-    char_burnt=3.0,
-    char_out=2.0,
-    gas_made=1.0,
-    to_freeboard=2.0,
-    flue=2.0,
-)
+PUBLISHED_FLOWS = Flows()
 """F_in, F_out, R_w, P, R_c, F_c, R_g, F_w, F_g. [published] They leave 3 kg/min of gas in the freeboard for ever."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Incinerator(ContinuousModel, Outflowing):
     """Masses and temperatures of wastebed (waste M, char M_c, gas M_w, T_w) and freeboard (gas M_f, T_g).
 
@@ -72,72 +64,47 @@ class Incinerator(ContinuousModel, Outflowing):
     Source: published code of arXiv 2505.21536, "not taken from a real incinerator", after Magnanelli et al., Energy 209
     (2020) 118426; its only units are min and °C, kg and kJ are inferred. The reference trajectory is reproduced to the
     last digit from its second row on. Numbers of ``sound`` alone are chosen, at the scale of a 6 t/h plant.
-
-    Attributes:
-        form: ``published``, ``energy_balance`` or ``sound``.
-        feed_kg_min: F_in unless ``derivative`` is given another. [published]
-        air_bed_kg_min: F_aI. [published]
-        air_freeboard_kg_min: F_aII. [published]
-        ambient_degc: T_a of air and feed. [published; of the feed inferred]
-        waste_heat_kj_kg_k: c_w. [published]
-        char_heat_kj_kg_k: c_c. [published]
-        gas_heat_kj_kg_k: c_g. [published]
-        grate_kg: mass of the grate. [published]
-        grate_heat_kj_kg_k: c of the grate, 25; ``published`` uses the freeboard's. [published]
-        freeboard_kg: mass of the freeboard's walls. [published]
-        freeboard_heat_kj_kg_k: c of the walls. [published]
-        bed_heat_kj_min: Q, constant rates only. [published]
-        freeboard_heat_kj_min: Q_g, constant rates only. [published]
-        target_degc: set-point of T_g. [published]
-        waste_reference_kg: M at which F_out = 10 and R_w = 70. [chosen: half an hour's throughput]
-        char_reference_kg: M_c at which F_c = 2 and R_c = 3. [chosen: half an hour]
-        reference_degc: T_ref, where θ = 1. [chosen]
-        activation_k: T_A. [chosen]
-        gas_residence_min: of wastebed and freeboard gas. [chosen]
-        combustion_kj_kg: h, heat per kg turned to gas. [chosen: lower heating value of municipal waste]
-        bed_share: share of the heat released in the bed. [chosen]
-        exchange_kj_min_k: U between freeboard and bed. [chosen]
-        recovery_kj_min_k: U_rec of the heat recovery. [chosen]
     """
 
     kind: ClassVar[str] = "incinerator"
-    state_names: ClassVar[tuple[str, ...]] = (
-        "waste_kg",
-        "char_kg",
-        "wastebed_degc",
-        "wastebed_gas_kg",
-        "freeboard_gas_kg",
-        "freeboard_degc",
+    state_names: ClassVar[tuple[str, ...]] = tuple(
+        "waste_kg char_kg wastebed_degc wastebed_gas_kg freeboard_gas_kg freeboard_degc".split()
     )
     input_names: ClassVar[tuple[str, ...]] = ("heat_taken_kj_min",)
     input_unit: ClassVar[str] = "kJ/min"
     time_unit: ClassVar[str] = "min"
     reward_state: ClassVar[RewardState] = "after"
 
-    form: Literal["published", "energy_balance", "sound"] = "sound"
-    feed_kg_min: float = 100.0
-    air_bed_kg_min: float = 5.0
-    air_freeboard_kg_min: float = 3.0
-    ambient_degc: float = 20.0
-    waste_heat_kj_kg_k: float = 1.0
-    char_heat_kj_kg_k: float = 1.0
-    gas_heat_kj_kg_k: float = 5.0
-    grate_kg: float = 500.0
-    grate_heat_kj_kg_k: float = 25.0
-    freeboard_kg: float = 120.0
-    freeboard_heat_kj_kg_k: float = 5.0
-    bed_heat_kj_min: float = 100.0
-    freeboard_heat_kj_min: float = 450.0
-    target_degc: float = 1000.0
-    waste_reference_kg: float = 2400.0
-    char_reference_kg: float = 150.0
-    reference_degc: float = 300.0
-    activation_k: float = 5000.0
-    gas_residence_min: float = 0.5
-    combustion_kj_kg: float = 10_000.0
-    bed_share: float = 0.05
-    exchange_kj_min_k: float = 20.0
-    recovery_kj_min_k: float = 1000.0
+    form: Annotated[_Form, Word("which equations", of=get_args(_Form))] = "sound"
+    feed_kg_min: Annotated[float, NotNegative("F_in unless ``derivative`` is given another [published]")] = 100.0
+    air_bed_kg_min: Annotated[float, NotNegative("F_aI [published]")] = 5.0
+    air_freeboard_kg_min: Annotated[float, NotNegative("F_aII [published]")] = 3.0
+    ambient_degc: Annotated[float, Temperature("T_a of air and feed [published; of the feed inferred]")] = 20.0
+    waste_heat_kj_kg_k: Annotated[float, NotNegative("c_w [published]")] = 1.0
+    char_heat_kj_kg_k: Annotated[float, NotNegative("c_c [published]")] = 1.0
+    gas_heat_kj_kg_k: Annotated[float, NotNegative("c_g [published]")] = 5.0
+    grate_kg: Annotated[float, Positive("mass of the grate [published]")] = 500.0
+    grate_heat_kj_kg_k: Annotated[
+        float, Positive("c of the grate, 25; ``published`` uses the freeboard's [published]")
+    ] = 25.0
+    freeboard_kg: Annotated[float, Positive("mass of the freeboard's walls [published]")] = 120.0
+    freeboard_heat_kj_kg_k: Annotated[float, Positive("c of the walls [published]")] = 5.0
+    bed_heat_kj_min: Annotated[float, NotNegative("Q, constant rates only [published]")] = 100.0
+    freeboard_heat_kj_min: Annotated[float, NotNegative("Q_g, constant rates only [published]")] = 450.0
+    target_degc: Annotated[float, Temperature("set-point of T_g [published]")] = 1000.0
+    waste_reference_kg: Annotated[
+        float, Positive("M at which F_out = 10 and R_w = 70 [chosen: half an hour's throughput]")
+    ] = 2400.0
+    char_reference_kg: Annotated[float, Positive("M_c at which F_c = 2 and R_c = 3 [chosen: half an hour]")] = 150.0
+    reference_degc: Annotated[float, Temperature("T_ref, where θ = 1 [chosen]")] = 300.0
+    activation_k: Annotated[float, NotNegative("T_A [chosen]")] = 5000.0
+    gas_residence_min: Annotated[float, Positive("of wastebed and freeboard gas [chosen]")] = 0.5
+    combustion_kj_kg: Annotated[
+        float, NotNegative("h, heat per kg turned to gas [chosen: lower heating value of municipal waste]")
+    ] = 10_000.0
+    bed_share: Annotated[float, Share("share of the heat released in the bed [chosen]")] = 0.05
+    exchange_kj_min_k: Annotated[float, NotNegative("U between freeboard and bed [chosen]")] = 20.0
+    recovery_kj_min_k: Annotated[float, NotNegative("U_rec of the heat recovery [chosen]")] = 1000.0
 
     @property
     def bounds(self) -> Mapping[str, tuple[float, float]]:
@@ -145,17 +112,6 @@ class Incinerator(ContinuousModel, Outflowing):
         if self.form != "sound":
             return {}
         return {name: (0.0 if name.endswith("_kg") else -KELVIN + 1.0, math.inf) for name in self.state_names}
-
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        check_form(self.form, ("published", "energy_balance", "sound"))
-        values = {name: getattr(self, name) for name in (f.name for f in fields(self)) if name != "form"}
-        free = ("ambient_degc", "reference_degc", "target_degc")
-        needed = ("grate", "freeboard_kg", "freeboard_heat_kj_kg_k", "reference_kg", "residence")
-        positive = {name: values[name] for name in values if any(part in name for part in needed)}
-        check_positive(self.kind, **positive, **{n.replace("degc", "k"): values[n] + KELVIN for n in free})
-        check_not_negative(self.kind, **{name: values[name] for name in values if name not in free})
-        check_share(self.kind, bed_share=self.bed_share)
 
     def flows(self, state: Floats, feed_kg_min: Floats | float | None = None) -> Flows:
         """Return every flow and conversion, kg/min."""
@@ -182,13 +138,7 @@ class Incinerator(ContinuousModel, Outflowing):
         )
 
     def derivative(self, state: Floats, inputs: Floats, *, feed_kg_min: Floats | float | None = None) -> Floats:
-        """Return dz/dt per minute, shape (6, B).
-
-        Args:
-            state: (M, M_c, T_w, M_w, M_f, T_g), shape (6, B).
-            inputs: (Q_ext,), shape (1, B).
-            feed_kg_min: waste that arrives, shape (B,) or a number; None takes the parameter.
-        """
+        """Return d(M, M_c, T_w, M_w, M_f, T_g)/dt per minute, shape (6, B); another feed is a number or shape (B,)."""
         flows = self.flows(state, feed_kg_min)
         bed_power, freeboard_power = self.powers(state, inputs, flows)
         bed_capacity, freeboard_capacity = self.capacities(state)

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import partial
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.light import light_response
-from cirl_marl.compartments.nutrient import draw_down, substeps
-from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive
-from cirl_marl.network.model import ContinuousModel, OwnStepModel, RewardState
+from cirl_marl.compartments.microalgae import Microalgae
+from cirl_marl.network.declared import NotNegative, Positive, frozen
+from cirl_marl.network.model import Form, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred (mean return 454; the paper's end
 # at 446 to 473). The light changes the return by no more than 0.1 %.
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MicroalgaeDroop(ContinuousModel, OwnStepModel):
+@frozen
+class MicroalgaeDroop(Microalgae):
     """Chemostat with biomass X, cell quota Q and dissolved nutrient S; the control is the light I.
 
     μ = μ̃·f(I)·(1 − k_q/Q), ρ = ρ_max·S/(S + K_S), Ẋ = (μ − D)X, Q̇ = ρ − μQ, Ṡ = D(S_in − S) − ρX; both forms.
@@ -31,37 +28,24 @@ class MicroalgaeDroop(ContinuousModel, OwnStepModel):
 
     Source: published code of arXiv 2505.21536 (equations, parameters, bounds, start, reward); the reference trajectory
     is reproduced to the last digit from its second row on. Its first step is rounded to float32.
-
-    Attributes:
-        form: ``published`` or ``sound``.
-        growth_per_day: μ̃, growth at full light and unlimited quota. [published]
-        minimal_quota_umol_um3: k_q. [published]
-        light_half_saturation: K_sI of the sound form, µmol/(m² s); the published is 0. [chosen]
-        light_inhibition: K_iI, µmol/(m² s). [published]
-        uptake_umol_um3_day: ρ_max. [published]
-        nutrient_half_saturation_umol_l: K_S. [published]
-        dilution_per_day: D = 1/T_h. [published]
-        nutrient_in_umol_l: S_in. [published]
-        co2_per_nutrient: K_CO2. [published: "freely chosen"]
     """
 
     kind: ClassVar[str] = "microalgae_droop"
     state_names: ClassVar[tuple[str, ...]] = ("biomass_um3_l", "quota_umol_um3", "nutrient_umol_l")
-    input_names: ClassVar[tuple[str, ...]] = ("light_umol_m2_s",)
-    input_unit: ClassVar[str] = "umol/m**2/s"
-    time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
-    form: Literal["published", "sound"] = "sound"
-    growth_per_day: float = 1.7
-    minimal_quota_umol_um3: float = 1.7
-    light_half_saturation: float = 20.0
-    light_inhibition: float = 295.0
-    uptake_umol_um3_day: float = 9.4
-    nutrient_half_saturation_umol_l: float = 0.1
-    dilution_per_day: float = 0.45
-    nutrient_in_umol_l: float = 100.0
-    co2_per_nutrient: float = 0.3
+    form: Form = "sound"
+    growth_per_day: Annotated[float, Positive("μ̃, growth at full light and unlimited quota [published]")] = 1.7
+    minimal_quota_umol_um3: Annotated[float, Positive("k_q [published]")] = 1.7
+    light_half_saturation: Annotated[
+        float, Positive("K_sI of the sound form, µmol/(m² s); the published is 0 [chosen]")
+    ] = 20.0
+    light_inhibition: Annotated[float, Positive("K_iI, µmol/(m² s) [published]")] = 295.0
+    uptake_umol_um3_day: Annotated[float, Positive("ρ_max [published]")] = 9.4
+    nutrient_half_saturation_umol_l: Annotated[float, Positive("K_S [published]")] = 0.1
+    dilution_per_day: Annotated[float, NotNegative("D = 1/T_h [published]")] = 0.45
+    nutrient_in_umol_l: Annotated[float, NotNegative("S_in [published]")] = 100.0
+    co2_per_nutrient: Annotated[float, NotNegative('K_CO2 [published: "freely chosen"]')] = 0.3
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
@@ -72,31 +56,7 @@ class MicroalgaeDroop(ContinuousModel, OwnStepModel):
             "quota_umol_um3": (self.minimal_quota_umol_um3, math.inf)
         }
 
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        check_form(self.form, ("published", "sound"))
-        check_positive(
-            self.kind,
-            growth_per_day=self.growth_per_day,
-            minimal_quota_umol_um3=self.minimal_quota_umol_um3,
-            light_half_saturation=self.light_half_saturation,
-            light_inhibition=self.light_inhibition,
-            uptake_umol_um3_day=self.uptake_umol_um3_day,
-            nutrient_half_saturation_umol_l=self.nutrient_half_saturation_umol_l,
-        )
-        check_not_negative(
-            self.kind,
-            dilution_per_day=self.dilution_per_day,
-            nutrient_in_umol_l=self.nutrient_in_umol_l,
-            co2_per_nutrient=self.co2_per_nutrient,
-        )
-
-    def light(self, inputs: Floats) -> Floats:
-        """Return f(I), shape (B,)."""
-        half_saturation = 0.0 if self.form == "published" else self.light_half_saturation
-        return light_response(inputs[0], half_saturation=half_saturation, inhibition=self.light_inhibition)
-
-    def uptake(self, state: Floats) -> Floats:
+    def uptake(self, state: Floats, inputs: Floats) -> Floats:
         """Return ρ, nutrient taken up per biovolume and day, shape (B,)."""
         rho: Floats = self.uptake_umol_um3_day * (state[2] / (state[2] + self.nutrient_half_saturation_umol_l))
         return rho
@@ -105,21 +65,10 @@ class MicroalgaeDroop(ContinuousModel, OwnStepModel):
         """Return (Ẋ, Q̇, Ṡ) per day, shape (3, B)."""
         biomass, quota, nutrient = state
         growth = self.growth_per_day * self.light(inputs) * (1.0 - self.minimal_quota_umol_um3 / quota)
-        rho = self.uptake(state)
+        rho = self.uptake(state, inputs)
         supply = self.dilution_per_day * (self.nutrient_in_umol_l - nutrient)
-        return np.stack(
-            [growth * biomass - self.dilution_per_day * biomass, rho - growth * quota, supply - rho * biomass]
-        )
-
-    def reward(self, state: Floats, inputs: Floats) -> Floats:
-        """Return K_CO2·ρ (published) or K_CO2·ρ·X in µmol/(L d) (sound), shape (B,)."""
-        per_biovolume = self.co2_per_nutrient * self.uptake(state)
-        return per_biovolume if self.form == "published" else per_biovolume * state[0]
-
-    def outflow(self, state: Floats, inputs: Floats) -> Floats:
-        """Return the CO₂ that the culture takes *in* per litre, ṁ23 in mmol/(L d), shape (B,); see Monod."""
-        taken = self.reward(state, inputs)
-        return taken if self.form == "published" else taken / 1000.0
+        grown = growth * biomass - self.dilution_per_day * biomass
+        return np.stack([grown, rho - growth * quota, supply - rho * biomass])
 
     def integrate(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
         """Return the state after an interval of constant light, (3, B), and the mean ``outflow`` over it, (B,).
@@ -136,26 +85,12 @@ class MicroalgaeDroop(ContinuousModel, OwnStepModel):
             S ← S_in + (S − S_in)E − U,   Q ← Q + U/(X E).
 
         Hence N = S + XQ is S_in + (N₀ − S_in)e^(−D·interval) to round-off, and Q stays above k_q. The mean is that of
-        ρX (sound) or ρ (published) along the exact S.
-
-        Args:
-            state: X ≥ 0, Q > k_q, S ≥ 0, shape (3, B).
-            inputs: I ≥ 0, shape (1, B).
-            interval: days, > 0.
+        ρX (sound) or ρ (published) along the exact S. All this holds for X ≥ 0, Q > k_q, S ≥ 0, I ≥ 0.
         """
         biomass, quota, nutrient = state
-        steps = substeps(interval, self.growth_per_day + self.dilution_per_day)
-        half = interval / steps / 2.0
-        kept = math.exp(-self.dilution_per_day * half)
+        steps, half, kept, draw = self._halves(interval)
         ungrown = np.exp(-2.0 * half * self.growth_per_day * self.light(inputs))
         least, most = self.minimal_quota_umol_um3, self.uptake_umol_um3_day
-        draw = partial(
-            draw_down,
-            span=half,
-            dilution=self.dilution_per_day,
-            feed=self.nutrient_in_umol_l,
-            half_saturation=self.nutrient_half_saturation_umol_l,
-        )
         uptake = np.zeros_like(biomass)
         for _ in range(steps):
             early_demand = most * biomass
@@ -168,8 +103,5 @@ class MicroalgaeDroop(ContinuousModel, OwnStepModel):
             late_demand = most * biomass
             late = draw(early.nutrient, late_demand)
             quota, nutrient = quota + most * late.retained, late.nutrient
-            if self.form == "published":
-                uptake += most * (early.saturation + late.saturation)
-            else:
-                uptake += (early_demand * early.saturation + late_demand * late.saturation) / 1000.0
+            uptake += self._taken(most, (early_demand, early), (late_demand, late))
         return np.stack([biomass, quota, nutrient]), self.co2_per_nutrient / interval * uptake

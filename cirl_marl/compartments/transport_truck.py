@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import check_form, check_not_negative, check_positive
-from cirl_marl.network.model import ContinuousModel, RewardState
+from cirl_marl.network.declared import NotNegative, Positive, frozen
+from cirl_marl.network.model import ContinuousModel, Form, RewardState
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ s, an episode 0.01 s. x(0) ~ U[0, 500] m is inferred: from 0 the
 # published returns of −1.2·10⁸ are out of reach (the best is −1.99992·10⁸).
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class TransportTruck(ContinuousModel):
     """Point mass on a straight road, driven by a force F.
 
@@ -27,19 +26,6 @@ class TransportTruck(ContinuousModel):
     Source: published code of arXiv 2505.21536 (equation, masses, reward, bounds ±10⁶ N, start (0, 4)); confirmed by
     the reference trajectory, whose 200 later steps are reproduced to the last bit. The resistances are chosen, typical
     of a light lorry. ±10⁶ N is 312 m/s²; the default scenario should stay at what tyres transmit, about ±12 kN (0.4 g).
-
-    Attributes:
-        form: ``published`` or ``sound``.
-        truck_kg: mass of the empty truck. [published]
-        load_kg: mass carried unless ``derivative`` is given another. [published: m_u]
-        target_m: position x* of the incinerator. [published]
-        speed_weight: weight of v² in the reward, s². [published]
-        force_weight: weight of F² in the reward, m²/N². [published]
-        rolling_resistance: c_rr. [chosen, lorry tyres 0.006 to 0.015]
-        drag_area_m2: c_d·A. [chosen: 0.6 × 5 m²]
-        air_density_kg_m3: ρ. [air at 20 °C]
-        gravity_m_s2: g. [standard]
-        standstill_m_s: v_s of the smoothed sign. [chosen]
     """
 
     kind: ClassVar[str] = "transport_truck"
@@ -49,42 +35,22 @@ class TransportTruck(ContinuousModel):
     time_unit: ClassVar[str] = "s"
     reward_state: ClassVar[RewardState] = "after"
 
-    form: Literal["published", "sound"] = "sound"
-    truck_kg: float = 3000.0
-    load_kg: float = 210.0
-    target_m: float = 1000.0
-    speed_weight: float = 0.1
-    force_weight: float = 0.001
-    rolling_resistance: float = 0.01
-    drag_area_m2: float = 3.0
-    air_density_kg_m3: float = 1.2
-    gravity_m_s2: float = 9.80665
-    standstill_m_s: float = 0.05
-
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        check_form(self.form, ("published", "sound"))
-        check_positive(self.kind, truck_kg=self.truck_kg, standstill_m_s=self.standstill_m_s)
-        check_not_negative(
-            self.kind,
-            load_kg=self.load_kg,
-            target_m=self.target_m,
-            speed_weight=self.speed_weight,
-            force_weight=self.force_weight,
-            rolling_resistance=self.rolling_resistance,
-            drag_area_m2=self.drag_area_m2,
-            air_density_kg_m3=self.air_density_kg_m3,
-            gravity_m_s2=self.gravity_m_s2,
-        )
+    form: Form = "sound"
+    truck_kg: Annotated[float, Positive("mass of the empty truck [published]")] = 3000.0
+    load_kg: Annotated[float, NotNegative("mass carried unless ``derivative`` is given another [published: m_u]")] = (
+        210.0
+    )
+    target_m: Annotated[float, NotNegative("position x* of the incinerator [published]")] = 1000.0
+    speed_weight: Annotated[float, NotNegative("weight of v² in the reward, s² [published]")] = 0.1
+    force_weight: Annotated[float, NotNegative("weight of F² in the reward, m²/N² [published]")] = 0.001
+    rolling_resistance: Annotated[float, NotNegative("c_rr [chosen, lorry tyres 0.006 to 0.015]")] = 0.01
+    drag_area_m2: Annotated[float, NotNegative("c_d·A [chosen: 0.6 × 5 m²]")] = 3.0
+    air_density_kg_m3: Annotated[float, NotNegative("ρ [air at 20 °C]")] = 1.2
+    gravity_m_s2: Annotated[float, NotNegative("g [standard]")] = 9.80665
+    standstill_m_s: Annotated[float, Positive("v_s of the smoothed sign [chosen]")] = 0.05
 
     def derivative(self, state: Floats, inputs: Floats, *, load_kg: Floats | float | None = None) -> Floats:
-        """Return (ẋ, v̇) in m/s and m/s², shape (2, B).
-
-        Args:
-            state: (x, v), shape (2, B).
-            inputs: (F,), shape (1, B).
-            load_kg: mass carried, shape (B,) or a number; None takes the parameter.
-        """
+        """Return (ẋ, v̇) in m/s and m/s², shape (2, B); another load than the parameter is a number or shape (B,)."""
         mass_kg = self.truck_kg + (self.load_kg if load_kg is None else load_kg)
         force_n = inputs[0]
         if self.form == "sound":
@@ -95,8 +61,7 @@ class TransportTruck(ContinuousModel):
         """Return rolling resistance plus drag, in N, shape (B,); it always opposes the motion."""
         rolling = self.rolling_resistance * mass_kg * self.gravity_m_s2 * np.tanh(speed_m_s / self.standstill_m_s)
         drag = 0.5 * self.air_density_kg_m3 * self.drag_area_m2 * speed_m_s * np.abs(speed_m_s)
-        total: Floats = rolling + drag
-        return total
+        return rolling + drag
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −((x* − x)² + 0.1 v² + 0.001 F²), shape (B,)."""

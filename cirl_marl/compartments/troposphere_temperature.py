@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.compartments.parameters import check_not_negative, check_positive
-from cirl_marl.errors import CirlError
+from cirl_marl.network.declared import NotNegative, Positive, Share, frozen
 from cirl_marl.network.model import ContinuousModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 SECONDS_PER_DAY = 86400.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class TroposphereTemperature(ContinuousModel):
     """Radiation balance C·Ṫ = S(1 − α) − ε·σ·T⁴ with the emissivity ε = ε_n − η·x₁/V₁ of air that holds x₁ of CO₂.
 
@@ -25,16 +23,6 @@ class TroposphereTemperature(ContinuousModel):
     No reward is published; it is −(T − T*)².
 
     Source: published code of arXiv 2508.16774; the model is Elsherif and Taha's, arXiv 2504.21153. T(0) = 288.33 K.
-
-    Attributes:
-        heat_capacity_j_m2_k: C. [published]
-        solar_w_m2: S, mean over the sphere, 1361/4 W/m². [published]
-        albedo: α. [published]
-        emissivity: ε_n. [published]
-        greenhouse_m3_mg: η. [published; unit inferred]
-        volume_km3: V₁; x₁/V₁ in t/km³ is mg/m³. [published; unit inferred]
-        stefan_boltzmann_w_m2_k4: σ. [published]
-        set_point_k: T*, pre-industrial. [published as T_e]
     """
 
     kind: ClassVar[str] = "troposphere_temperature"
@@ -44,48 +32,25 @@ class TroposphereTemperature(ContinuousModel):
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "after"
 
-    heat_capacity_j_m2_k: float = 8e8
-    solar_w_m2: float = 1361.0 / 4.0
-    albedo: float = 0.3
-    emissivity: float = 0.75
-    greenhouse_m3_mg: float = 2.36e-4
-    volume_km3: float = 1.18
-    stefan_boltzmann_w_m2_k4: float = 5.67e-8
-    set_point_k: float = 287.05
-
-    def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
-        check_positive(
-            self.kind,
-            heat_capacity_j_m2_k=self.heat_capacity_j_m2_k,
-            solar_w_m2=self.solar_w_m2,
-            emissivity=self.emissivity,
-            volume_km3=self.volume_km3,
-            stefan_boltzmann_w_m2_k4=self.stefan_boltzmann_w_m2_k4,
-            set_point_k=self.set_point_k,
-        )
-        check_not_negative(self.kind, greenhouse_m3_mg=self.greenhouse_m3_mg)
-        if not 0.0 <= self.albedo < 1.0:
-            raise CirlError(f"{self.kind}: albedo = {self.albedo!r}, but it must lie in [0, 1).")
+    heat_capacity_j_m2_k: Annotated[float, Positive("C [published]")] = 8e8
+    solar_w_m2: Annotated[float, Positive("S, mean over the sphere, 1361/4 W/m² [published]")] = 1361.0 / 4.0
+    albedo: Annotated[float, Share("α [published]")] = 0.3
+    emissivity: Annotated[float, Positive("ε_n [published]")] = 0.75
+    greenhouse_m3_mg: Annotated[float, NotNegative("η [published; unit inferred]")] = 2.36e-4
+    volume_km3: Annotated[float, Positive("V₁; x₁/V₁ in t/km³ is mg/m³ [published; unit inferred]")] = 1.18
+    stefan_boltzmann_w_m2_k4: Annotated[float, Positive("σ [published]")] = 5.67e-8
+    set_point_k: Annotated[float, Positive("T*, pre-industrial [published as T_e]")] = 287.05
 
     def effective_emissivity(self, co2_t: Floats) -> Floats:
         """Return ε = ε_n − η·x₁/V₁, shape as x₁."""
-        effective: Floats = self.emissivity - self.greenhouse_m3_mg * (co2_t / self.volume_km3)
-        return effective
+        return self.emissivity - self.greenhouse_m3_mg * (co2_t / self.volume_km3)
 
     def derivative(self, state: Floats, inputs: Floats, *, stock_kg: Floats) -> Floats:
-        """Return Ṫ, K/d, shape (1, B).
-
-        Args:
-            state: (T,), shape (1, B).
-            inputs: none, shape (0, B).
-            stock_kg: x₁, the carbon dioxide that the network holds there, kg, shape (B,).
-        """
+        """Return Ṫ, K/d, shape (1, B); ``stock_kg`` is x₁, the CO₂ that the network holds there, shape (B,)."""
         co2_t = stock_kg[None] / 1000.0
         absorbed = self.solar_w_m2 * (1.0 - self.albedo)
         emitted = self.effective_emissivity(co2_t) * self.stefan_boltzmann_w_m2_k4 * np.square(np.square(state))
-        rate: Floats = SECONDS_PER_DAY / self.heat_capacity_j_m2_k * (absorbed - emitted)
-        return rate
+        return SECONDS_PER_DAY / self.heat_capacity_j_m2_k * (absorbed - emitted)
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −(T − T*)², K², shape (B,)."""
@@ -96,5 +61,4 @@ class TroposphereTemperature(ContinuousModel):
         """Return T = (S(1 − α)/(εσ))^¼, K; NaN where ε ≤ 0."""
         emissivity = self.effective_emissivity(np.asarray(co2_t, dtype=np.float64))
         usable = np.where(emissivity > 0.0, emissivity, np.nan)
-        steady: Floats = (self.solar_w_m2 * (1.0 - self.albedo) / (usable * self.stefan_boltzmann_w_m2_k4)) ** 0.25
-        return steady
+        return (self.solar_w_m2 * (1.0 - self.albedo) / (usable * self.stefan_boltzmann_w_m2_k4)) ** 0.25

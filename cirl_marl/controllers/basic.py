@@ -1,4 +1,4 @@
-"""Controllers that need no learning: neutral, constant and random."""
+"""Controllers that need no learning: neutral, constant and random, and one that tells how far another is."""
 
 from __future__ import annotations
 
@@ -15,13 +15,10 @@ Arrays = Mapping[str, NDArray[np.floating]]
 
 
 class Controller(ABC):
-    """Maps the observations of all agents to their actions.
-
-    Attributes:
-        note: once started, what is to be said beside its figures; empty if nothing is.
-    """
+    """Maps the observations of all agents to their actions."""
 
     note: str = ""
+    """Once started, what is to be said beside its figures; empty if nothing is."""
 
     @abstractmethod
     def start(self, env: VectorEnv, seed: int) -> None:
@@ -33,13 +30,10 @@ class Controller(ABC):
 
 
 class Planner(Controller):
-    """A controller that plans when it is started, for so long that it tells how far it is.
-
-    Attributes:
-        ahead: about what share of the work of an episode is done before it begins.
-    """
+    """A controller that plans when it is started, for so long that it tells how far it is."""
 
     ahead: float
+    """About what share of the work of an episode is done before it begins."""
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Plan without telling how far it is."""
@@ -59,11 +53,7 @@ class Constant(Controller):
         self._actions: dict[str, NDArray[np.floating]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
-        """Take the actions of ``env``'s agents.
-
-        Raises:
-            ControlError: if a named agent does not act or its value is out of bounds.
-        """
+        """Take the actions of ``env``'s agents; an agent that does not act or a value out of bounds is refused."""
         for agent, value in self._wanted.items():
             if agent not in env.agents:
                 raise ControlError(f"constant control: {unknown('agent', agent, env.agents)}")
@@ -101,3 +91,38 @@ class Random(Controller):
         """Return fresh random actions."""
         del observations
         return {agent: self._random.uniform(-1.0, 1.0, (self._batch, n)) for agent, n in self._entries.items()}
+
+
+class Watched(Controller):
+    """A controller that tells how far its episode is: its plans, if it is a planner, and what it has carried out.
+
+    >>> from cirl_marl.controllers import Neutral
+    >>> from cirl_marl.controllers.rollout import rollout
+    >>> shares = []
+    >>> watched = Watched(Neutral(), shares.append)
+    >>> _ = rollout(VectorEnv("net_zero", num_envs=1, horizon=2), watched, progress=watched.acted)
+    >>> shares
+    [0.5, 1.0]
+    """
+
+    def __init__(self, controller: Controller, progress: Callable[[float], None]) -> None:
+        """Take who acts, and what is called with the share of the episode's work that is done."""
+        self._controller, self._progress = controller, progress
+        self._ahead, self._steps = 0.0, 1
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        """Start the controller, and tell how far its plans are."""
+        self._ahead, self._steps = 0.0, env.network.episode.horizon
+        if isinstance(self._controller, Planner):
+            ahead = self._ahead = self._controller.ahead
+            self._controller.plan(env, seed, lambda share: self._progress(ahead * share))
+        else:
+            self._controller.start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the controller's actions."""
+        return self._controller.act(observations)
+
+    def acted(self, intervals: int) -> None:
+        """Tell that so many intervals are done; ``rollout`` takes this as its ``progress``."""
+        self._progress(self._ahead + (1.0 - self._ahead) * intervals / self._steps)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +23,7 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declared import frozen
 from cirl_marl.network.elements import ControlKind, Law, Role
 
 RANK, DECAY = 1e-9, 1e-7
@@ -30,45 +32,29 @@ ITERATIONS, CONVERGED = 500, 1e-12
 """Most steps of the fixed point of output feedback, and the relative change at which it has converged."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class LinearSystem:
     """The linear laws ẋ = A x + B u + c of a network, read off its compiled flow laws.
 
     States are the stocks that drive a flow or have a set-point; the others only count what passes. A non-renewable
     reservoir without a set-point is held at the middle of its initial range. The laws hold while no donor runs dry.
-
-    Attributes:
-        states: nodes, in network order.
-        inputs: acting agents.
-        A: shape (states, states), 1/time.
-        B: shape (states, inputs), dimensionless.
-        c: shape (states,), mass/time.
-        set_points: of the states, NaN where there is none, mass.
-        scale: reference values of the states, then of the inputs, mass and mass/time.
-        bounds: lower and upper bounds of the inputs, shape (2, inputs), mass/time.
-        neutral: their values while nobody acts, shape (inputs,), mass/time.
     """
 
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    A: Floats
-    B: Floats
-    c: Floats
-    set_points: Floats
-    scale: Floats
-    bounds: Floats
-    neutral: Floats
+    states: Annotated[tuple[str, ...], "nodes, in network order"]
+    inputs: Annotated[tuple[str, ...], "acting agents"]
+    A: Annotated[Floats, "shape (states, states), 1/time"]
+    B: Annotated[Floats, "shape (states, inputs), dimensionless"]
+    c: Annotated[Floats, "shape (states,), mass/time"]
+    set_points: Annotated[Floats, "of the states, NaN where there is none, mass"]
+    scale: Annotated[Floats, "reference values of the states, then of the inputs, mass and mass/time"]
+    bounds: Annotated[Floats, "lower and upper bounds of the inputs, shape (2, inputs), mass/time"]
+    neutral: Annotated[Floats, "their values while nobody acts, shape (inputs,), mass/time"]
 
     @classmethod
     def of(
         cls, network: Network, agents: Sequence[str] | None = None, set_points: Mapping[str, float] | None = None
     ) -> LinearSystem:
-        """Read the system off the flows of unit stocks and unit controls.
-
-        Args:
-            network: under the scenario of interest.
-            agents: who acts; the others are neutral. None: the network's own choice.
-            set_points: node → stock, in place of the tracked set-points of the network.
+        """Read the system off the flows of unit stocks and unit controls; arguments are as in ``LQR``.
 
         Raises:
             CirlError: if an agent or node is unknown, no state can be moved, or the laws are not linear in x and u.

@@ -27,13 +27,8 @@ SHORT = 20
 
 def remarks(network: Network) -> Iterator[str]:
     """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse."""
-    yield from _apart(network)
-    yield from _without_effect(network)
-    yield from _departures(network)
-    yield from _starved(network)
-    yield from _aimless(network)
-    yield from _unpaid(network)
-    yield from _coarse(network)
+    for look in (_apart, _without_effect, _departures, _starved, _aimless, _unpaid, _coarse):
+        yield from look(network)
 
 
 def _apart(network: Network) -> Iterator[str]:
@@ -71,10 +66,8 @@ def _departures(network: Network) -> Iterator[str]:
             if round(time / interval) >= horizon:
                 yield f"{at}: {end}, so that it never leaves"
             if batch_kg is not None and not is_whole(mass * factor(network.mass_unit, "kg") / batch_kg):
-                yield (
-                    f"{at}: {mass:g} {network.mass_unit} are no whole number of batches of {batch_kg:g} kg, as "
-                    f"'{recipient.id}' makes them, so that a part of it waits there"
-                )
+                made = f"batches of {batch_kg:g} kg, as '{recipient.id}' makes them, so that a part of it waits there"
+                yield f"{at}: {mass:g} {network.mass_unit} are no whole number of {made}"
 
 
 def _coarse(network: Network) -> Iterator[str]:
@@ -92,13 +85,10 @@ def _coarse(network: Network) -> Iterator[str]:
         return
     size = np.maximum(np.abs(shown[1]).max(axis=0), 1e-9)
     apart = np.abs(shown[0] - shown[1]).max(axis=0) / size
-    if (apart > COARSE).any():
-        worst = int(apart.argmax())
+    if apart[worst := int(apart.argmax())] > COARSE:
         name = VectorEnv(network, num_envs=1).state_names[worst]
-        yield (
-            f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, neutral control gives another "
-            f"{name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
-        )
+        other = f"neutral control gives another {name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
+        yield f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, {other}"
 
 
 def _states(network: Network, action: float | None, intervals: int) -> Floats:
@@ -142,10 +132,10 @@ def _starved(network: Network) -> Iterator[str]:
                 short.setdefault(k, step * interval)
     for k, time in short.items():
         arc = ordered[k]
-        yield (
-            f"arc '{arc.id}': under neutral control '{arc.donor}' holds too little for its flow from "
-            f"{time:g} {network.time_unit} on; give it a larger initial stock if it stands for the world outside"
+        since = (
+            f"from {time:g} {network.time_unit} on; give it a larger initial stock if it stands for the world outside"
         )
+        yield f"arc '{arc.id}': under neutral control '{arc.donor}' holds too little for its flow {since}"
 
 
 def _valve(compartment: Compartment) -> float:
@@ -176,10 +166,8 @@ def _unpaid(network: Network) -> Iterator[str]:
         idle = [debtor for debtor in service.debtors if debtor not in network.agents]
         owed = "owed_by" if service.owed_by else "owed_by is left out, so the provider owes it;"
         if len(idle) == len(service.debtors):
-            yield (
-                f"service '{service.id}': {owed} {', '.join(idle)}: does not act, so that no agent is paid less when "
-                f"the service fails; agents are {', '.join(network.agents)}"
-            )
+            unpaid = f"no agent is paid less when the service fails; agents are {', '.join(network.agents)}"
+            yield f"service '{service.id}': {owed} {', '.join(idle)}: does not act, so that {unpaid}"
         elif idle:
             yield f"service '{service.id}': owed_by: {', '.join(idle)} does not act and cannot be paid less"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from cirl_marl.controllers.basic import Controller
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declared import itemised
 
 EVALUATION_SEEDS = 2**31
 """First seed of evaluations; training draws its seeds below it, so no evaluated episode was trained on."""
@@ -19,35 +21,22 @@ SEED_SPACING = 1_000_000
 """Distance between the first seeds of two evaluations with different ``seed``, so that they share no episode."""
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """One episode of each of B copies under one controller.
+    """One episode of each of B copies under one controller."""
 
-    Attributes:
-        circularity: λ at the end of each interval, shape (B, steps), mass.
-        circularity_mean: mean of λ over each interval, shape (B, steps), mass.
-        service: service level, shape (B, steps).
-        local_returns: sum of the local rewards of each agent, shape (agents, B).
-        returns: sum of the rewards of each agent, shape (agents, B).
-        stock: stocks after each interval in the first copy, shape (steps, nodes), mass.
-        flow: mean flows of each interval in the first copy, shape (steps, arcs), mass/time.
-        load: masses that batch arcs hold after each interval in the first copy, shape (steps, batch arcs), mass.
-        inner: inner states after each interval in the first copy, those that an agent may see, shape (steps, states).
-        final_stock: mean over copies of the last stocks, shape (nodes,), mass.
-        mean_flow: mean over copies and time of the flows, shape (arcs,), mass/time.
-    """
-
-    circularity: Floats
-    circularity_mean: Floats
-    service: Floats
-    local_returns: Floats
-    returns: Floats
-    stock: Floats
-    flow: Floats
-    load: Floats
-    inner: Floats
-    final_stock: Floats
-    mean_flow: Floats
+    circularity: Annotated[Floats, "λ at the end of each interval, shape (B, steps), mass"]
+    circularity_mean: Annotated[Floats, "mean of λ over each interval, shape (B, steps), mass"]
+    service: Annotated[Floats, "service level, shape (B, steps)"]
+    local_returns: Annotated[Floats, "sum of the local rewards of each agent, shape (agents, B)"]
+    returns: Annotated[Floats, "sum of the rewards of each agent, shape (agents, B)"]
+    stock: Annotated[Floats, "stocks after each interval in the first copy, shape (steps, nodes), mass"]
+    flow: Annotated[Floats, "mean flows of each interval in the first copy, shape (steps, arcs), mass/time"]
+    load: Annotated[Floats, "masses that batch arcs hold, likewise, shape (steps, batch arcs), mass"]
+    inner: Annotated[Floats, "inner states that an agent may see, likewise, shape (steps, states)"]
+    final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (nodes,), mass"]
+    mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
 
     @property
     def episode_circularity(self) -> Floats:
@@ -70,26 +59,17 @@ def rollout(
     start: Mapping[str, float] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Rollout:
-    """Run one whole episode in every copy of ``env``.
+    """Run one whole episode in every copy of ``env``, of which copy i is reset with ``seed + i``.
 
-    Args:
-        env: copy i is reset with ``seed + i``.
-        controller: who acts.
-        seed: first seed; the same seed gives every controller the same start states.
-        start: initial stocks and inner states that are given instead of drawn; see ``VectorEnv.reset``.
-        progress: called with the number of intervals done.
+    The same seed gives every controller the same start states; what stands in ``start`` is not drawn (see
+    ``VectorEnv.reset``). ``progress`` is called with the number of intervals done.
     """
     observations = env.reset(seed=seed, options={"initial_state": start or {}})
     controller.start(env, seed)
-    steps = env.network.episode.horizon
-    shape = (env.num_envs, steps)
-    circularity, mean, service = np.empty(shape), np.empty(shape), np.empty(shape)
-    local = np.zeros((len(env.agents), env.num_envs))
-    returns = np.zeros_like(local)
-    rows = env.rows
-    stock = np.empty((steps, len(env.network.nodes)))
-    flow = np.empty((steps, len(env.network.arcs)))
-    batches, physics = env.dynamics.batches, env.dynamics.inner
+    steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
+    circularity, mean, service = np.empty((3, env.num_envs, steps))
+    local, returns = np.zeros((2, len(env.agents), env.num_envs))
+    stock, flow = np.empty((steps, len(env.network.nodes))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
     for t in range(steps):
@@ -110,18 +90,11 @@ def rollout(
 
 def interval_ends(network: Network) -> Floats:
     """Return the time at which each control interval of an episode ends, shape (steps,)."""
-    ends: Floats = np.multiply(
-        np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64
-    )
-    return ends
+    return np.multiply(np.arange(1, network.episode.horizon + 1), network.episode.control_interval, dtype=np.float64)
 
 
 def first_seed(seed: int) -> int:
-    """Return the seed of the first episode of the evaluation ``seed``.
-
-    Raises:
-        CirlError: if ``seed`` is negative.
-    """
+    """Return the seed of the first episode of the evaluation ``seed``, which a ``CirlError`` refuses if negative."""
     if seed < 0:
         raise CirlError(f"seed must not be negative, got {seed}")
     return EVALUATION_SEEDS + SEED_SPACING * seed

@@ -14,20 +14,13 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.elements import Compartment, ControlKind, Law
+from cirl_marl.network.elements import ControlKind, Law
 from cirl_marl.records.files import write_atomically, write_table
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """One episode of a policy or controller.
-
-    Attributes:
-        network: under its scenario.
-        header: of the columns, with units.
-        columns: shape (columns, steps).
-        rollout: the episode.
-    """
+    """One episode: the network, a header with units, columns of shape (columns, steps), and the rollout."""
 
     network: Network
     header: tuple[str, ...]
@@ -35,11 +28,7 @@ class Schedule:
     rollout: Rollout
 
     def write(self, path: Path) -> None:
-        """Write a CSV file, whole or not at all; its folder must be there.
-
-        Raises:
-            CirlError: if there is no such folder.
-        """
+        """Write a CSV file, whole or not at all; a ``CirlError`` says so if its folder is not there."""
         if not path.parent.is_dir():
             raise CirlError(f"{path}: the folder {path.parent} does not exist")
         rows = [[f"{value:.10g}" for value in row] for row in self.columns.T]
@@ -71,12 +60,9 @@ def schedule(
     Columns are when the interval begins and ends, the value of every control in it, the mass that an agent with a valve
     lets through, λ at its end and its mean over it, and the service level.
 
-    Args:
-        env: a single copy.
-        controller: who acts.
-        seed: of the evaluation whose first start is taken; None starts from the middle of all initial ranges, with
-            inner states that models draw themselves as the first evaluation draws them.
-        progress: called with the number of intervals done.
+    It begins at the first start of the evaluation ``seed``; None takes the middle of all initial ranges, with inner
+    states that models draw themselves as the first evaluation draws them. ``progress`` is called with the number of
+    intervals done.
 
     Raises:
         CirlError: if the controller does not fit the network, nobody acts, or there are several copies.
@@ -117,13 +103,8 @@ def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
             yield f"{agent}: flow ordered ({network.mass_unit}/{network.time_unit})"
         elif control.kind is ControlKind.RATE:
             yield f"{agent}: valve factor (1)"
-        else:
-            yield from (f"{agent}: {name}" for name in _inputs(compartment))
-
-
-def _inputs(compartment: Compartment) -> tuple[str, ...]:
-    assert compartment.model is not None
-    return tuple(compartment.model.input_names)  # they end in their unit
+        elif compartment.model is not None:
+            yield from (f"{agent}: {name}" for name in compartment.model.input_names)  # they end in their unit
 
 
 def _throughputs(network: Network, agents: tuple[str, ...], flow: Floats) -> Iterator[tuple[str, Floats]]:

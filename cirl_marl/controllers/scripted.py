@@ -42,9 +42,8 @@ def fetch(seen: Seen, model: Any = None) -> Floats:
     its height where the fingers, which open in y, pass on both sides of it; around the object they close; once they
     hold, it is lifted, carried and set down; at the target it is let go.
     """
-    grip, item, target = (
-        np.stack([seen[f"{what}_{axis}"] for axis in "xyz"]) for what in ("grip", "object", "desired")
-    )
+    whats = ("grip", "object", "desired")
+    grip, item, target = (np.stack([seen[f"{what}_{axis}"] for axis in "xyz"]) for what in whats)
     away = grip - item
     aside = np.hypot(*away[:2])
     around = (aside < 0.02) & (np.abs(away[2]) < 0.02)
@@ -109,12 +108,7 @@ def incinerator(seen: Seen, model: Incinerator) -> Floats:
 HOLD_KJ_MIN, GAIN_KJ_MIN_K = 3.56e5, 3e4
 """Heat that holds 1000 °C at the reference inventory, and a gain that leaves it some degrees off elsewhere. [chosen]"""
 
-SCRIPTS: dict[str, Script] = {
-    "fetch": fetch,
-    "reacher": reacher,
-    "delivery_truck": truck,
-    "incinerator": incinerator,
-}
+SCRIPTS: dict[str, Script] = {"fetch": fetch, "reacher": reacher, "delivery_truck": truck, "incinerator": incinerator}
 """Script of each kind of model; that of a sorting station is its robot's."""
 
 
@@ -128,11 +122,7 @@ class Scripted(Controller):
         self._scripts: dict[str, tuple[Script, CompartmentModel, dict[str, int], Control]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
-        """Find the script of each agent and what it reads.
-
-        Raises:
-            ControlError: if an agent that is held constant does not act or its value is out of bounds.
-        """
+        """Find the script of each agent and what it reads; those held constant are refused as by ``Constant``."""
         self._constant.start(env, seed)
         self._scripts = {}
         for agent in env.agents:
@@ -140,14 +130,10 @@ class Scripted(Controller):
             model, control = compartment.model, compartment.control
             if model is None or agent in self._held or control is None or control.kind is not ControlKind.INPUT:
                 continue
-            script = SCRIPTS.get(model.robot.kind)
-            if script is None:
-                continue
-            own = f"{agent}."
-            columns = {
-                name.removeprefix(own): i for i, name in enumerate(env.layout.names[agent]) if name.startswith(own)
-            }
-            self._scripts[agent] = script, model, columns, control
+            if script := SCRIPTS.get(model.robot.kind):
+                places = {name: i for i, name in enumerate(env.layout.names[agent]) if name.startswith(f"{agent}.")}
+                columns = {name.removeprefix(f"{agent}."): i for name, i in places.items()}
+                self._scripts[agent] = script, model, columns, control
 
     @property
     def scripted(self) -> tuple[str, ...]:
@@ -155,11 +141,7 @@ class Scripted(Controller):
         return tuple(self._scripts)
 
     def act(self, observations: Arrays) -> Arrays:
-        """Return each agent's action.
-
-        Raises:
-            ControlError: if an agent does not see a state that its script needs.
-        """
+        """Return each agent's action; a ``ControlError`` names a state that its script needs and it does not see."""
         actions = dict(self._constant.act(observations))
         for agent, (script, model, columns, control) in self._scripts.items():
             seen = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}

@@ -17,11 +17,7 @@ CHECKOUT = Path(__file__).parent.parent.parent
 
 
 def folder(kind: str) -> Path:
-    """Return the folder of definitions, ``kind`` being ``envs`` or ``agents``.
-
-    Raises:
-        CirlError: if neither the installed package nor a checkout holds it.
-    """
+    """Return the folder of definitions ``envs`` or ``agents``, of the installed package or of a checkout."""
     packaged = PACKAGED / kind
     if packaged.is_dir():
         return packaged
@@ -48,9 +44,7 @@ def recipes() -> list[str]:
 def load_network(name: str | Path, *, scenario: str | None = None) -> Network:
     """Return a network of the catalogue, or of a definition file if ``name`` ends in ``.toml``.
 
-    Args:
-        name: catalogue name or path.
-        scenario: scenario of the definition; None is the default, physical one.
+    It is under ``scenario``; None is the default, physical one.
 
     Raises:
         DefinitionError: if the file has mistakes; all are named.

@@ -8,20 +8,9 @@ from cirl_marl.compartments import CompartmentModel, model_class
 from cirl_marl.definitions.mistakes import parameter_mistakes
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable, QuantityTable, Range
 from cirl_marl.errors import CirlError, NetworkError, unknown
-from cirl_marl.network import Network
-from cirl_marl.network.declared import Declared, Names, Numbers, Quantity, declarations
-from cirl_marl.network.elements import (
-    TAKEN,
-    Arc,
-    Control,
-    ControlKind,
-    Episode,
-    Law,
-    Node,
-    Objective,
-    Observation,
-    Service,
-)
+from cirl_marl.network import Network, elements
+from cirl_marl.network.declared import Declared, Numbers, Quantity, declarations
+from cirl_marl.network.elements import TAKEN, Arc, Control, ControlKind, Law, Node
 from cirl_marl.network.units import factor
 
 GIVEN = ("rate", "flow", "series", "batches")
@@ -48,11 +37,7 @@ class Converter:
         self.scales: dict[str, float] = {}
 
     def network(self, scenario: str) -> Network:
-        """Return the network.
-
-        Raises:
-            NetworkError: with every inconsistent unit and every fault of the network.
-        """
+        """Return the network; a ``NetworkError`` has every inconsistent unit, or else every fault of the network."""
         table = self.table
         for key, unit, base in (("mass", table.units.mass, "kg"), ("time", table.units.time, "s")):
             try:
@@ -63,15 +48,14 @@ class Converter:
             self.scales[kind] = self._value(scale, kind, f"scales.{key}")
             if self.scales[kind] <= 0:
                 self.mistakes.append(f"scales.{key}: {scale.value} must be positive")
+        services = table.services.items()
         parts: dict[str, Any] = {
             "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
             "arcs": tuple(self._compartment(Arc, id_, arc, f"arcs.{id_}") for id_, arc in table.arcs.items()),
-            "services": tuple(
-                self._part(Service, service, f"services.{id_}", id=id_) for id_, service in table.services.items()
-            ),
-            "episode": self._part(Episode, table.episode, "episode"),
-            "objective": self._part(Objective, table.objective, "objective"),
-            "observation": self._part(Observation, table.observation, "observation"),
+            "services": tuple(self._part(elements.Service, each, f"services.{id_}", id=id_) for id_, each in services),
+            "episode": self._part(elements.Episode, table.episode, "episode"),
+            "objective": self._part(elements.Objective, table.objective, "objective"),
+            "observation": self._part(elements.Observation, table.observation, "observation"),
         }
         if self.mistakes:
             raise NetworkError(table.name, self.mistakes)
@@ -110,7 +94,7 @@ class Converter:
             return self._batches(given, where)
         if isinstance(declared, Numbers):
             return (self._value(given, "flow", where),)
-        return tuple(given) if isinstance(declared, Names) else given
+        return tuple(given) if isinstance(given, list) else given
 
     def _compartment(self, made: type[Node] | type[Arc], id_: str, table: Any, where: str) -> Any:
         """Return a node or an arc, whose control depends on its model, with the scale of all that state none."""
@@ -154,17 +138,12 @@ class Converter:
         """Return the model of a compartment and the initial ranges of its inner states, as keywords."""
         if table is None:
             return {}
+        form = {} if table.form is None else {"form": table.form}
         try:
             kind = model_class(table.kind)
-        except CirlError as error:
-            self.mistakes.append(f"{where}: {error}")
-            return {}
-        form = {} if table.form is None else {"form": table.form}
-        mistakes = list(parameter_mistakes(kind, table.parameters, form))
-        self.mistakes += (f"{where}: {mistake}" for mistake in mistakes)
-        if mistakes:
-            return {}
-        try:
+            if mistakes := list(parameter_mistakes(kind, table.parameters, form)):
+                self.mistakes += (f"{where}: {mistake}" for mistake in mistakes)
+                return {}
             model = kind(**table.parameters | form)
         except CirlError as error:
             self.mistakes.append(f"{where}: {error}")
@@ -190,16 +169,12 @@ class Converter:
         where = f"{where}.control"
         if control is None:
             return None
-        target = {
-            ControlKind.RATE: "1",
-            ControlKind.FLOW: "flow",
-            ControlKind.INPUT: control.unit if model is None else model.input_unit,
-        }[control.kind]
+        taken = control.unit if model is None else model.input_unit
+        target = {ControlKind.RATE: "1", ControlKind.FLOW: "flow", ControlKind.INPUT: taken}[control.kind]
         if target is None and model is not None and control.unit != "1":
-            self.mistakes.append(
-                f"{where}: unit '{control.unit}': model '{model.kind}' states no input_unit to convert to; "
-                f"give its class one, or write unit = '1' and the numbers as the model takes them"
-            )
+            remedy = "give its class one, or write unit = '1' and the numbers as the model takes them"
+            stated = f"unit '{control.unit}': model '{model.kind}' states no input_unit to convert to"
+            self.mistakes.append(f"{where}: {stated}; {remedy}")
             return None
         unit = self._factor(control.unit, target or "1", where)
         low, neutral, high = (value * unit for value in (control.low, control.neutral, control.high))

@@ -20,34 +20,25 @@ BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ON
 
 def toml_mistake(error: tomllib.TOMLDecodeError, text: str) -> str:
     """Say where ``text`` is not valid TOML, and what to write if it is for a bare word."""
-    comma = _decimal_comma(str(error), text)
-    if comma:
-        return f"not valid TOML: {error}: {comma}; write {comma.replace(',', '.')}"
-    word = _bare_word(str(error), text)
+    place = re.search(r"line (\d+), column (\d+)", str(error))
+    if place is None:
+        return f"not valid TOML: {error}"
+    line, column = text.split("\n")[int(place[1]) - 1], int(place[2]) - 1
+    if comma := re.search(r"=\s*(-?\d+,\d+)\W*$", line[: column + 1]):
+        return f"not valid TOML: {error}: {comma[1]}; write {comma[1].replace(',', '.')}"
+    word = _bare_word(str(error), line, column)
     if word.lower() in ("true", "false"):
         return f"not valid TOML: {error}: {word}; write {word.lower()}"
     return f"not valid TOML: {error}" + (f': {word}; text needs quotes, "{word}"' if word else "")
 
 
-def _decimal_comma(error: str, text: str) -> str:
-    """Return the number with a comma in it that stands last before where reading failed; empty if there is none."""
-    place = re.search(r"line (\d+), column (\d+)", error)
-    if place is None:
-        return ""
-    before = text.split("\n")[int(place[1]) - 1][: int(place[2])]
-    found = re.search(r"=\s*(-?\d+,\d+)\W*$", before)
-    return found[1] if found else ""
-
-
-def _bare_word(error: str, text: str) -> str:
+def _bare_word(error: str, line: str, column: int) -> str:
     """Return the words without quotes that stand as a value where reading failed; empty if there are none.
 
     A word that begins with a digit, such as 1/day, fails only where the number in it ends.
     """
-    place = re.search(r"line (\d+), column (\d+)", error)
-    if place is None or not error.startswith(("Invalid value", "Expected newline", "Unclosed")):
+    if not error.startswith(("Invalid value", "Expected newline", "Unclosed")):
         return ""
-    line, column = text.split("\n")[int(place[1]) - 1], int(place[2]) - 1
     start = column if error.startswith("Invalid value") else line.rfind("=", 0, column) + 1
     found = re.compile(r"[^][{}\"'#,=]*+(?!=)").match(line, start)
     word = found[0].strip() if found is not None and found.end() > column else ""

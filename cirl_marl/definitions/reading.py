@@ -115,11 +115,7 @@ def write_network(network: Network, path: Path) -> None:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises:
-        DefinitionError: if it is missing, unreadable or not TOML (with line and column).
-    """
+    """Read a TOML file; a ``DefinitionError`` says if it is missing, unreadable or not TOML, with line and column."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:

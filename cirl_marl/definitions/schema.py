@@ -6,15 +6,12 @@ what files spell otherwise than Python is written out here.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, create_model
 
 from cirl_marl.network.declared import (
-    Amount,
     Declared,
-    Flag,
-    Names,
     Nested,
     Numbers,
     Quantity,
@@ -103,37 +100,38 @@ class ModelTable(Table):
 
 def table_of(made: type[Any], **more: Any) -> Any:
     """Return the table of a part: a key for each declared field, with ``more`` that Python has otherwise."""
-    told = {name: declared for name, declared in declarations(made).items() if name not in IN_MODEL}
-    keys = {name: _key(made, name, declared) for name, declared in told.items() if _spelled(declared) is not None}
-    if any(isinstance(declared, Amount) for declared in told.values()):
+    told, hints = declarations(made), get_type_hints(made)
+    spelled = {name: _spelled(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
+    keys = {name: _key(made, name, kind) for name, kind in spelled.items() if kind is not None}
+    if Number in spelled.values():
         more |= {"unit": (str, ...), "source": (Source, ...)}
     summary = str(made.__doc__).partition("\n")[0]
     return create_model(f"{made.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
 
 
-def _key(made: type[Any], name: str, declared: Declared) -> tuple[Any, Any]:
+def _key(made: type[Any], name: str, kind: Any) -> tuple[Any, Any]:
     """Return type and pydantic field of a declared field; what is left out is None, or its default if that is plain."""
-    kind, alias = _spelled(declared), declared.key or None
+    declared, default = declarations(made)[name], default_of(made, name)
+    told: dict[str, Any] = {"description": declared.meaning, "alias": declared.key or None}
     if is_required(made, name):
-        return kind, Field(description=declared.meaning, alias=alias)
+        return kind, Field(**told)
     if isinstance(kind, type) and issubclass(kind, BaseModel):
-        return kind | None, Field(None, description=declared.meaning, alias=alias)
-    default = default_of(made, name)
-    return kind, Field(
-        list(default) if isinstance(default, tuple) else default, description=declared.meaning, alias=alias
-    )
+        return kind | None, Field(None, **told)
+    return kind, Field(list(default) if isinstance(default, tuple) else default, **told)
 
 
-def _spelled(declared: Declared) -> Any:
+def _spelled(declared: Declared, hint: Any) -> Any:
     """Return the type of a declared field in a file; None if it stands in the table of another."""
     if isinstance(declared, Word):
         return declared.of if isinstance(declared.of, type) else Literal[declared.of]
     if isinstance(declared, Numbers):
-        return {"range": Range, "batches": Batches, "flow": QuantityTable}.get(declared.spelled)
+        tables = {"range": Range, "batches": Batches, "flow": QuantityTable, "amount": Number}
+        return tables.get(declared.spelled)
     if isinstance(declared, Nested):
         return ControlTable if declared.of == "control" else ModelTable
-    plain = {Names: list[str], Flag: StrictBool, Quantity: QuantityTable, Amount: Number}
-    return plain.get(type(declared), str)
+    if isinstance(declared, Quantity):
+        return QuantityTable
+    return {bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
 
 
 TITLE: Any = (str, "")

@@ -12,7 +12,7 @@ import tomlkit
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
-from cirl_marl.network.declared import Flag, Names, Nested, Numbers, Quantity, declarations, default_of, is_required
+from cirl_marl.network.declared import Nested, Numbers, Quantity, declarations, default_of, is_required
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 
 SOURCE = "network built in Python"
@@ -97,27 +97,29 @@ class _Writer:
             if isinstance(declared, Quantity):
                 table[key] = self._quantity(value, declared.kind(part))
             elif isinstance(declared, Numbers):
-                table |= self._numbers(part, declared, key)
+                table |= self._numbers(part, declared.spelled, key)
             elif isinstance(declared, Nested):
                 table[key] = self._control(part) if declared.of == "control" else self._model(part)
             else:
-                table[key] = {Names: list, Flag: bool}.get(type(declared), str)(value)
+                table[key] = (
+                    value if isinstance(value, bool) else list(value) if isinstance(value, tuple) else str(value)
+                )
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
 
-    def _numbers(self, part: Any, declared: Numbers, key: str) -> dict[str, Any]:
-        units = {"unit": self._units.get(declared.of[0] if declared.of else ""), "source": SOURCE}
-        if declared.spelled == "range":
+    def _numbers(self, part: Any, spelled: str, key: str) -> dict[str, Any]:
+        if spelled == "range":
             low, high = map(float, part.initial)
-            return {key: {"low": low, "high": high, **units}}
-        if declared.spelled == "batches":
+            return {key: {"low": low, "high": high, "unit": self._units["mass"], "source": SOURCE}}
+        time = self._units["time"]
+        if spelled == "batches":
             times, masses = ([float(pair[column]) for pair in part.batches] for column in (0, 1))
-            units = {"time_unit": self._units["time"], "unit": self._units["mass"], "source": SOURCE}
+            units = {"time_unit": time, "unit": self._units["mass"], "source": SOURCE}
             return {key: {"times": times, "masses": masses, **units}}
-        if declared.spelled == "flow" and part.times:
+        if spelled == "flow" and part.times:
             columns = {"times": list(map(float, part.times)), "values": list(map(float, part.flow))}
-            return {"series": {**columns, "time_unit": self._units["time"], **units}}
-        return {key: self._quantity(part.flow[0], "flow")} if declared.spelled == "flow" else {}
+            return {"series": {**columns, "time_unit": time, "unit": self._units["flow"], "source": SOURCE}}
+        return {key: self._quantity(part.flow[0], "flow")} if spelled == "flow" else {}
 
     def _control(self, part: Compartment) -> dict[str, Any]:
         control = part.control

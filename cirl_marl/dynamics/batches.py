@@ -39,15 +39,10 @@ class BatchTransport:
         self._vehicles = [(i, line) for i, line in enumerate(self.lines) if not line.slots]
         self._receiving = sorted({line.recipient for line in self.lines})
         count, every, lines = len(self.lines), np.arange(len(self.lines)), self.lines
-        self._delivery = RowSum([line.recipient for line in lines], every, np.ones(count), (rows.masses, count))
-        parts = [line.part for line in lines]
-        self._arrivals = RowSum(parts, every, [line.arrives for line in lines], (2, count))
-        self._held = RowSum(
-            [i for i, line in enumerate(lines) for _ in line.rows],
-            [row for line in lines for row in line.rows],
-            np.ones(sum(len(line.rows) for line in lines)),
-            (count, rows.masses),
-        )
+        self._delivery = RowSum([line.recipient for line in lines], every, 1.0, (rows.masses, count))
+        self._arrivals = RowSum([line.part for line in lines], every, [line.arrives for line in lines], (2, count))
+        held = [(i, row) for i, line in enumerate(lines) for row in line.rows]
+        self._held = RowSum([i for i, _ in held], [row for _, row in held], 1.0, (count, rows.masses))
         self._delayed = np.flatnonzero([line.slots > 0 for line in lines])
         self._first = np.array([lines[i].first for i in self._delayed], dtype=np.intp)[:, None]
         self._slots = np.array([lines[i].slots for i in self._delayed], dtype=np.intp)[:, None]
@@ -66,7 +61,7 @@ class BatchTransport:
         self._sent_first = np.array([line.first for line in lines], dtype=np.intp)[:, None]
         self._sent_slots = np.array([line.slots for line in lines], dtype=np.intp)[:, None]
         self._sent_donor = np.array([line.donor for line in lines], dtype=np.intp)
-        self._departure = RowSum(self._sent_donor, np.arange(count), -np.ones(count), (self._rows.masses, count))
+        self._departure = RowSum(self._sent_donor, np.arange(count), -1.0, (self._rows.masses, count))
         parts, weights = [line.part for line in lines], [line.leaves for line in lines]
         self._departures = RowSum(parts, np.arange(count), weights, (2, count))
 
@@ -87,16 +82,10 @@ class BatchTransport:
         return self._departures(mass)
 
     def settle(self, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> tuple[Floats, Floats]:
-        """Deliver, release and send off, in place, what is due at the end of the interval.
+        """Deliver, release and send off, in place, what is due at the end of the interval ``step``, shape (B,).
 
-        Args:
-            stock: all masses and the unit row, shape (rows, B).
-            inner: inner states, shape (states, B); vehicles turn, plants receive.
-            step: index of the interval in each copy, shape (B,).
-            physics: the models that release batches, drive vehicles and receive deliveries.
-
-        Returns:
-            Mass delivered by each batch arc, shape (batch arcs, B), and m_fb of the interval's end, shape (2, B).
+        Vehicles turn and plants receive in ``inner``. Returned are the mass delivered by each batch arc, shape (batch
+        arcs, B), and m_fb of the interval's end, shape (2, B).
         """
         delivered = np.empty((len(self.lines), stock.shape[1]))
         slots, copies = self._first + step % self._slots, np.arange(stock.shape[1])

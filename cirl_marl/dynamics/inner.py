@@ -59,20 +59,14 @@ class InnerPhysics:
             owner: tuple(self.rows[owner].start + model.state_names.index(name) for name in model.observed)
             for owner, model in named.items()
         }
-        visible = [row for rows in self.observed.values() for row in sorted(rows)]
-        self.visible = np.array(visible, dtype=np.intp)
+        self.visible = np.array([row for seen in self.observed.values() for row in sorted(seen)], dtype=np.intp)
         euler = network.episode.solver == "euler"
-        self._discrete: list[tuple[int, DiscreteTimeModel]] = []
-        self._own_step: list[tuple[int, OwnStepModel]] = []
-        self._continuous: list[tuple[int, ContinuousModel]] = []
-        for i, model in placed:
-            if isinstance(model, DiscreteTimeModel):
-                self._discrete.append((i, model))
-            elif isinstance(model, OwnStepModel) and not (euler and isinstance(model, ContinuousModel)):
-                self._own_step.append((i, model))
-            elif isinstance(model, ContinuousModel):
-                self._continuous.append((i, model))
+        self._discrete = [(i, model) for i, model in placed if isinstance(model, DiscreteTimeModel)]
+        own = ((i, model) for i, model in placed if isinstance(model, OwnStepModel))
+        self._own_step = [(i, model) for i, model in own if not (euler and isinstance(model, ContinuousModel))]
         self._averaged = {i for i, _ in self._own_step}
+        taken = self._averaged.union(i for i, _ in self._discrete)
+        self._continuous = [(i, m) for i, m in placed if isinstance(m, ContinuousModel) and i not in taken]
         every = np.arange(len(self.names))
         self._moving = np.concatenate([every[:0], *(every[self._states[i]] for i, _ in self._continuous)])
         ranged = (name in model.ranged_states for model in self._models for name in model.state_names)
@@ -82,14 +76,10 @@ class InnerPhysics:
         self.high: Floats = np.array([high for _, high in ranges], dtype=float)
         self._reward_scale = np.array([owner.reward_scale for owner in owners]).reshape(-1, 1)
         self._speed = [factor(network.time_unit, model.time_unit) for model in self._models]
-        takes_inputs = [o.control is not None and o.control.kind is ControlKind.INPUT for o in owners]
-        self._inputs = [
-            network.control_rows[owner.id] if takes else slice(0, 0)
-            for owner, takes in zip(owners, takes_inputs, strict=True)
-        ]
+        takes = (o.control is not None and o.control.kind is ControlKind.INPUT for o in owners)
+        self._inputs = [network.control_rows[o.id] if t else slice(0, 0) for o, t in zip(owners, takes, strict=True)]
         self._held = [network.node_index[o] if o in network.node_index else rows.aboard.get(o) for o in self.owners]
-        self._kg = factor(network.mass_unit, "kg") if owners else 1.0
-        index = network.node_index
+        self._kg, index = factor(network.mass_unit, "kg") if owners else 1.0, network.node_index
         self._plants = {index[o]: (self.rows[o], model) for o, model in named.items() if o in index}
 
     def start(self, stream: np.random.Generator) -> Floats:
@@ -116,9 +106,8 @@ class InnerPhysics:
     def own_steps(self, inner: Floats, controls: Floats, interval: float, stock: Floats) -> tuple[Floats, Floats]:
         """Let models that bring their own step move by ``interval``.
 
-        Returns:
-            Inner states, shape (states, B), those of the other models as they were; mean outputs of all models,
-            shape (models, B), NaN for the others.
+        Returned are the inner states, shape (states, B), and mean outputs of all models, shape (models, B): as they
+        were and NaN for the other models.
         """
         means = np.full((len(self._models), stock.shape[1]), np.nan)
         if not self._own_step:

@@ -10,91 +10,42 @@ segment sum treat each column alike, so a column's bits do not depend on the bat
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.dynamics.rows import Rows
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Arc, ControlKind, Law
 from cirl_marl.network.rowsum import RowSum
 
 
-class FlowLaw(ABC):
-    """One law: which row drives an arc, and with which coefficient, f = r·y[driver].
+@itemised
+@dataclass(frozen=True, slots=True)
+class FlowLaw:
+    """One law, f = r·y[driver]."""
 
-    Attributes:
-        scheduled: whether it asks for a flow, which is cut to what the donor can deliver.
-    """
-
-    scheduled = False
-
-    @abstractmethod
-    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
-        """Return the row whose value the flow is proportional to."""
-
-    def coefficient(self, arc: Arc) -> float:
-        """Return r with every control at 1, 1/time or mass/time per unit of the driver."""
-        return arc.rate
+    driver: Annotated[Callable[[Arc, Network, Rows], int], "row whose value the flow is proportional to"]
+    coefficient: Annotated[Callable[[Arc], float], "r with every control at 1"] = attrgetter("rate")
+    scheduled: Annotated[bool, "whether it asks for a flow, which is cut to what the donor can deliver"] = False
 
 
-class _Donor(FlowLaw):
-    """f = a·x_donor."""
-
-    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
-        return network.node_index[arc.donor]
-
-
-class _Recipient(FlowLaw):
-    """f = a·x_recipient."""
-
-    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
-        return network.node_index[arc.recipient]
-
-
-class _Compartment(FlowLaw):
-    """f = a·y, y the output of a model."""
-
-    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
-        return rows.outputs[arc.by]
-
-
-class _Controlled(FlowLaw):
-    """f = u, which the control sets."""
-
-    scheduled = True
-
-    def driver(self, arc: Arc, network: Network, rows: Rows) -> int:
-        return rows.unit
-
-    def coefficient(self, arc: Arc) -> float:
-        return 1.0
-
-
-class _Exogenous(_Controlled):
-    """f = e(t); of a series the coefficient is the mean over the interval, which ``FlowLaws.rate`` multiplies in."""
-
-    def coefficient(self, arc: Arc) -> float:
-        return 1.0 if arc.times else arc.flow[0]
-
-
-class _Batch(_Controlled):
-    """Nothing flows: what moves in batches moves at once."""
-
-    scheduled = False
-
-    def coefficient(self, arc: Arc) -> float:
-        return 0.0
+def _unit(arc: Arc, network: Network, rows: Rows) -> int:
+    return rows.unit
 
 
 LAWS: Mapping[Law, FlowLaw] = {
-    Law.DONOR: _Donor(),
-    Law.RECIPIENT: _Recipient(),
-    Law.CONTROLLED: _Controlled(),
-    Law.EXOGENOUS: _Exogenous(),
-    Law.COMPARTMENT: _Compartment(),
-    Law.BATCH: _Batch(),
+    Law.DONOR: FlowLaw(lambda arc, network, _: network.node_index[arc.donor]),  # a·x_donor
+    Law.RECIPIENT: FlowLaw(lambda arc, network, _: network.node_index[arc.recipient]),  # a·x_recipient
+    Law.COMPARTMENT: FlowLaw(lambda arc, _, rows: rows.outputs[arc.by]),  # a·y, y the output of a model
+    Law.CONTROLLED: FlowLaw(_unit, lambda _: 1.0, scheduled=True),  # u, which the control sets
+    # e(t); of a series r is the mean over the interval, which ``FlowLaws.rate`` multiplies in
+    Law.EXOGENOUS: FlowLaw(_unit, lambda arc: 1.0 if arc.times else arc.flow[0], scheduled=True),
+    Law.BATCH: FlowLaw(_unit, lambda _: 0.0),  # nothing flows: what moves in batches moves at once
 }
 
 
@@ -118,12 +69,8 @@ class FlowLaws:
         self.network = network
         arcs = len(network.arcs)
         self.rows = rows = Rows(network)
-        self.incidence = RowSum(
-            np.concatenate([network.donors, network.recipients]),
-            np.tile(np.arange(arcs), 2),
-            np.repeat([-1.0, 1.0], arcs),
-            (rows.masses, arcs),
-        )
+        ends, twice = np.concatenate([network.donors, network.recipients]), np.tile(np.arange(arcs), 2)
+        self.incidence = RowSum(ends, twice, np.repeat([-1.0, 1.0], arcs), (rows.masses, arcs))
         laws = [LAWS[arc.law] for arc in network.arcs]
         self.scheduled = np.array([law.scheduled for law in laws], dtype=bool)
         drivers = [law.driver(arc, network, rows) for law, arc in zip(laws, network.arcs, strict=True)]
@@ -139,15 +86,11 @@ class FlowLaws:
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
 
     def rate(self, controls: Floats, step: Integers | None = None) -> Floats:
-        """Return r of each arc for given controls.
+        """Return r of each arc, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
 
         Args:
             controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
-            step: index of the control interval in each environment, shape (B,); picks the value of time series, which
-                without it count as 1.
-
-        Returns:
-            r, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
+            step: index of the control interval in each copy, shape (B,); without it time series count as 1.
         """
         if self._partial:  # some arc lacks a control: let a row of ones stand in for it
             controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
@@ -166,20 +109,16 @@ class FlowLaws:
 
     def extend(self, stock: Floats) -> Floats:
         """Append empty batch rows and the unit row to stocks of shape (nodes, B)."""
-        return np.concatenate(
-            [stock, np.zeros((len(self.rows.batch_names), stock.shape[1])), np.ones((1, stock.shape[1]))]
-        )
+        batch = stock.shape[1]
+        return np.concatenate([stock, np.zeros((len(self.rows.batch_names), batch)), np.ones((1, batch))])
 
     def _compile_controls(self) -> None:
         """Find for each arc the rows of the control array that act on it; the row past the last is 1."""
         network = self.network
         acting = [network.compartments[id_] for id_ in network.controllable]
         controls = [c.control for c in acting for _ in range(c.actions) if c.control is not None]
-        position = {
-            c.id: network.control_rows[c.id].start
-            for c in acting
-            if c.control is not None and c.control.kind is not ControlKind.INPUT
-        }
+        scaling = [c.id for c in acting if c.control is not None and c.control.kind is not ControlKind.INPUT]
+        position = {id_: network.control_rows[id_].start for id_ in scaling}
         none = len(controls)
         self.control_low: Floats = np.array([c.low for c in controls], dtype=float)
         self.control_high: Floats = np.array([c.high for c in controls], dtype=float)

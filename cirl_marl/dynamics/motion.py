@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from cirl_marl.dynamics.inner import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import MAX_STEPS, Law
 from cirl_marl.network.rowsum import RowSum, disposable
 
@@ -30,24 +32,18 @@ RUNGE_KUTTA = {"rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), "eul
 """Nodes and weights of the explicit schemes; each stage starts from the slope of the one before."""
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """What one control interval did.
+    """What one control interval did."""
 
-    Attributes:
-        stock: stocks after the interval with batch rows and unit row, shape (masses, B), mass.
-        inner: inner states of the models after the interval, shape (states, B).
-        moved: mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass.
-        flow: realised continuous flows at the end of the interval, shape (arcs, B), mass/time.
-        batched: m_fb of the interval, net batch mass moved finite-time sustainably at its start and at its end, not
-            through and through the environment, shape (2, 2, B), mass; None without batch arcs.
-    """
-
-    stock: Floats
-    inner: Floats
-    moved: Floats
-    flow: Floats
-    batched: Floats | None = None
+    stock: Annotated[Floats, "stocks after the interval with batch rows and unit row, shape (masses, B), mass"]
+    inner: Annotated[Floats, "inner states of the models after the interval, shape (states, B)"]
+    moved: Annotated[Floats, "mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass"]
+    flow: Annotated[Floats, "realised continuous flows at the end of the interval, shape (arcs, B), mass/time"]
+    batched: Annotated[
+        Floats | None, "m_fb of its start and of its end, as in ``Network.circularity``, shape (2, 2, B), mass, if any"
+    ] = None
 
 
 class Dynamics(FlowLaws):
@@ -75,10 +71,8 @@ class Dynamics(FlowLaws):
         episode = network.episode
         self.physical = episode.solver != "euler"
         self._exact = episode.solver == "exact"
-        stock_driven = self.driver < rows.nodes.stop
-        turnover = np.bincount(
-            self.driver[stock_driven], weights=self.max_rate[stock_driven], minlength=rows.nodes.stop
-        ).astype(float)
+        driven = self.driver < rows.nodes.stop  # by a stock
+        turnover = np.bincount(self.driver[driven], self.max_rate[driven], rows.nodes.stop).astype(float)
         fastest = float(turnover.max(initial=0.0))
         self._check_turnover(turnover)
         if self._exact:
@@ -90,7 +84,7 @@ class Dynamics(FlowLaws):
         self.terms = self._series_terms() if self._exact else 0
         self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
         shape = (rows.masses, len(network.arcs))
-        self._outgoing = RowSum(network.donors, np.arange(shape[1]), np.ones(shape[1]), shape)
+        self._outgoing = RowSum(network.donors, np.arange(shape[1]), 1.0, shape)
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._pulls = Law.RECIPIENT in laws
@@ -115,11 +109,7 @@ class Dynamics(FlowLaws):
         return k
 
     def _check_turnover(self, turnover: Floats) -> None:
-        """Refuse rates that the solver cannot follow.
-
-        Raises:
-            CirlError: naming the fastest node, its rate and the largest usable step.
-        """
+        """Refuse rates that the solver cannot follow, naming the fastest node, its rate and the largest usable step."""
         episode = self.network.episode
         if not self.physical or not len(turnover):
             return
@@ -131,14 +121,11 @@ class Dynamics(FlowLaws):
                 f"{where}; a control interval of {episode.control_interval:g} {self.network.time_unit} would need more "
                 f"than {MAX_STEPS:,} solver steps. Is a rate in the wrong unit?"
             )
-        if (
-            episode.solver == "rk4"
-            and episode.solver_step is not None
-            and turnover[node] * episode.solver_step > MAX_TURNOVER
-        ):
+        step = episode.solver_step or 0.0
+        if episode.solver == "rk4" and turnover[node] * step > MAX_TURNOVER:
             raise CirlError(
                 f"{where}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / turnover[node]:.4g} "
-                f"{self.network.time_unit}, not {episode.solver_step:g}"
+                f"{self.network.time_unit}, not {step:g}"
             )
 
     def _compile_orders(self) -> None:
@@ -150,25 +137,14 @@ class Dynamics(FlowLaws):
         slot = {int(node): i for i, node in enumerate(self._order_donors)}
         exits = [k for k, d in enumerate(network.donors) if int(d) in slot and network.arcs[k].law is Law.DONOR]
         exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
-        self._orders_and_exits = RowSum(
-            np.concatenate([order_slot, np.array(exit_slot, dtype=np.intp)]),
-            np.concatenate([self._order_arcs, np.array(exits, dtype=np.intp)]),
-            np.ones(len(self._order_arcs) + len(exits)),
-            (2 * len(slot), len(network.arcs)),
-        )
+        rows, columns = [*order_slot, *exit_slot], [*self._order_arcs, *exits]
+        self._orders_and_exits = RowSum(rows, columns, 1.0, (2 * len(slot), len(network.arcs)))
 
     def advance(self, stock: Floats, inner: Floats, controls: Floats, step: Integers | None = None) -> Transition:
-        """Hold ``controls`` for one control interval.
+        """Hold ``controls`` for one control interval; arguments are as in ``Transition`` and ``FlowLaws.rate``.
 
         In the physical mode scheduled flows are first cut to what their donor can deliver, so the realised flows may be
-        lower than those asked for.
-
-        Args:
-            stock: stocks with batch rows and unit row, shape (masses, B).
-            inner: inner states of the models, shape (states, B).
-            controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
-            step: index of the control interval in each environment, shape (B,); networks without time series and
-                batches need none.
+        lower than those asked for. Networks without time series and batches need no ``step``.
 
         Raises:
             CirlError: if ``step`` is missing though an arc needs it, or if a state is no longer a finite number, as the
@@ -312,15 +288,7 @@ class Dynamics(FlowLaws):
         Proportional and scheduled flows never overdraw. A recipient or a model that asks for more than there is gets
         its share: all outflows of the overdrawn node, and their rates, are scaled to the stock it started with. They
         are then settled, and the others follow from them, lest the recipient passes on what it did not get. Each pass
-        settles at least one more node.
-
-        Args:
-            stock: stocks at the start of the substep, shape (masses, B).
-            rate: rates of the flows, shape (arcs, B).
-            passing: what moves at given rates.
-
-        Returns:
-            Stocks at the end, mass moved, and the rates realised.
+        settles at least one more node. Returned are the stocks at the end, the mass moved, and the rates realised.
         """
         moved = passing(rate)
         after = self.incidence.add_to(stock.copy(), moved)

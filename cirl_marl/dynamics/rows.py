@@ -7,46 +7,34 @@ drives scheduled flows; the outputs of models follow it where flows are computed
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Law, Role
+from cirl_marl.network.rowsum import spans
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One batch arc and its rows.
+    """One batch arc and its rows."""
 
-    Attributes:
-        id: the arc.
-        by: compartment whose model releases batches; empty for a schedule.
-        port: what it releases into this arc.
-        unit: mass per unit released.
-        donor: row of the node that gives.
-        recipient: row of the node that receives.
-        collecting: row of the batch that is being put together.
-        packed: row of complete batches that wait for the vehicle; None without a vehicle.
-        first: first row of the slots, or the row of what is aboard.
-        slots: number of slots; 0 with a vehicle.
-        leaves: weight with which mass that leaves the donor counts in m_fb.
-        arrives: weight with which mass that reaches the recipient counts in m_fb.
-        part: part of m_fb in which it counts, 1 if the arc touches the environment, else 0.
-    """
-
-    id: str
-    by: str
-    port: str
-    unit: float
-    donor: int
-    recipient: int
-    collecting: int
-    packed: int | None
-    first: int
-    slots: int
-    leaves: float
-    arrives: float
-    part: int
+    id: Annotated[str, "the arc"]
+    by: Annotated[str, "compartment whose model releases batches; empty for a schedule"]
+    port: Annotated[str, "what it releases into this arc"]
+    unit: Annotated[float, "mass per unit released"]
+    donor: Annotated[int, "row of the node that gives"]
+    recipient: Annotated[int, "row of the node that receives"]
+    collecting: Annotated[int, "row of the batch that is being put together"]
+    packed: Annotated[int | None, "row of complete batches that wait for the vehicle; None without a vehicle"]
+    first: Annotated[int, "first row of the slots, or the row of what is aboard"]
+    slots: Annotated[int, "number of slots; 0 with a vehicle"]
+    leaves: Annotated[float, "weight with which mass that leaves the donor counts in m_fb"]
+    arrives: Annotated[float, "weight with which mass that reaches the recipient counts in m_fb"]
+    part: Annotated[int, "part of m_fb in which it counts, 1 if the arc touches the environment, else 0"]
 
     @property
     def rows(self) -> range:
@@ -90,10 +78,7 @@ class Rows:
         self.owners = tuple(models)
         self.state_names = tuple(f"{owner}.{name}" for owner, model in models.items() for name in model.state_names)
         self.start_names = (*network.node_index, *self.state_names)
-        self.states: dict[str, slice] = {}
-        first = 0
-        for owner, model in models.items():
-            self.states[owner] = slice(first, first := first + len(model.state_names))
+        self.states = dict(zip(models, spans(len(model.state_names) for model in models.values()), strict=True))
         self.outputs = {owner: self.masses + i for i, owner in enumerate(self.owners)}
 
     def start_of(self, masses: Floats, inner: Floats) -> Floats:

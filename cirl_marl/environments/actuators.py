@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.rowsum import spans
 
 BOUND = 1.0 + 1e-6
 """Largest action taken: wrappers that rescale actions do so in single precision and may land a rounding beyond 1."""
@@ -27,17 +28,12 @@ class Actuators:
     """
 
     def __init__(self, laws: FlowLaws, agents: Sequence[str] | None, num_envs: int) -> None:
-        """Let ``agents`` act, None being the network's own choice.
-
-        Raises:
-            CirlError: if one of them is unknown or named twice.
-        """
+        """Let ``agents`` act, None being the network's own choice; a ``CirlError`` names one unknown or named twice."""
         network = laws.network
         self.agents = _checked(network, agents)
         self.num_envs = num_envs
         rows = {agent: network.control_rows[agent] for agent in self.agents}
-        edges = np.cumsum([0, *(each.stop - each.start for each in rows.values())]).tolist()
-        self.entries = {agent: slice(edges[i], edges[i + 1]) for i, agent in enumerate(self.agents)}
+        self.entries = dict(zip(rows, spans(each.stop - each.start for each in rows.values()), strict=True))
         acting = [row for each in rows.values() for row in range(each.start, each.stop)]
         self.acting: Integers = np.array(acting, dtype=np.intp)
         self.spaces = {a: Box(-1.0, 1.0, (each.stop - each.start,), np.float32) for a, each in rows.items()}
@@ -80,11 +76,7 @@ class Actuators:
         return {agent: actions[entries].T for agent, entries in self.entries.items()}
 
     def controls(self, actions: Floats) -> Floats:
-        """Map stacked actions, shape (entries, B), to the physical values of every control, shape (controls, B).
-
-        Raises:
-            ControlError: for NaN or values outside [−1, 1].
-        """
+        """Map stacked actions, (entries, B), to physical values of every control, (controls, B), or refuse them."""
         if not (actions.max(initial=0.0) <= BOUND and actions.min(initial=0.0) >= -BOUND):
             raise ControlError(self._wrong_values(actions))
         acting = actions * self._half

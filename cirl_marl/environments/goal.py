@@ -46,22 +46,20 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         self.agent = self.flat.agent
         model = self.flat.network.compartments[self.agent].model
         names = [name.split(".")[-1] for name in self.flat.parallel.layout.names[self.agent]]
-        wanted: tuple[tuple[str, ...], ...] = ()
-        if isinstance(model, GoalTask):
-            self._task, wanted = model, (model.observation_names, model.achieved_names, model.desired_names)
-        if not wanted or any(name not in names for part in wanted for name in part):
-            raise CirlError(f"agent '{self.agent}' of '{self.flat.network.name}' has no goals to observe")
-        reward = options.get("reward") or self.flat.network.objective.reward
+        who = f"agent '{self.agent}' of '{self.network.name}'"
+        if not isinstance(model, GoalTask):
+            raise CirlError(f"{who} has no goals to observe")
+        self._task, wanted = model, (model.observation_names, model.achieved_names, model.desired_names)
+        if not set().union(*wanted) <= set(names):
+            raise CirlError(f"{who} has no goals to observe")
+        reward = options.get("reward") or self.network.objective.reward
         if reward != "local":  # hindsight would learn from two rewards that disagree
             raise CirlError(f"agent '{self.agent}': a function of the goals is the reward 'local', not '{reward}'")
         if more := list(_beside_the_goals(self.flat.network, self.agent)):
-            raise CirlError(
-                f"agent '{self.agent}' of '{self.flat.network.name}': its local reward is no function of the goals "
-                f"alone, as it also contains {' and '.join(more)}"
-            )
-        self._parts = {
-            part: np.array([names.index(name) for name in entries]) for part, entries in zip(PARTS, wanted, strict=True)
-        }
+            beside = " and ".join(more)
+            raise CirlError(f"{who}: its local reward is no function of the goals alone, as it also contains {beside}")
+        rows = [np.array([names.index(name) for name in entries]) for entries in wanted]
+        self._parts = dict(zip(PARTS, rows, strict=True))
         box = self.flat.observation_space
         assert isinstance(box, spaces.Box)
         self.observation_space: spaces.Space[Any] = spaces.Dict(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -13,72 +12,30 @@ from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import OBSERVE, Arc
+from cirl_marl.network.rowsum import spans
 
 
-@dataclass(frozen=True, slots=True)
 class Signals:
     """Rows of the signal table: quantities, time, service levels, set-points of nodes and arcs.
 
     The quantities are stocks, flows, inner states, measures and masses on the way along batch arcs. Stocks, flows,
     masses on the way and set-points are divided by the scale of their compartment (what a batch arc delivers in a
     control interval too), time by the horizon.
+
+    Attributes:
+        quantities: number of quantities.
+        time: row of the time.
+        rows: number of rows.
     """
 
-    nodes: int
-    arcs: int
-    inner: int
-    measured: int
-    batch_arcs: int
-    services: int
-
-    @property
-    def quantities(self) -> int:
-        """Number of quantities."""
-        return self.nodes + self.arcs + self.inner + self.measured + self.batch_arcs
-
-    @property
-    def flows(self) -> slice:
-        """Rows of the mean flows."""
-        return slice(self.nodes, self.nodes + self.arcs)
-
-    @property
-    def states(self) -> slice:
-        """Rows of the inner states."""
-        return slice(self.flows.stop, self.flows.stop + self.inner)
-
-    @property
-    def measures(self) -> slice:
-        """Rows of what the models measure."""
-        return slice(self.states.stop, self.states.stop + self.measured)
-
-    @property
-    def loads(self) -> slice:
-        """Rows of the masses on batch arcs."""
-        return slice(self.measures.stop, self.measures.stop + self.batch_arcs)
-
-    @property
-    def inside(self) -> bool:
-        """Whether there are quantities besides stocks and flows."""
-        return self.inner + self.measured + self.batch_arcs > 0
-
-    @property
-    def time(self) -> int:
-        """Row of the time."""
-        return self.quantities
-
-    @property
-    def levels(self) -> slice:
-        """Rows of the service levels."""
-        return slice(self.quantities + 1, self.quantities + 1 + self.services)
-
-    def set_point(self, compartment: int) -> int:
-        """Row of the set-point of a compartment, nodes counted first."""
-        return self.quantities + 1 + self.services + compartment
-
-    @property
-    def rows(self) -> int:
-        """Number of rows."""
-        return self.set_point(self.nodes + self.arcs)
+    def __init__(self, dynamics: Dynamics) -> None:
+        """Lay out the signals of a network."""
+        network, inner, nodes = dynamics.network, dynamics.inner, dynamics.rows.nodes.stop
+        arcs, lines, services = len(network.arcs), len(dynamics.batches.lines), len(network.services)
+        parts = spans((nodes, arcs, len(inner.names), len(inner.measure_names), lines, 1, services, nodes + arcs))
+        self.nodes, self.flows, self.states, self.measures, self.loads, time, self.levels, self.set_points = parts
+        self.quantities, self.time, self.rows = self.loads.stop, time.start, self.set_points.stop
+        self.inside = self.quantities > self.flows.stop  # whether there are quantities besides stocks and flows
 
 
 class ObservationLayout:
@@ -103,16 +60,8 @@ class ObservationLayout:
         for agent in agents:
             if mode == "model" and network.compartments[agent].model is None:
                 raise CirlError(f"observe: mode 'model' needs a model, and '{agent}' of '{network.name}' has none")
-        inner = dynamics.inner
-        batches = dynamics.batches
-        self.signals = signals = Signals(
-            nodes=dynamics.rows.nodes.stop,
-            arcs=len(network.arcs),
-            inner=len(inner.names),
-            measured=len(inner.measure_names),
-            batch_arcs=len(batches.lines),
-            services=len(network.services),
-        )
+        inner, batches = dynamics.inner, dynamics.batches
+        self.signals = signals = Signals(dynamics)
         first = signals.states.start
         self._inner = {owner: [first + row for row in rows] for owner, rows in inner.observed.items()}
         self._measures = inner.measure_names
@@ -123,41 +72,35 @@ class ObservationLayout:
         self._observed = {**network.node_index, **{name: first + i for i, name in enumerate(inner.names)}}
         self._network = network
         self._incident = _incident_arcs(network)
-        self._names = list(self._signal_names((*inner.names, *inner.measure_names)))
-        compartments = [c.id for c in (*network.nodes, *network.arcs)]
-        self._position = {id_: i for i, id_ in enumerate(compartments)}
+        names = list(self._signal_names((*inner.names, *inner.measure_names)))
+        self._position = {id_: i for i, id_ in enumerate(network.compartments)}
         self._debts: dict[str, list[int]] = {}
-        for row, service in zip(range(*self.signals.levels.indices(10**9)), network.services, strict=True):
+        for row, service in enumerate(network.services, signals.levels.start):
             for debtor in service.debtors:
                 self._debts.setdefault(debtor, []).append(row)
         rows = [list(dict.fromkeys(self._rows(agent, mode))) for agent in agents]
         self._index: Integers = np.array([row for seen in rows for row in seen], dtype=np.intp)
-        edges = np.cumsum([0, *(len(seen) for seen in rows)]).tolist()
-        self.slices = {a: slice(edges[i], edges[i + 1]) for i, a in enumerate(agents)}
+        self.slices = dict(zip(agents, spans(map(len, rows)), strict=True))
         low, high = self._bounds(dynamics)
-        self.spaces = {
-            agent: Box(low[seen], high[seen], dtype=np.float32) for agent, seen in zip(agents, rows, strict=True)
-        }
-        self.names = {agent: tuple(self._names[row] for row in seen) for agent, seen in zip(agents, rows, strict=True)}
+        by_agent = dict(zip(agents, rows, strict=True))
+        self.spaces = {agent: Box(low[seen], high[seen], dtype=np.float32) for agent, seen in by_agent.items()}
+        self.names = {agent: tuple(names[row] for row in seen) for agent, seen in by_agent.items()}
         self.array_order = self._common_order(agents, mode)
-        scales = np.array([c.scale for c in (*network.nodes, *network.arcs)])
-        inside = np.ones(signals.inner + signals.measured)
-        inverse_scale = 1.0 / np.concatenate([scales, inside, scales[signals.nodes :][batches.arcs]])
+        scales = np.array([c.scale for c in network.compartments.values()])
+        inside = np.ones(signals.loads.start - signals.states.start)
+        inverse_scale = 1.0 / np.concatenate([scales, inside, scales[signals.flows][batches.arcs]])
         inverse_scale[signals.flows][batches.arcs] *= network.episode.control_interval
-        self._inverse_scale = np.repeat(
-            inverse_scale[:, None], batch, axis=1
-        )  # equal shapes are faster than a broadcast
-        set_points = np.array([c.set_point or 0.0 for c in (*network.nodes, *network.arcs)]) / scales
-        self._table = np.zeros((self.signals.rows, batch), dtype=np.float32)
-        self._table[self.signals.set_point(0) :] = set_points[:, None]
+        # equal shapes are faster than a broadcast
+        self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
+        set_points = np.array([c.set_point or 0.0 for c in network.compartments.values()]) / scales
+        self._table = np.zeros((signals.rows, batch), dtype=np.float32)
+        self._table[signals.set_points] = set_points[:, None]
 
     def observe(self, quantities: Floats, time: Floats, levels: Floats) -> NDArray[np.float32]:
         """Return the stacked observation, shape (entries of all agents, B).
 
-        Args:
-            quantities: shape (quantities, B); see ``Signals``.
-            time: elapsed share of the episode, shape (B,).
-            levels: service levels, shape (services, B).
+        It follows from the quantities of ``Signals``, shape (quantities, B), the elapsed share of the episode, shape
+        (B,), and the service levels, shape (services, B).
         """
         table = self._table
         with np.errstate(over="ignore"):
@@ -169,16 +112,14 @@ class ObservationLayout:
     def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:
         if mode == "stocks":
             return self._network.observation.nodes
-        known = set(self._observed)
-        if mode == "model" and len(agents) == 1 and known.issuperset(self.names[agents[0]]):
+        if mode == "model" and len(agents) == 1 and self._observed.keys() >= set(self.names[agents[0]]):
             return self.names[agents[0]]
         return ()
 
     def row(self, compartment: str, quantity: str, measure: str = "") -> int:
         """Return the row of a compartment's ``stock``, ``flow`` or ``measure`` among the quantities."""
         if quantity == "measure":
-            first: int = self.signals.measures.start
-            return first + self._measures.index(f"{compartment}.{measure}")
+            return int(self.signals.measures.start) + self._measures.index(f"{compartment}.{measure}")
         rows = self._load if quantity == "stock" and compartment in self._load else self._position
         return rows[compartment]
 
@@ -197,21 +138,20 @@ class ObservationLayout:
         if agent in self._load:
             yield self._load[agent]
         if not isinstance(compartment, Arc):
-            arcs = self._incident[own]
-            neighbours = self._across(own)
+            arcs, neighbours = self._incident[own], self._across(own)
         else:
             ends = [network.node_index[compartment.donor], network.node_index[compartment.recipient]]
             yield from ends
             arcs = [k for end in ends for k in self._incident[end]] if mode == "neighbours" else []
             neighbours = [node for end in ends for node in self._across(end)]
-        yield from (signals.nodes + k for k in arcs)
+        yield from (signals.flows.start + k for k in arcs)
         yield from (self._load[network.arcs[k].id] for k in arcs if network.arcs[k].id in self._load)
         if mode == "neighbours":
             yield from neighbours
         if mode == "full":
             yield from (row for row in range(signals.quantities) if row not in self._hidden)
         if compartment.set_point is not None:
-            yield signals.set_point(own)
+            yield signals.set_points.start + own
         if mode == "full":
             yield from range(signals.levels.start, signals.levels.stop)
         yield from self._debts.get(agent, [])
@@ -230,15 +170,15 @@ class ObservationLayout:
         yield from (f"mass on {arc}" for arc in self._load)
         yield "time"
         yield from (f"service level of {service.id}" for service in network.services)
-        yield from (f"set-point of {c.id}" for c in (*network.nodes, *network.arcs))
+        yield from (f"set-point of {id_}" for id_ in network.compartments)
 
     def _bounds(self, dynamics: Dynamics) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Bounds that conservation gives: no stock exceeds all the mass there is, no flow what that mass can drive."""
         network, signals = self._network, self.signals
-        compartments = (*network.nodes, *network.arcs)
+        compartments = network.compartments.values()
         scales = np.array([c.scale for c in compartments])
         low, high = np.zeros(signals.rows), np.ones(signals.rows)
-        known = signals.nodes + signals.arcs
+        known = signals.flows.stop
         low[:known], high[:known] = -np.inf, np.inf
         if dynamics.physical:
             mass = sum(node.initial[1] for node in network.nodes)
@@ -246,13 +186,12 @@ class ObservationLayout:
             drive[dynamics.driver > dynamics.rows.unit] = np.inf
             flows = drive * dynamics.max_rate
             flows[dynamics.batches.arcs] = mass
-            limits = np.concatenate([np.full(signals.nodes, mass), flows]) / scales
+            limits = np.concatenate([np.full(signals.nodes.stop, mass), flows]) / scales
             low[:known], high[:known] = 0.0, limits * (1 + 1e-6) + 1e-6
         low[known : signals.quantities], high[known : signals.quantities] = -np.inf, np.inf
         low[signals.loads] = 0.0
         set_points = np.abs([c.set_point or 0.0 for c in compartments]) / scales
-        low[signals.set_point(0) :] = -set_points - 1
-        high[signals.set_point(0) :] = set_points + 1
+        low[signals.set_points], high[signals.set_points] = -set_points - 1, set_points + 1
         return low.astype(np.float32), high.astype(np.float32)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,20 @@ from pettingzoo.utils import conversions
 
 from cirl_marl.environments.actuators import wrong_shape
 from cirl_marl.environments.state import Outcome, Snapshot
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
 
 RENDER_MODES = ("rgb_array", "human")
+_Seen = dict[str, NDArray[np.float32]]
 OPTIONS = ("observe", "circularity", "circularity_weight", "horizon")
+
+
+def check_options(options: Iterable[str], known: Sequence[str], *named: str) -> None:
+    """Refuse options that are not ``known``; ``named`` are those that are arguments of their own."""
+    for option in options:
+        if option not in known:
+            raise CirlError(unknown("option", option, (*known, *named)))
 
 
 class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
@@ -56,9 +64,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         **options: Any,
     ) -> None:
         """Make the environment; ``options`` and errors are those of ``VectorEnv``."""
-        for option in options:
-            if option not in OPTIONS:
-                raise CirlError(unknown("option", option, (*OPTIONS, "scenario", "agents", "reward", "render_mode")))
+        check_options(options, OPTIONS, "scenario", "agents", "reward", "render_mode")
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise CirlError(unknown("render_mode", render_mode, RENDER_MODES))
         self.batch = VectorEnv(network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options)
@@ -90,9 +96,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         """The action of each agent that leaves it neutral."""
         return {agent: action.astype(np.float32) for agent, action in self.batch.neutral_action.items()}
 
-    def reset(
-        self, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[_Seen, Infos]:
         """Start an episode; ``options={"initial_state": {node: stock}}`` starts it from a given state."""
         observation = self.batch.reset(seed, options)
         self.agents = list(self.possible_agents)
@@ -102,13 +106,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
     def step(
         self, actions: Mapping[str, ArrayLike]
-    ) -> tuple[
-        dict[str, NDArray[np.float32]],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
-    ]:
+    ) -> tuple[_Seen, dict[str, float], dict[str, bool], dict[str, bool], Infos]:
         """Hold one action per agent, each in its Box(−1, 1), for one control interval.
 
         Raises:
@@ -125,8 +123,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             self.agents = []
         if self.render_mode == "human":
             self.render()
-        seen = outcome.observation[:, 0]
-        slices = self.layout.slices
+        seen, slices = outcome.observation[:, 0], self.layout.slices
         return (
             {agent: seen[slices[agent]] for agent in agents},
             dict(zip(agents, outcome.reward[:, 0].tolist(), strict=True)),
@@ -148,7 +145,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         """Return a copy of the whole environment state, random streams included."""
         return self.batch.snapshot()
 
-    def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
+    def restore(self, snapshot: Snapshot) -> _Seen:
         """Go back to a snapshot and return the observations there."""
         observation = self.batch.restore(snapshot)
         over = int(self.batch.physical.step[0]) >= self.network.episode.horizon
@@ -156,15 +153,9 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         return {agent: seen[0] for agent, seen in observation.items()}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``.
-
-        Raises:
-            CirlError: if the environment was made without a ``render_mode``.
-        """
+        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``."""
         if self.render_mode is None:
-            raise CirlError(
-                f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when making the environment"
-            )
+            raise CirlError(f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when it is made")
         from cirl_marl.drawing.digraph import Canvas
 
         if self._canvas is None:
@@ -190,11 +181,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             stacked = np.array([actions[agent] for agent in self.possible_agents])
         except (KeyError, ValueError):
             stacked = np.empty(0)
-        if (
-            stacked.dtype.kind not in "biuf"
-            or stacked.shape != (self._entries, 1)
-            or len(actions) != len(self.possible_agents)
-        ):
+        fits = stacked.shape == (self._entries, 1) and len(actions) == len(self.possible_agents)
+        if not fits or stacked.dtype.kind not in "biuf":
             return self.batch.stack({agent: self._checked(agent, action)[None] for agent, action in actions.items()})
         return stacked
 
@@ -205,16 +193,11 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             raise ControlError(wrong_shape(agent, found.shape, space.shape))
         return found
 
-    def _infos(self, outcome: Outcome) -> dict[str, dict[str, Any]]:
+    def _infos(self, outcome: Outcome) -> Infos:
         circularity, service = float(outcome.circularity[0]), float(outcome.service_level[0])
         flows = outcome.flow[:, 0]
-        infos: dict[str, dict[str, Any]] = {
-            agent: {
-                "circularity": circularity,
-                "local_reward": local,
-                "flows": flows,
-                "service_level": service,
-            }
+        infos: Infos = {
+            agent: {"circularity": circularity, "local_reward": local, "flows": flows, "service_level": service}
             for agent, local in zip(self.possible_agents, outcome.local[:, 0].tolist(), strict=True)
         }
         for agent, success in outcome.success.items():
@@ -224,12 +207,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
 
 def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParallelEnv:
-    """Return the network as a PettingZoo ParallelEnv.
-
-    Args:
-        network: catalogue name, path of a definition file, or a network.
-        **options: ``scenario``, ``agents``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``,
-            ``horizon``, ``render_mode``.
+    """Return the network as a PettingZoo ParallelEnv; options are those of ``VectorEnv``, and ``render_mode``.
 
     >>> env = parallel_env("copper_net", agents=["mine", "use_to_collection"])
     >>> observations, infos = env.reset(seed=0)
@@ -252,8 +230,5 @@ def vector_env(network: str | Path | Network, num_envs: int = 64, **options: Any
     >>> env.reset(seed=0)["mine"].shape
     (3, 4)
     """
-    known = ("scenario", "agents", "reward", *OPTIONS)
-    for option in options:
-        if option not in known:
-            raise CirlError(unknown("option", option, known))
+    check_options(options, (*OPTIONS, "scenario", "agents", "reward"))
     return VectorEnv(network, num_envs=num_envs, **options)

@@ -24,8 +24,5 @@ def register() -> None:
     for id_, (network, agent, scenario) in PAPER_ENVIRONMENTS.items():
         if id_ not in gymnasium.registry:
             kind = "goal:GoalEnv" if id_ in GOAL_TASKS else "single:SingleAgentEnv"
-            gymnasium.register(
-                id_,
-                entry_point=f"cirl_marl.environments.{kind}",
-                kwargs={"network": network, "agent": agent, "scenario": scenario},
-            )
+            arguments = {"network": network, "agent": agent, "scenario": scenario}
+            gymnasium.register(id_, entry_point=f"cirl_marl.environments.{kind}", kwargs=arguments)

@@ -35,9 +35,8 @@ class Credit:
 
     def __init__(self, dynamics: Dynamics, scoring: Scoring, agents: Sequence[str], mode: str, measure: str) -> None:
         """Pay ``agents`` by ``mode``; ``measure`` is ``end`` or ``mean``."""
-        self.mode = mode
+        self.mode, self._measure = mode, measure
         self._dynamics, self._scoring, self._agents = dynamics, scoring, tuple(agents)
-        self._measure = measure
         objective = dynamics.network.objective
         self._rest = 1.0 - objective.circularity_weight
         self._per_mass = objective.circularity_weight / objective.circularity_scale
@@ -59,14 +58,8 @@ class Credit:
     ) -> Floats:
         """Return the reward of each agent, shape (agents, B).
 
-        Args:
-            end: λ at the end of the interval, shape (B,), mass.
-            mean: its mean over the interval, shape (B,), mass.
-            local: local rewards, shape (agents, B).
-            terms: what local rewards consist of (``Scoring.terms``), shape (terms, B).
-            levels: of the services, shape (services, B).
-            state: at the start of the interval.
-            controls: during it, shape (controls, B).
+        It may follow from λ at the ``end`` of the interval and its ``mean`` over it, what ``Scoring`` gives (``local``,
+        ``terms``, ``levels``), the ``state`` at the start and the ``controls`` since.
 
         Raises:
             CirlError: if the solver cannot follow what would have been, had an agent been neutral; names the agent.
@@ -97,18 +90,12 @@ class Credit:
         return np.concatenate(results) if results else np.empty((0, controls.shape[1]))
 
     def _with_neutral(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
-        """λ had each of ``agents`` in turn been neutral, all in one batch, shape (agents, B).
-
-        Raises:
-            CirlError: if a re-simulated state is no longer a finite number; names the agent.
-        """
+        """λ had each of ``agents`` in turn been neutral, all in one batch, shape (agents, B); errors name the agent."""
         try:
             return self._imagined(agents, state, controls)
         except CirlError as error:
             if len(agents) == 1:
-                raise CirlError(
-                    f"with agent '{agents[0]}' neutral, as difference rewards imagine it: {error}"
-                ) from error
+                raise CirlError(f"with agent '{agents[0]}' neutral, for difference rewards: {error}") from error
         return np.concatenate([self._with_neutral([agent], state, controls) for agent in agents])
 
     def _imagined(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
@@ -118,10 +105,7 @@ class Credit:
             rows = dynamics.network.control_rows[agent]
             imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows, None]
         transition = dynamics.advance(
-            np.tile(state.stock, (1, count)),
-            np.tile(state.inner, (1, count)),
-            imagined,
-            np.tile(state.step, count),
+            np.tile(state.stock, (1, count)), np.tile(state.inner, (1, count)), imagined, np.tile(state.step, count)
         )
         imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
         flow = transition.moved / dynamics.network.episode.control_interval

@@ -54,12 +54,9 @@ class Scoring:
         sums = self._everyone.column_sums()
         counted = np.flatnonzero(sums)
         self._all = RowSum(np.zeros(len(counted), dtype=np.intp), counted, sums[counted], (1, terms))
-        self._weighted_shortfall = RowSum(
-            [0] * len(services), range(len(services)), [s.weight for s in services], (1, len(services))
-        )
-        self._sum_of_levels = RowSum(
-            [0] * len(services), range(len(services)), [1.0] * len(services), (1, len(services))
-        )
+        every, shape = range(len(services)), (1, len(services))
+        self._weighted_shortfall = RowSum([0] * len(services), every, [s.weight for s in services], shape)
+        self._sum_of_levels = RowSum([0] * len(services), every, 1.0, shape)
 
     def levels(self, quantities: Floats) -> Floats:
         """Return the level of each service in [0, 1], shape (services, B)."""
@@ -120,4 +117,4 @@ def _measurement(network: Network, layout: ObservationLayout) -> RowSum:
             read = [layout.row(service.provider, service.quantity, service.measure)]
         rows += [row] * len(read)
         columns += read
-    return RowSum(rows, columns, np.ones(len(rows)), (len(network.services), layout.signals.quantities))
+    return RowSum(rows, columns, 1.0, (len(network.services), layout.signals.quantities))

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.parallel import OPTIONS, NetworkParallelEnv
+from cirl_marl.environments.parallel import OPTIONS, NetworkParallelEnv, check_options
 from cirl_marl.environments.state import Snapshot
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 
 SHARED = ("reward", "render_mode")
@@ -60,10 +60,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if "agents" in options:
             raise CirlError("a single-agent environment takes agent=, not agents=")
-        for option in options:
-            if option not in (*OPTIONS, *SHARED):
-                own = ("agent", "scenario", "legacy_episode")
-                raise CirlError(unknown("option", option, (*OPTIONS, *own, *SHARED)))
+        check_options(options, (*OPTIONS, *SHARED), "agent", "scenario", "legacy_episode")
         if not isinstance(agent, str | None):
             raise CirlError(f"agent must be the name of one agent, got {agent!r}")
         chosen = None if agent is None else [agent]
@@ -71,13 +68,10 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         scenario = _scenario_of(found, scenario, agent)
         self.parallel = NetworkParallelEnv(found, scenario=scenario, agents=chosen, **options)
         if len(self.parallel.possible_agents) != 1:
-            raise CirlError(
-                f"network '{self.parallel.network.name}' has several agents: "
-                f"give agent=, one of {', '.join(self.parallel.possible_agents)}"
-            )
+            several = ", ".join(self.parallel.possible_agents)
+            raise CirlError(f"network '{self.network.name}' has several agents: give agent=, one of {several}")
         self.agent = self.parallel.possible_agents[0]
-        self._legacy = legacy_episode
-        self._elapsed = 0
+        self._legacy, self._elapsed = legacy_episode, 0
         self.render_mode = self.parallel.render_mode
         self.observation_space = self.parallel.observation_space(self.agent)
         self.action_space = self.parallel.action_space(self.agent)
@@ -107,8 +101,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._elapsed += 1
         observations, rewards, terminations, truncations, infos = self.parallel.step({self.agent: action})
         info = {**infos[self.agent], "state": self._paper_state()}
-        agent = self.agent
-        truncated = truncations[agent] and not self._legacy
+        agent, truncated = self.agent, truncations[self.agent] and not self._legacy
         return observations[agent], rewards[agent], terminations[agent] or over, truncated, info
 
     def snapshot(self) -> Snapshot:
@@ -137,15 +130,10 @@ def _scenario_of(network: Network, scenario: str | None, agent: str | None) -> s
     """Return ``scenario`` or, if there is none of that name, the ``scenario_…`` in which ``agent`` alone acts."""
     if scenario is None or scenario == network.scenario_name or scenario in network.scenarios:
         return scenario
-    fitting = [
-        name
-        for name, other in network.scenarios.items()
-        if name.startswith(f"{scenario}_") and agent is not None and other.acting == (agent,)
-    ]
+    alone = [name for name, other in network.scenarios.items() if other.acting == (agent,)]
+    fitting = [name for name in alone if name.startswith(f"{scenario}_")]
     if len(fitting) > 1:
-        raise CirlError(
-            f"network '{network.name}': agent '{agent}' has the scenarios {', '.join(fitting)}: give one of them"
-        )
+        raise CirlError(f"network '{network.name}': '{agent}' has scenarios {', '.join(fitting)}: give one of them")
     return fitting[0] if fitting else scenario
 
 

@@ -24,40 +24,28 @@ class Starts:
     """
 
     def __init__(self, network: Network, dynamics: Dynamics, num_envs: int, order: Sequence[str]) -> None:
-        """Compile the initial ranges; the streams are seeded from the operating system.
+        """Compile the initial ranges of B = ``num_envs`` copies; the streams are seeded from the operating system.
 
-        Args:
-            network: whose starts they are.
-            dynamics: its compiled dynamics.
-            num_envs: B.
-            order: names of the rows that an array of initial values gives; empty if only mappings are taken.
+        ``order`` names the rows that an array of initial values gives; it is empty if only mappings are taken.
         """
-        inner = dynamics.inner
+        inner, nodes = dynamics.inner, dynamics.rows.nodes.stop
         self.names = dynamics.rows.start_names
         self._rows = {name: row for row, name in enumerate(self.names)}
         self.streams = [np.random.default_rng() for _ in range(num_envs)]
-        self._network = network
-        self._bounds = _bounds(network)
-        self._wholes = _wholes(network)
+        self._network, self._bounds, self._wholes = network, _bounds(network), _wholes(network)
         inseparable = {name for names in self._wholes.values() for name in names}
         self._array_order = () if inseparable & set(order) else tuple(order)
-        self._physical = dynamics.physical
-        nodes = dynamics.rows.nodes.stop
-        self._nodes, self._inner = dynamics.rows.nodes, inner
+        self._physical, self._nodes, self._inner = dynamics.physical, dynamics.rows.nodes, inner
         self._ranged = np.concatenate([np.arange(nodes), nodes + inner.ranged])
         self._own = np.setdiff1d(np.arange(len(self.names)), self._ranged)
         self._low = np.concatenate([[node.initial[0] for node in network.nodes], inner.low])
         self._width = np.concatenate([[node.initial[1] for node in network.nodes], inner.high]) - self._low
 
     def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
-        """Return the state in which every copy starts, shape (rows, B); see ``VectorEnv.reset``.
-
-        Raises:
-            ControlError: for a seed, option or state that cannot be used; the streams are left as they were.
-        """
+        """Return the state in which every copy starts, shape (rows, B); see ``VectorEnv.reset``."""
         streams = self.streams if seed is None else self._seeded(seed)
         given = self._given({} if options is None else options)
-        self.streams = streams
+        self.streams = streams  # not before, so that what is refused changes nothing
         drawn = self.draw(range(len(streams)))
         for row, values in given.items():
             drawn[row] = values
@@ -119,7 +107,10 @@ class Starts:
                     + (f", or the values of {', '.join(names)} in this order" if names else "")
                 )
             given = dict(zip(names, values, strict=True))
-        checked = {self._row(id_): self._initial(id_, values) for id_, values in given.items()}
+        for id_ in given:
+            if id_ not in self._rows:
+                raise ControlError(f"initial_state: {unknown('node or inner state', id_, self.names)}")
+        checked = {self._rows[id_]: self._initial(id_, values) for id_, values in given.items()}
         for owner, whole in self._wholes.items():
             named = [name for name in whole if name in given]
             if named and len(named) < len(whole):
@@ -139,17 +130,10 @@ class Starts:
                 )
         return checked
 
-    def _row(self, id_: str) -> int:
-        if id_ not in self._rows:
-            raise ControlError(f"initial_state: {unknown('node or inner state', id_, self.names)}")
-        return self._rows[id_]
-
     def _initial(self, id_: str, values: ArrayLike) -> Floats:
         stock = _numbers(f"initial_state of '{id_}'", values)
         if stock.shape not in ((), (len(self.streams),)):
-            raise ControlError(
-                f"initial_state of '{id_}' has shape {stock.shape}, expected () or {(len(self.streams),)}"
-            )
+            raise ControlError(f"initial_state of '{id_}' has shape {stock.shape}, not () or {(len(self.streams),)}")
         is_stock = self._physical and id_ in self._network.node_index
         if not np.isfinite(stock).all() or (is_stock and (stock < 0).any()):
             raise ControlError(f"initial_state of '{id_}' is {values!r}: stocks are finite and not negative")

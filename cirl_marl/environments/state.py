@@ -4,39 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declared import itemised
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class State:
-    """The physical state of B environments, from which their observations follow, and the sums that an episode reports.
+    """The physical state of B environments, which observations follow from, and the sums that an episode reports."""
 
-    Attributes:
-        stock: masses of nodes, then of batch arcs, then the unit row, shape (rows, B), mass.
-        inner: inner states of the compartments' models, shape (states, B).
-        flow: mean flows of the last control interval, shape (arcs, B), mass/time.
-        measures: what the models measured at its end, under its controls, shape (measures, B).
-        step: control intervals done, shape (B,).
-        batched: m_fb, net batch mass moved finite-time sustainably in this episode, not through and through the
-            environment, shape (2, B), mass.
-        circularity: sum over the episode of the interval means of λ, shape (B,), mass.
-        service: sum over the episode of the service level, shape (B,).
-    """
-
-    stock: Floats
-    inner: Floats
-    flow: Floats
-    measures: Floats
-    step: Integers
-    batched: Floats
-    circularity: Floats
-    service: Floats
+    stock: Annotated[Floats, "masses of nodes, then of batch arcs, then the unit row, shape (rows, B), mass"]
+    inner: Annotated[Floats, "inner states of the compartments' models, shape (states, B)"]
+    flow: Annotated[Floats, "mean flows of the last control interval, shape (arcs, B), mass/time"]
+    measures: Annotated[Floats, "what the models measured at its end, under its controls, shape (measures, B)"]
+    step: Annotated[Integers, "control intervals done, shape (B,)"]
+    batched: Annotated[Floats, "m_fb of this episode, in two parts as in ``Network.circularity``, shape (2, B), mass"]
+    circularity: Annotated[Floats, "sum over the episode of the interval means of λ, shape (B,), mass"]
+    service: Annotated[Floats, "sum over the episode of the service level, shape (B,)"]
 
     def copied(self) -> State:
         """Return the state with arrays of its own."""
@@ -47,23 +37,16 @@ class State:
         return State(*(np.where(ended, getattr(fresh, each.name), getattr(self, each.name)) for each in fields(self)))
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Everything needed to go on from here, bit for bit.
+    """Everything needed to go on from here, bit for bit."""
 
-    Attributes:
-        state: the physical state.
-        streams: state of the random stream of each copy.
-        agents: who acts.
-        network: what it is a snapshot of, under its scenario and horizon.
-        elapsed: the published step counter of a one-agent environment with ``legacy_episode``.
-    """
-
-    state: State
-    streams: tuple[Mapping[str, Any], ...]
-    agents: tuple[str, ...]
-    network: Network
-    elapsed: int = 0
+    state: Annotated[State, "the physical state"]
+    streams: Annotated[tuple[Mapping[str, Any], ...], "state of the random stream of each copy"]
+    agents: Annotated[tuple[str, ...], "who acts"]
+    network: Annotated[Network, "what it is a snapshot of, under its scenario and horizon"]
+    elapsed: Annotated[int, "the published step counter of a one-agent environment with ``legacy_episode``"] = 0
 
     def check(self, network: Network, copies: int, agents: tuple[str, ...]) -> None:
         """Raise a ``ControlError`` unless ``copies`` of ``network``, in which ``agents`` act, can go back to this."""
@@ -74,45 +57,26 @@ class Snapshot:
             raise ControlError(f"the snapshot does not fit: it is of another definition of {ours}")
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one control interval brought, agents stacked along axis 0.
+    """What one control interval brought, agents stacked along axis 0."""
 
-    Attributes:
-        observation: shape (entries of all agents, B), float32.
-        reward: shape (agents, B).
-        local: local rewards, shape (agents, B).
-        circularity: λ at the end of the interval, shape (B,), mass.
-        circularity_mean: mean of λ over the interval, shape (B,), mass.
-        service_level: shape (B,).
-        flow: mean flows, shape (arcs, B), mass/time.
-        truncated: time limit reached, shape (B,).
-        success: whether a compartment whose model has a criterion of success meets it, shape (B,) each.
-    """
-
-    observation: NDArray[np.float32]
-    reward: Floats
-    local: Floats
-    circularity: Floats
-    circularity_mean: Floats
-    service_level: Floats
-    flow: Floats
-    truncated: NDArray[np.bool_]
-    success: Mapping[str, NDArray[np.bool_]]
+    observation: Annotated[NDArray[np.float32], "shape (entries of all agents, B), float32"]
+    reward: Annotated[Floats, "shape (agents, B)"]
+    local: Annotated[Floats, "local rewards, shape (agents, B)"]
+    circularity: Annotated[Floats, "λ at the end of the interval, shape (B,), mass"]
+    circularity_mean: Annotated[Floats, "mean of λ over the interval, shape (B,), mass"]
+    service_level: Annotated[Floats, "shape (B,)"]
+    flow: Annotated[Floats, "mean flows, shape (arcs, B), mass/time"]
+    truncated: Annotated[NDArray[np.bool_], "time limit reached, shape (B,)"]
+    success: Annotated[Mapping[str, NDArray[np.bool_]], "whether the task of a compartment's model is done, shape (B,)"]
 
     def infos(self, agents: Sequence[str]) -> dict[str, dict[str, Any]]:
         """Return λ, local reward, flows (B, arcs) and service level for each agent; success where it is defined."""
-        flows = self.flow.T
         self.circularity.flags.writeable = self.service_level.flags.writeable = False  # the same for all agents
-        infos: dict[str, dict[str, Any]] = {
-            agent: {
-                "circularity": self.circularity,
-                "local_reward": self.local[i],
-                "flows": flows,
-                "service_level": self.service_level,
-            }
-            for i, agent in enumerate(agents)
-        }
+        team = {"circularity": self.circularity, "flows": self.flow.T, "service_level": self.service_level}
+        infos = {agent: {**team, "local_reward": local} for agent, local in zip(agents, self.local, strict=True)}
         for agent in self.success.keys() & infos.keys():
             infos[agent]["success"] = self.success[agent]
         return infos

@@ -25,6 +25,8 @@ from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import MOMENTS, REWARDS
 
 Infos = dict[str, dict[str, Any]]
+_Seen = dict[str, NDArray[np.float32]]
+_Flags = dict[str, NDArray[np.bool_]]
 
 
 class VectorEnv:
@@ -103,7 +105,6 @@ class VectorEnv:
         self._starts = Starts(found, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
         self.state_names = (*self.rows.start_names, *self.rows.batch_names)
-        self._metered = self.layout.signals.measures
         self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
         self._state: State | None = None
         _keep_freed_memory()
@@ -115,18 +116,12 @@ class VectorEnv:
 
     @property
     def physical(self) -> State:
-        """The current physical state; its arrays must not be written to.
-
-        Raises:
-            ControlError: before the first ``reset``.
-        """
+        """The current physical state; its arrays must not be written to. Before ``reset`` there is none."""
         if self._state is None:
             raise ControlError("the environment has no state yet: call reset() first")
         return self._state
 
-    def reset(
-        self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
-    ) -> dict[str, NDArray[np.float32]]:
+    def reset(self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None) -> _Seen:
         """Start an episode in every copy and return the observations.
 
         Args:
@@ -143,22 +138,10 @@ class VectorEnv:
         self.episodes = self.episodes + 1
         return self.by_agent(self._observe(self._state))
 
-    def step(
-        self, actions: Mapping[str, ArrayLike]
-    ) -> tuple[
-        dict[str, NDArray[np.float32]],
-        dict[str, Floats],
-        dict[str, NDArray[np.bool_]],
-        dict[str, NDArray[np.bool_]],
-        Infos,
-    ]:
-        """Hold the actions for one control interval.
+    def step(self, actions: Mapping[str, ArrayLike]) -> tuple[_Seen, dict[str, Floats], _Flags, _Flags, Infos]:
+        """Hold the actions, agent → array (num_envs, entries of its action) in [−1, 1], for one control interval.
 
-        Args:
-            actions: agent → array of shape (num_envs, entries of its action) in [−1, 1].
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos, each by agent.
+        Returned are observations, rewards, terminations, truncations and infos, each by agent.
 
         Raises:
             ControlError: for missing or unknown agents, wrong shapes, NaN or values out of bounds.
@@ -208,16 +191,8 @@ class VectorEnv:
         circularity, mean, batched = self._credit.circularity(state, transition, flow)
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
-        self._state = State(
-            transition.stock,
-            transition.inner,
-            flow,
-            quantities[self._metered],
-            step,
-            batched,
-            state.circularity + mean,
-            state.service + service,
-        )
+        measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + service)
+        self._state = State(transition.stock, transition.inner, flow, measures, step, batched, *totals)
         observation = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
@@ -237,24 +212,16 @@ class VectorEnv:
         time = state.step / self.network.episode.horizon
         return np.concatenate([state.stock[self.rows.nodes], state.inner, state.stock[self.rows.batches], time[None]]).T
 
-    def observations(self) -> dict[str, NDArray[np.float32]]:
-        """Return the observations that the agents act on next, equal to what the last reset, step or restore gave.
-
-        Raises:
-            ControlError: before the first ``reset``.
-        """
+    def observations(self) -> _Seen:
+        """Return the observations that the agents act on next, equal to what the last reset, step or restore gave."""
         return self.by_agent(self._observe(self.physical))
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the state and the random streams; environments are not changed."""
         return Snapshot(self.physical.copied(), self._starts.saved_streams(), self.agents, self.network)
 
-    def restore(self, snapshot: Snapshot) -> dict[str, NDArray[np.float32]]:
-        """Go back to a snapshot and return the observations there.
-
-        Raises:
-            ControlError: if the snapshot is of another network, horizon, batch size or choice of agents.
-        """
+    def restore(self, snapshot: Snapshot) -> _Seen:
+        """Go back to a snapshot, which must be of the same network, horizon, batch size and agents, and observe."""
         snapshot.check(self.network, self.num_envs, self.agents)
         self._starts.restore_streams(snapshot.streams)
         self._state = snapshot.state.copied()
@@ -264,7 +231,7 @@ class VectorEnv:
     def close(self) -> None:
         """Do nothing; the environment holds no resources."""
 
-    def by_agent(self, stacked: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+    def by_agent(self, stacked: NDArray[np.float32]) -> _Seen:
         """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
         return {agent: stacked[rows].T for agent, rows in self.layout.slices.items()}
 
@@ -274,11 +241,8 @@ class VectorEnv:
         steps = np.maximum(state.step, 1)
         final, whole = self.by_agent(outcome.observation), self.state()
         for agent, info in infos.items():
-            info["final_observation"] = final[agent]
-            info["final_state"] = whole
-            info["_final_observation"] = ended
-            info["episode_circularity"] = state.circularity / steps
-            info["episode_service_level"] = state.service / steps
+            info |= {"final_observation": final[agent], "final_state": whole, "_final_observation": ended}
+            info |= {"episode_circularity": state.circularity / steps, "episode_service_level": state.service / steps}
 
     def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in the copies that ended and return the observation of all."""
@@ -294,12 +258,9 @@ class VectorEnv:
         """State at the start of an episode; flows and measures are those that neutral control would give."""
         dynamics, batch = self.dynamics, drawn.shape[1]
         stocks, inner = self.rows.split(drawn)
-        stock = dynamics.extend(stocks)
-        step = np.zeros(batch, dtype=np.intp)
+        stock, step, zeros = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp), np.zeros(batch)
         neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
-        flow = dynamics.start_flow(stock, inner, neutral)
-        measures = dynamics.inner.measures(inner, neutral)
-        zeros = np.zeros(batch)
+        flow, measures = dynamics.start_flow(stock, inner, neutral), dynamics.inner.measures(inner, neutral)
         return State(stock, inner, flow, measures, step, np.zeros((2, batch)), zeros, zeros)
 
     def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
-from cirl_marl.controllers.watched import Watched
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError

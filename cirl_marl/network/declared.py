@@ -13,10 +13,10 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, MISSING, dataclass, fields
 from enum import StrEnum
-from functools import cache
+from functools import cache, partial
 from numbers import Real
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, dataclass_transform, get_type_hints
 
 import numpy as np
 
@@ -28,79 +28,75 @@ Kind = Literal["mass", "time", "rate", "flow", "steps", "1"]
 Part = TypeVar("Part")
 
 
+def itemised(made: type[Part]) -> type[Part]:
+    """Let the docstring of a dataclass list its fields with what their annotations declare or, as plain text, say."""
+    lines = [
+        textwrap.fill(f"        {name}: {getattr(told, 'meaning', told)}.", 120, subsequent_indent=" " * 12)
+        for name, told in _annotated(made).items()
+    ]
+    made.__doc__ = "\n".join([str(made.__doc__).rstrip(), "", "    Attributes:", *lines, "    "])
+    return made
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+def frozen(made: type[Part]) -> type[Part]:
+    """Make a dataclass of keywords that cannot be changed, and whose docstring lists them."""
+    return itemised(dataclass(frozen=True, slots=True, kw_only=True)(made))
+
+
+def _annotated(made: Any) -> dict[str, Any]:
+    hints = get_type_hints(made, include_extras=True)
+    found = {each.name: getattr(hints[each.name], "__metadata__", ()) for each in fields(made)}
+    return {name: told[0] for name, told in found.items() if told}
+
+
+@itemised
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """What is known of a field of whatever kind.
+    """What is known of a field; by itself, of a text, of ids in a fixed order, or of one that is true or false."""
 
-    Attributes:
-        meaning: for docstrings, schema and documents.
-        key: what definition files call it, if not by its name.
-        required: whether definition files must give it, though Python has a default.
-    """
-
-    meaning: str
+    meaning: Annotated[str, "for docstrings, schema and documents"]
     _: KW_ONLY
-    key: str = ""
-    required: bool = False
+    key: Annotated[str, "what definition files call it, if not by its name"] = ""
+    required: Annotated[bool, "whether definition files must give it, though Python has a default"] = False
 
     def problem(self, value: object) -> str:
         """Return what the field must be, and what to write instead, if ``value`` is of another kind; else nothing."""
         return ""
 
 
-@dataclass(frozen=True, slots=True)
-class Text(Declared):
-    """The id of a compartment, or other text."""
-
-
-@dataclass(frozen=True, slots=True)
-class Names(Declared):
-    """Ids in a fixed order."""
-
-
-@dataclass(frozen=True, slots=True)
-class Flag(Declared):
-    """True or false."""
-
-
+@itemised
 @dataclass(frozen=True, slots=True)
 class Word(Declared):
-    """One of some words.
+    """One of some words."""
 
-    Attributes:
-        of: an enumeration, or the words.
-        called: what messages call it, if not by its name.
-    """
-
-    of: type[StrEnum] | tuple[str, ...] = ()
-    called: str = ""
+    of: Annotated[type[StrEnum] | tuple[str, ...], "an enumeration, or the words"] = ()
+    called: Annotated[str, "what messages call it, if not by its name"] = ""
 
 
+class Kinds(NamedTuple):
+    """A kind of quantity that depends on the value of the field ``by``: one ``of`` those named, or ``otherwise``."""
+
+    by: str
+    of: Mapping[str, Kind]
+    otherwise: Kind
+
+
+@itemised
 @dataclass(frozen=True, slots=True)
 class Quantity(Declared):
-    """A number with a unit.
+    """A number with a unit."""
 
-    Attributes:
-        of: kind of quantity; or, by the value of the field ``by``, the kinds that differ from ``otherwise``.
-        by: the field that decides; empty if ``of`` is the same for all.
-        otherwise: kind for values of ``by`` that ``of`` does not name.
-        low: lowest value; a ``positive`` one lies above 0.
-        high: highest value.
-        positive: whether it lies above 0.
-        joint: whether its bounds depend on other fields, so that they are checked with these.
-    """
-
-    of: Kind | Mapping[str, Kind] = "1"
-    by: str = ""
-    otherwise: Kind = "1"
-    low: float = -math.inf
-    high: float = math.inf
-    positive: bool = False
-    joint: bool = False
+    of: Annotated[Kind | Kinds, "kind of quantity"] = "1"
+    low: Annotated[float, "lowest value; a ``positive`` one lies above 0"] = -math.inf
+    high: Annotated[float, "highest value"] = math.inf
+    positive: Annotated[bool, "whether it lies above 0"] = False
+    joint: Annotated[bool, "whether its bounds depend on other fields, so that they are checked with these"] = False
 
     def kind(self, part: object) -> Kind:
         """Return the kind of quantity in ``part``, a part of a network or its table in a definition file."""
-        return self.of if isinstance(self.of, str) else self.of.get(getattr(part, self.by), self.otherwise)
+        kinds = self.of
+        return kinds if isinstance(kinds, str) else kinds.of.get(getattr(part, kinds.by), kinds.otherwise)
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
@@ -111,64 +107,43 @@ class Quantity(Declared):
         within = self.low <= value <= self.high and (value > 0 or not self.positive)
         if self.joint or (math.isfinite(value) and within):
             return ""
+        if math.isfinite(self.high):
+            return f"must lie in {'(0' if self.positive else f'[{self.low:g}'}, {self.high:g}]"
         if self.positive:
             return "must be positive and finite"
-        if math.isfinite(self.high):
-            return f"must lie in [{self.low:g}, {self.high:g}]"
         if self.low == 0:
             return "must be finite and not negative"
         return f"must be at least {self.low:g}" if math.isfinite(self.low) else "must be finite"
 
 
-@dataclass(frozen=True, slots=True)
-class Amount(Declared):
-    """A number whose unit is that of the table in which it stands."""
-
-    def problem(self, value: object) -> str:
-        """See ``Declared.problem``."""
-        return _problem(value, "a number", ())
+Positive = partial(Quantity, positive=True)
+NotNegative = partial(Quantity, low=0.0)
+Share = partial(Quantity, low=0.0, high=1.0)
 
 
+@itemised
 @dataclass(frozen=True, slots=True)
 class Numbers(Declared):
-    """Several numbers, which definition files spell in a table of their own.
+    """Several numbers, which definition files spell in a table of their own."""
 
-    Attributes:
-        of: kind of quantity of each column.
-        form: how they are given in Python.
-        shape: their shape, None being any length.
-        spelled: which table of definition files holds them; empty if that of another field does.
-    """
-
-    of: tuple[Kind, ...] = ()
-    form: str = ""
-    shape: tuple[int | None, ...] = (None,)
-    spelled: str = ""
+    form: Annotated[str, "how they are given in Python"] = ""
+    shape: Annotated[tuple[int | None, ...], "their shape, None being any length"] = (None,)
+    spelled: Annotated[str, "which table of definition files holds them; empty if that of another field does"] = ""
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
         return _problem(value, self.form, self.shape)
 
 
+Amount = partial(Numbers, form="a number", shape=(), spelled="amount")
+"""A number whose unit is that of the table in which it stands."""
+
+
 @dataclass(frozen=True, slots=True)
 class Nested(Declared):
-    """A part of its own, with a table of its own.
-
-    Attributes:
-        of: which.
-    """
+    """A part of its own, with a table of its own."""
 
     of: Literal["control", "model"] = "control"
-
-
-def part(made: type[Part]) -> type[Part]:
-    """Let the docstring of a frozen dataclass list its declared fields with their meanings."""
-    lines = [
-        textwrap.fill(f"{name}: {declared.meaning}.", 120, initial_indent=" " * 8, subsequent_indent=" " * 12)
-        for name, declared in declarations(made).items()
-    ]
-    made.__doc__ = "\n".join([str(made.__doc__).rstrip(), "", "    Attributes:", *lines, "    "])
-    return made
 
 
 def declarations(made: type[Any]) -> Mapping[str, Declared]:
@@ -179,9 +154,7 @@ def declarations(made: type[Any]) -> Mapping[str, Declared]:
 
 @cache
 def _declarations(made: Any) -> Mapping[str, Declared]:
-    hints = get_type_hints(made, include_extras=True)
-    found = {each.name: getattr(hints[each.name], "__metadata__", ()) for each in fields(made)}
-    return MappingProxyType({name: told[0] for name, told in found.items() if told})
+    return MappingProxyType({name: told for name, told in _annotated(made).items() if isinstance(told, Declared)})
 
 
 def default_of(made: type[Any], name: str) -> Any:

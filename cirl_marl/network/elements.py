@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Literal, get_args
 
@@ -16,15 +15,16 @@ import numpy as np
 
 from cirl_marl.network.declared import (
     Amount,
-    Flag,
-    Kind,
-    Names,
+    Declared,
+    Kinds,
     Nested,
+    NotNegative,
     Numbers,
+    Positive,
     Quantity,
-    Text,
+    Share,
     Word,
-    part,
+    frozen,
     settle,
 )
 from cirl_marl.network.model import CompartmentModel
@@ -63,19 +63,13 @@ class ControlKind(StrEnum):
     INPUT = "input"
 
 
-Solver = Literal["exact", "rk4", "euler"]
-NetZero = Literal["signed", "abs"]
 Reward = Literal["local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team"]
 Observe = Literal["local", "neighbours", "full", "stocks", "model"]
 Moment = Literal["end", "mean"]
-ServiceQuantity = Literal["stock", "outflow", "flow", "measure"]
 
-SOLVERS: tuple[str, ...] = get_args(Solver)
-NET_ZERO: tuple[str, ...] = get_args(NetZero)
 REWARDS: tuple[str, ...] = get_args(Reward)
 OBSERVE: tuple[str, ...] = get_args(Observe)
 MOMENTS: tuple[str, ...] = get_args(Moment)
-QUANTITIES: tuple[str, ...] = get_args(ServiceQuantity)
 SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})
 MAX_STEPS = 10_000
 """Solver steps of a control interval, or control intervals of a delay, beyond which a unit is taken for a mistake."""
@@ -90,14 +84,14 @@ TAKEN: Mapping[Law, tuple[str, ...]] = {
 }
 """What each law takes, of the fields that only some laws take."""
 
-RATE_OF: Mapping[str, Kind] = {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}
-"""Kind of quantity of an arc's rate, where it is not 1/time."""
-MEASURED: Mapping[str, Kind] = {"stock": "mass", "measure": "1"}
-"""Kind of quantity of a service's band, where it is no flow."""
+RATE_OF = Kinds("law", {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}, "rate")
+SCALE_OF = Kinds("law", {Law.BATCH: "mass"}, "flow")
+BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
+
+Pair = tuple[float, float]
 
 
-@part
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Control:
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high]."""
 
@@ -115,16 +109,20 @@ class Control:
     def action(self, value: Floats) -> Floats:
         """Return the normalised actions, in [-1, 1], that come closest to physical values."""
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        action: Floats = np.clip((value - middle) / half, -1.0, 1.0)
-        return action
+        return np.clip((value - middle) / half, -1.0, 1.0)
 
 
 CONTROL = Nested("its actuator; None if it cannot act")
 MODEL = Nested("inner physics; None for a plain store or transport", of="model")
-PAIRS = "((low, high), …), one pair for each inner state"
+INNER = Numbers(
+    "(low, high) of the initial value of each inner state of the model, drawn uniformly; empty for a model that draws "
+    "its own start",
+    "((low, high), …), one pair for each inner state",
+    (None, 2),
+)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Compartment:
     """What nodes and arcs have in common."""
 
@@ -133,28 +131,22 @@ class Compartment:
     scale: float = 1.0
     control: Annotated[Control | None, CONTROL] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
-    inner: Annotated[
-        tuple[tuple[float, float], ...],
-        Numbers(
-            "(low, high) of the initial value of each inner state of the model, drawn uniformly; empty for a model "
-            "that draws its own start",
-            form=PAIRS,
-            shape=(None, 2),
-        ),
-    ] = ()
-    reward_scale: Annotated[float, Quantity("the model's reward is divided by it", positive=True)] = 1.0
+    inner: Annotated[tuple[Pair, ...], INNER] = ()
+    reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no number; take roles and laws as definitions spell them."""
+        settle(f"{type(self).__name__.lower()} '{self.id}'", self)
 
     @property
     def actions(self) -> int:
         """Number of entries of its action."""
-        if self.control is None:
-            return 0
-        takes_inputs = self.control.kind is ControlKind.INPUT and self.model is not None
-        return len(self.model.input_names) if takes_inputs and self.model is not None else 1
+        if self.control is not None and self.control.kind is ControlKind.INPUT and self.model is not None:
+            return len(self.model.input_names)
+        return int(self.control is not None)
 
 
-@part
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Node(Compartment):
     """A compartment that stores material, with an ``id`` of its own among nodes and arcs.
 
@@ -165,31 +157,16 @@ class Node(Compartment):
         Role.TECHNOSPHERE
     )
     initial: Annotated[
-        tuple[float, float],
-        Numbers(
-            "(low, high) of the initial stock, drawn uniformly, mass",
-            of=("mass",),
-            form="(low, high)",
-            spelled="range",
-            shape=(2,),
-            required=True,
-        ),
+        Pair,
+        Numbers("(low, high) of the initial stock, drawn uniformly, mass", "(low, high)", (2,), "range", required=True),
     ] = (0.0, 0.0)
     set_point: Annotated[float | None, Quantity("stock aimed at, mass; None if there is none", of="mass")] = None
     scale: Annotated[
-        float,
-        Quantity(
-            "reference stock of observations and rewards; files may leave it to scales.stock", of="mass", positive=True
-        ),
+        float, Positive("reference stock of observations and rewards; files may leave it to scales.stock", of="mass")
     ] = 1.0
 
-    def __post_init__(self) -> None:
-        """Refuse what is no number; take a role as definitions spell it."""
-        settle(f"node '{self.id}'", self)
 
-
-@part
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Arc(Compartment):
     """A compartment that moves material from ``donor`` to ``recipient``, with an ``id`` of its own.
 
@@ -198,32 +175,28 @@ class Arc(Compartment):
     discrete masses.
     """
 
-    donor: Annotated[str, Text("id of the node that gives", key="from")]
-    recipient: Annotated[str, Text("id of the node that receives", key="to")]
+    donor: Annotated[str, Declared("id of the node that gives", key="from")]
+    recipient: Annotated[str, Declared("id of the node that receives", key="to")]
     law: Annotated[Law, Word("how much it carries", of=Law, required=True)] = Law.DONOR
     rate: Annotated[
         float,
-        Quantity(
+        NotNegative(
             "a, 1/time (donor and recipient laws), mass/time per unit of the model's output, or mass per unit that the "
             "donor's model releases (batch law)",
             of=RATE_OF,
-            by="law",
-            otherwise="rate",
-            low=0.0,
         ),
     ] = 0.0
     by: Annotated[
-        str, Text("compartment whose model gives the flow (compartment law) or releases the batches (batch law)")
+        str, Declared("compartment whose model gives the flow (compartment law) or releases the batches (batch law)")
     ] = ""
-    port: Annotated[str, Text("what ``by`` releases into this arc, one of the ports of its model (batch law)")] = ""
+    port: Annotated[str, Declared("what ``by`` releases into this arc, one of the ports of its model (batch law)")] = ""
     batches: Annotated[
-        tuple[tuple[float, float], ...],
+        tuple[Pair, ...],
         Numbers(
             "(time, mass) of batches that leave on schedule (batch law without ``by``)",
-            of=("time", "mass"),
-            form="((time, mass), …)",
+            "((time, mass), …)",
+            (None, 2),
             spelled="batches",
-            shape=(None, 2),
         ),
     ] = ()
     delay: Annotated[
@@ -238,40 +211,29 @@ class Arc(Compartment):
         tuple[float, ...],
         Numbers(
             "e, mass/time (exogenous law); with ``times`` the values of a step function, else a single value",
-            of=("flow",),
-            form="(value, …)",
+            "(value, …)",
             spelled="flow",
         ),
     ] = (0.0,)
     times: Annotated[
         tuple[float, ...],
-        Numbers(
-            "starts of the steps of an exogenous series, time; empty for a constant", of=("time",), form="(time, …)"
-        ),
+        Numbers("starts of the steps of an exogenous series, time; empty for a constant", "(time, …)"),
     ] = ()
-    pollutant: Annotated[bool, Flag("whether material that enters an environment here is a pollutant")] = True
+    pollutant: Annotated[bool, Declared("whether material that enters an environment here is a pollutant")] = True
     set_point: Annotated[float | None, Quantity("mean flow aimed at, mass/time; None if there is none", of="flow")] = (
         None
     )
     scale: Annotated[
         float,
-        Quantity(
+        Positive(
             "reference flow of observations and rewards, of a batch arc reference mass; files may leave it to "
             "scales.flow and scales.stock",
-            of={Law.BATCH: "mass"},
-            by="law",
-            otherwise="flow",
-            positive=True,
+            of=SCALE_OF,
         ),
     ] = 1.0
 
-    def __post_init__(self) -> None:
-        """Refuse what is no number; take a law as definitions spell it."""
-        settle(f"arc '{self.id}'", self)
 
-
-@part
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Service:
     """What the network is there for: a stock or flow to be kept within a band, under an ``id`` of its own.
 
@@ -280,40 +242,21 @@ class Service:
     """
 
     id: str
-    provider: Annotated[str, Text("compartment at which it is measured")]
+    provider: Annotated[str, Declared("compartment at which it is measured")]
     quantity: Annotated[
         str,
         Word(
             "``stock`` (of a node, or on the way along a batch arc), ``outflow`` of a node (sum of its outflows, none "
             "of them in batches), ``flow`` of an arc, or ``measure``, one that the provider's model offers",
-            of=QUANTITIES,
+            of=("stock", "outflow", "flow", "measure"),
         ),
     ]
-    low: Annotated[
-        float,
-        Quantity(
-            "lower end of the band: mass, mass/time or the measure's",
-            of=MEASURED,
-            by="quantity",
-            otherwise="flow",
-            joint=True,
-        ),
-    ]
-    high: Annotated[
-        float,
-        Quantity(
-            "upper end of the band, likewise; none if left out",
-            of=MEASURED,
-            by="quantity",
-            otherwise="flow",
-            joint=True,
-        ),
-    ] = math.inf
-    weight: Annotated[float, Quantity("factor of the shortfall in the local rewards", low=0.0, required=True)] = 1.0
-    measure: Annotated[str, Text('name of the measure, for ``quantity = "measure"``')] = ""
+    low: Annotated[float, Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True)]
+    high: Annotated[float, Quantity("upper end, likewise; none if left out", of=BAND_OF, joint=True)] = math.inf
+    weight: Annotated[float, NotNegative("factor of the shortfall in the local rewards", required=True)] = 1.0
+    measure: Annotated[str, Declared('name of the measure, for ``quantity = "measure"``')] = ""
     owed_by: Annotated[
-        tuple[str, ...],
-        Names("compartments whose local reward bears the shortfall; empty means the provider alone"),
+        tuple[str, ...], Declared("compartments whose local reward bears the shortfall; empty means the provider alone")
     ] = ()
 
     @property
@@ -322,14 +265,11 @@ class Service:
         return self.owed_by or (self.provider,)
 
 
-@part
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Episode:
     """Time and solver of an episode."""
 
-    control_interval: Annotated[
-        float, Quantity("h, time between two decisions", of="time", positive=True, required=True)
-    ] = 1.0
+    control_interval: Annotated[float, Positive("h, time between two decisions", of="time", required=True)] = 1.0
     horizon: Annotated[int, Quantity("decisions per episode", of="steps", low=1, required=True)] = 50
     solver: Annotated[
         str,
@@ -337,7 +277,7 @@ class Episode:
             "``exact`` (zero-order-hold solution, for networks without inner physics), ``rk4`` (classical Runge-Kutta, "
             "for those with it), both keeping stocks non-negative; or ``euler`` (the explicit step of the published "
             "environments; stocks may become negative)",
-            of=SOLVERS,
+            of=("exact", "rk4", "euler"),
         ),
     ] = "exact"
     solver_step: Annotated[
@@ -348,43 +288,35 @@ class Episode:
     ] = None
 
 
-@part
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Objective:
     """How circularity and rewards are read off the network."""
 
-    reference_interval: Annotated[
-        float, Quantity("Δ of λ = −(m_fb + Δ·ṁ_fc)", of="time", positive=True, required=True)
-    ] = 1.0
+    reference_interval: Annotated[float, Positive("Δ of λ = −(m_fb + Δ·ṁ_fc)", of="time", required=True)] = 1.0
     net_zero: Annotated[
         str,
         Word(
             "``signed`` counts over-removal from the environment as positive; ``abs`` penalises it like emission",
-            of=NET_ZERO,
+            of=("signed", "abs"),
             required=True,
         ),
     ] = "signed"
     reward: Annotated[str, Word("default reward mode of the environments", of=REWARDS, required=True)] = "mixed"
-    circularity_scale: Annotated[float, Quantity("reference |λ|", of="mass", positive=True, required=True)] = 1.0
+    circularity_scale: Annotated[float, Positive("reference |λ|", of="mass", required=True)] = 1.0
     circularity_weight: Annotated[
-        float,
-        Quantity("weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local", low=0.0, high=1.0, required=True),
+        float, Share("weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local", required=True)
     ] = 0.5
     tracked: Annotated[
         tuple[str, ...],
-        Names(
-            "compartments whose distance to the set-point enters their local reward; empty means every compartment "
-            "with a set-point"
-        ),
+        Declared("compartments whose distance to the set-point enters their local reward; empty means all with one"),
     ] = ()
     criticality: Annotated[
         float | None,
-        Quantity("c of the material; evaluations then report the time-window circularity of CIRO7.2 too", low=0.0),
+        NotNegative("c of the material; evaluations then report the time-window circularity of CIRO7.2 too"),
     ] = None
 
 
-@part
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class Observation:
     """What agents see by default."""
 
@@ -400,5 +332,5 @@ class Observation:
     ] = "local"
     nodes: Annotated[
         tuple[str, ...],
-        Names("in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``)"),
+        Declared("in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``)"),
     ] = ()

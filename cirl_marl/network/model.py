@@ -13,24 +13,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from inspect import isabstract
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cirl_marl.errors import NetworkError
+from cirl_marl.network.declared import Word, bound_problems, settle
 from cirl_marl.network.rowsum import Floats
 
 RewardState = Literal["before", "after"]
+Form = Annotated[Literal["published", "sound"], Word("``published`` or ``sound``", of=("published", "sound"))]
+"""Which equations, of a model that has those that were published and physically sound ones."""
 Bools = NDArray[np.bool_]
 
 
-class _Stated:
-    """Stands for an attribute that the class of a model has to state: Python takes it for abstract."""
-
-    __isabstractmethod__ = True
-
-
-STATED: Any = _Stated()
+STATED: Any = abstractmethod(lambda: None)
+"""Stands for an attribute that the class of a model has to state: Python takes it for abstract."""
 
 
 class CompartmentModel(ABC):
@@ -53,6 +52,12 @@ class CompartmentModel(ABC):
     reward_state: ClassVar[RewardState] = STATED
     input_unit: ClassVar[str | None] = None
     context_names: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse parameters of another kind, or out of other bounds, than declared; a ``NetworkError`` names all."""
+        settle(self.kind, self)
+        if found := list(bound_problems(self)):
+            raise NetworkError(self.kind, found)
 
     @property
     @abstractmethod
@@ -122,9 +127,7 @@ class OwnStepModel(Outflowing):
     __slots__ = ()
 
     @abstractmethod
-    def integrate(
-        self, state: Floats, inputs: Floats, interval: float, *_: Any, **context: Any
-    ) -> tuple[Floats, Floats]:
+    def integrate(self, state: Floats, inputs: Floats, interval: float, *_: Any, **more: Any) -> tuple[Floats, Floats]:
         """Return the state after ``interval`` ``time_unit``, (k, B), and the mean of ``outflow`` over it, (B,)."""
 
 
@@ -153,11 +156,7 @@ class DiscreteTimeModel(CompartmentModel):
 
 
 class Measuring(CompartmentModel):
-    """A model of which services and observers may read more than its states.
-
-    Attributes:
-        measure_names: what it measures, with units, in order.
-    """
+    """A model of which services and observers may read more than states: ``measure_names``, with units, in order."""
 
     __slots__ = ()
     measure_names: ClassVar[tuple[str, ...]] = STATED
@@ -178,13 +177,7 @@ class Task(CompartmentModel):
 
 
 class GoalTask(Task):
-    """A task with goals, for ``GoalEnv``; all names are of states that are observed.
-
-    Attributes:
-        observation_names: what is seen besides the goals.
-        achieved_names: the goal as it is.
-        desired_names: the goal as it should be.
-    """
+    """A task with goals, for ``GoalEnv``: names of observed states besides the goal, of it as it is and should be."""
 
     __slots__ = ()
     observation_names: ClassVar[tuple[str, ...]] = STATED
@@ -197,11 +190,7 @@ class GoalTask(Task):
 
 
 class Releasing(CompartmentModel):
-    """A model that releases units of its node's stock into batch arcs.
-
-    Attributes:
-        ports: where it releases; each port has a batch arc.
-    """
+    """A model that releases units of its node's stock into batch arcs, of which each of its ``ports`` has one."""
 
     __slots__ = ()
     ports: ClassVar[tuple[str, ...]] = STATED

@@ -24,15 +24,9 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from cirl_marl.errors import CirlError, NetworkError, unknown
-from cirl_marl.network.elements import (
-    SINKS,
-    Compartment,
-    Law,
-    Role,
-    Service,
-)
+from cirl_marl.network.elements import SINKS, Compartment, Law, Role, Service
 from cirl_marl.network.parts import Parts
-from cirl_marl.network.rowsum import Floats, Integers, RowSum
+from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.validate import problems
 
 if TYPE_CHECKING:
@@ -54,11 +48,7 @@ class Network(Parts):
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def scenario(self, name: str | None) -> Network:
-        """Return this network under scenario ``name`` (None: as it is).
-
-        Raises:
-            CirlError: if the definition has no such scenario.
-        """
+        """Return this network under scenario ``name`` (None: as it is); a ``CirlError`` lists those there are."""
         if name is None or name == self.scenario_name:
             return self
         if name not in self.scenarios:
@@ -77,14 +67,12 @@ class Network(Parts):
         >>> load_network("copper_net").with_options(episode={"horizon": 3}).episode.horizon
         3
         """
-        known_groups = ("episode", "objective", "observation")
         for group, values in groups.items():
-            if group not in known_groups:
-                raise CirlError(f"with_options: {unknown('group', group, known_groups)}")
+            if group not in (known := ["episode", "objective", "observation"]):
+                raise CirlError(f"with_options: {unknown('group', group, known)}")
             known = [each.name for each in fields(getattr(self, group))]
-            for name in values:
-                if name not in known:
-                    raise CirlError(f"with_options: {group}: {unknown('field', name, known)}")
+            for name in [each for each in values if each not in known]:
+                raise CirlError(f"with_options: {group}: {unknown('field', name, known)}")
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
         return replace(self, **changes, scenarios={})
 
@@ -102,10 +90,7 @@ class Network(Parts):
         place[order] = np.arange(size)
         arcs = np.lexsort((place[self.recipients], place[self.donors]))
         return replace(
-            self,
-            nodes=tuple(self.nodes[i] for i in order),
-            arcs=tuple(self.arcs[k] for k in arcs),
-            scenarios={},
+            self, nodes=tuple(self.nodes[i] for i in order), arcs=tuple(self.arcs[k] for k in arcs), scenarios={}
         )
 
     @cached_property
@@ -141,8 +126,8 @@ class Network(Parts):
     @cached_property
     def control_rows(self) -> Mapping[str, slice]:
         """Rows of each controllable compartment in control arrays: one, or one per input of its model."""
-        edges = np.cumsum([0, *(self.compartments[id_].actions for id_ in self.controllable)]).tolist()
-        return MappingProxyType({id_: slice(edges[i], edges[i + 1]) for i, id_ in enumerate(self.controllable)})
+        rows = spans(self.compartments[id_].actions for id_ in self.controllable)
+        return MappingProxyType(dict(zip(self.controllable, rows, strict=True)))
 
     @cached_property
     def agents(self) -> tuple[str, ...]:
@@ -188,7 +173,7 @@ class Network(Parts):
         return graph
 
     def circularity(self, flow: Floats, batched: Floats | None = None) -> Floats:
-        """Return λ(N;t) = −(m_fb + Δ·σᵀf), σᵀf summed over the continuous flows.
+        """Return λ(N;t) = −(m_fb + Δ·σᵀf), shape (...), mass, with σᵀf summed over the continuous flows.
 
         With ``net_zero = "abs"`` the part through the environment enters by its absolute value,
         λ = −(m_rest + Δ·σ_rest·f) − |m_env + Δ·σ_env·f|. Given mean flows this is λ of the mean flows, which for
@@ -199,19 +184,14 @@ class Network(Parts):
             batched: m_fb, net batch mass moved finite-time sustainably so far, not through and through the environment,
                 shape (2, ...), mass; None if nothing moves in batches.
 
-        Returns:
-            λ, shape (...), mass.
-
         Raises:
             CirlError: if there is not one flow for each arc.
 
         References: Zocco et al., CiRL (arXiv 2505.21536), Definition 2.
         """
         if flow.shape[:1] != (len(self.arcs),):
-            raise CirlError(
-                f"network '{self.name}': flows of shape {flow.shape}; the first axis is that of its {len(self.arcs)} "
-                f"arcs, {', '.join(self.arc_index)}"
-            )
+            wanted = f"the first axis is that of its {len(self.arcs)} arcs, {', '.join(self.arc_index)}"
+            raise CirlError(f"network '{self.name}': flows of shape {flow.shape}; {wanted}")
         columns = (2, math.prod(flow.shape[1:]))
         parts = self._circularity_parts(flow.reshape(len(self.arcs), columns[1]))
         if batched is not None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
@@ -18,6 +21,15 @@ NOTHING = 1e-290
 """Stock that gives nothing away: emptied again and again it would become subnormal, which does not round well."""
 
 
+def spans(sizes: Iterable[int]) -> list[slice]:
+    """Return the rows of parts of given sizes, one after the other.
+
+    >>> spans([2, 1])
+    [slice(0, 2, None), slice(2, 3, None)]
+    """
+    return [slice(first, last) for first, last in pairwise(np.cumsum([0, *sizes]).tolist())]
+
+
 def disposable(stock: Floats, parts: int) -> Floats:
     """Return the mass that a stock can give away in so many parts without their rounding overdrawing it."""
     return np.where(stock > NOTHING, stock * (1.0 - max(1e-12, 4.0 * np.finfo(float).eps * parts)), 0.0)
@@ -31,27 +43,24 @@ class RowSum:
     """
 
     def __init__(self, rows: ArrayLike, columns: ArrayLike, weights: ArrayLike, shape: tuple[int, int]) -> None:
-        """Build W from its entries; entries at the same place are added."""
+        """Build W from its entries, or from places that share one weight; entries at the same place are added."""
+        weights = np.broadcast_to(np.asarray(weights, dtype=np.float64), np.shape(rows))
         matrix = sparse.csc_array((weights, (rows, columns)), shape=shape, dtype=np.float64)
         matrix.sort_indices()
-        self.shape = shape
-        self._starts = matrix.indptr
-        self._rows = matrix.indices
+        self.shape, self._starts, self._rows = shape, matrix.indptr, matrix.indices
         self._weights: Floats = matrix.data
 
     def __call__(self, values: Floats) -> Floats:
         """Return W x for x of shape (columns, B)."""
-        result = np.zeros((self.shape[0], values.shape[1]))
-        return self.add_to(result, values)
+        return self.add_to(np.zeros((self.shape[0], values.shape[1])), values)
 
     def add_to(self, result: Floats, values: Floats) -> Floats:
         """Add W x to ``result``, shape (rows, B), in place, and return it; both arrays are C-contiguous."""
-        rows, columns = self.shape
-        batch = values.shape[1]
+        batch, entries = values.shape[1], (self._starts, self._rows, self._weights)
         if batch == 1:
-            csc_matvec(rows, columns, self._starts, self._rows, self._weights, values, result)
+            csc_matvec(*self.shape, *entries, values, result)
         else:
-            csc_matvecs(rows, columns, batch, self._starts, self._rows, self._weights, values, result)
+            csc_matvecs(*self.shape, batch, *entries, values, result)
         return result
 
     def scaled(self, factor: float) -> RowSum:

@@ -15,13 +15,7 @@ CIRO_FACTOR = 2.0
 
 
 def staged_circularity(
-    time: ArrayLike,
-    *,
-    mass: float,
-    success: float,
-    left: float,
-    trucked: float,
-    used: float,
+    time: ArrayLike, *, mass: float, success: float, left: float, trucked: float, used: float
 ) -> Floats:
     """Return λ(t) of one batch of the solids network N_s, whatever else may be under way.
 

@@ -35,14 +35,7 @@ def _ambiguity(symbol: str) -> str | None:
     return None
 
 
-MISSPELT = {
-    "y": "year",
-    "T": "t (tonne)",
-    "kT": "kt (kilotonne)",
-    "Kt": "kt (kilotonne)",
-    "KT": "kt (kilotonne)",
-    "MT": "Mt (megatonne)",
-}
+MISSPELT = {"y": "year", "T": "t (tonne)", "MT": "Mt (megatonne)"} | dict.fromkeys(["kT", "Kt", "KT"], "kt (kilotonne)")
 """Symbols that are written for a unit, and are none or another."""
 
 

@@ -10,11 +10,10 @@ from itertools import pairwise
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.declared import bound_problems, default_of
 from cirl_marl.network.elements import MAX_STEPS, TAKEN, Arc, Compartment, ControlKind, Law, Node
-from cirl_marl.network.model import Outflowing, Releasing, Vehicle, model_faults
+from cirl_marl.network.model import CompartmentModel, Outflowing, Releasing, Vehicle, model_faults
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.units import factor
-from cirl_marl.network.validate_services import service_problems
-from cirl_marl.network.validate_settings import is_whole, repeated, setting_problems
+from cirl_marl.network.validate_settings import is_whole, repeated, service_problems, setting_problems
 
 IDENTIFIER = r"^[a-z][a-z0-9_]*$"
 """How compartments and services may be called; their names are keys of definition files and names of files."""
@@ -34,10 +33,8 @@ def problems(network: Parts) -> Iterator[str]:
             yield f"units.{key}: {error}"
     if not network.nodes:
         yield "nodes: a network needs at least one"
-    kinds = {c.id: type(c.model) for c in (*network.nodes, *network.arcs) if c.model is not None}
-    strange = [
-        f"'{id_}': model {kind.__name__}: {fault}" for id_, kind in kinds.items() for fault in model_faults(kind)
-    ]
+    kinds = [(c.id, type(c.model)) for c in (*network.nodes, *network.arcs) if c.model is not None]
+    strange = [f"'{id_}': model {kind.__name__}: {fault}" for id_, kind in kinds for fault in model_faults(kind)]
     yield from strange
     if strange:
         return  # such models cannot be asked for more
@@ -55,27 +52,13 @@ def problems(network: Parts) -> Iterator[str]:
     for node in network.nodes:
         outflows = controlled.get(node.id, [])
         if node.control and node.control.kind is ControlKind.FLOW and len(outflows) != 1:
-            yield (
-                f"node '{node.id}': control.kind 'flow' needs exactly one controlled outflow, it has {len(outflows)}"
-            )
+            yield f"node '{node.id}': control.kind 'flow' needs one controlled outflow, it has {len(outflows)}"
         for arc in outflows:
-            sets_flow = [c for c in (node, arc) if c.control is not None and c.control.kind is ControlKind.FLOW]
-            if len(sets_flow) != 1:
-                yield (
-                    f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', on the arc or on its "
-                    f"donor '{node.id}'; it has {len(sets_flow)}"
-                )
-    carrying = _ports(network)
-    for (donor, port), arcs in carrying.items():
-        if len(arcs) > 1:
-            yield f"arc '{arcs[1]}': port '{port}' of '{donor}' has the arc '{arcs[0]}' already"
-    for node in network.nodes:
-        for port in node.model.ports if isinstance(node.model, Releasing) else ():
-            if (node.id, port) not in carrying:
-                yield (
-                    f"node '{node.id}': what its model releases to port '{port}' would stay; give it an arc of law "
-                    f"'batch' with by = '{node.id}' and port = '{port}'"
-                )
+            setting = sum(c.control is not None and c.control.kind is ControlKind.FLOW for c in (node, arc))
+            if setting != 1:
+                where = f"on the arc or on its donor '{node.id}'; it has {setting}"
+                yield f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', {where}"
+    yield from _port_problems(network)
     yield from service_problems(network)
     yield from setting_problems(network)
     acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
@@ -87,13 +70,19 @@ def problems(network: Parts) -> Iterator[str]:
     yield from repeated("agents", network.acting)
 
 
-def _ports(network: Parts) -> dict[tuple[str, str], list[str]]:
-    """Return the arcs that carry what is released, by compartment and port."""
-    found: dict[tuple[str, str], list[str]] = {}
+def _port_problems(network: Parts) -> Iterator[str]:
+    """Yield ports of models that have two arcs, or none."""
+    carrying: dict[tuple[str, str], str] = {}
     for arc in network.arcs:
         if arc.law is Law.BATCH and arc.by:
-            found.setdefault((arc.by, arc.port), []).append(arc.id)
-    return found
+            first = carrying.setdefault((arc.by, arc.port), arc.id)
+            if first != arc.id:
+                yield f"arc '{arc.id}': port '{arc.port}' of '{arc.by}' has the arc '{first}' already"
+    for node in network.nodes:
+        for port in node.model.ports if isinstance(node.model, Releasing) else ():
+            if (node.id, port) not in carrying:
+                remedy = f"give it an arc of law 'batch' with by = '{node.id}' and port = '{port}'"
+                yield f"node '{node.id}': what its model releases to port '{port}' would stay; {remedy}"
 
 
 def _name_problems(named: Iterable[tuple[str, str]]) -> Iterator[str]:
@@ -134,7 +123,10 @@ def _arc_problems(
             taken = ", ".join(TAKEN[arc.law]) or "none of these"
             yield f"{where}: {name} = {given!r}: law '{arc.law}' takes {taken}"
     if arc.law is Law.COMPARTMENT:
-        yield from _model_flow_problems(where, arc, everyone)
+        ends = (arc.donor, arc.recipient, arc.id)
+        giving = [end for end in ends if end in everyone and isinstance(everyone[end].model, Outflowing)]
+        if arc.by not in giving:
+            yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
     if arc.law is Law.BATCH:
         yield from _batch_problems(where, arc, network, nodes)
     if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and arc.rate == 0:
@@ -151,13 +143,6 @@ def _arc_problems(
     if arc.control and arc.control.kind is ControlKind.RATE and arc.law is Law.CONTROLLED:
         yield f"{where}: law 'controlled' needs control.kind 'flow', not 'rate'"
     yield from _common_problems(where, arc, network)
-
-
-def _model_flow_problems(where: str, arc: Arc, everyone: Mapping[str, Compartment]) -> Iterator[str]:
-    ends = (arc.donor, arc.recipient, arc.id)
-    giving = [end for end in ends if end in everyone and isinstance(everyone[end].model, Outflowing)]
-    if arc.by not in giving:
-        yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
 
 
 def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, Node]) -> Iterator[str]:
@@ -180,15 +165,15 @@ def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, No
             if time < 0:
                 yield f"{where}: {what} {time:g} must not be negative"
             elif what == "delay" and time / interval > MAX_STEPS:
-                yield (
-                    f"{where}: delay {time:g} {network.time_unit} is {time / interval:.6g} control intervals of "
-                    f"{interval:g} {network.time_unit}, more than {MAX_STEPS:,}. Is it in the wrong unit?"
-                )
+                long = f"{time / interval:.6g} control intervals of {interval:g} {network.time_unit}"
+                excess = f"{long}, more than {MAX_STEPS:,}. Is it in the wrong unit?"
+                yield f"{where}: delay {time:g} {network.time_unit} is {excess}"
             elif not is_whole(time / interval) or (0 < time < interval / 2):
                 yield f"{where}: {what} {time:g} is not a whole number of control intervals of {interval:g}"
-    for what, given in (("set_point", arc.set_point), ("control of kind 'rate'", _rate_control(arc))):
-        if given is not None:
-            yield f"{where}: law 'batch' takes no {what}"
+    if arc.set_point is not None:
+        yield f"{where}: law 'batch' takes no set_point"
+    if arc.control is not None and arc.control.kind is ControlKind.RATE:
+        yield f"{where}: law 'batch' takes no control of kind 'rate'"
     donor = nodes.get(arc.donor)
     if arc.by and donor is not None:
         ports = donor.model.ports if isinstance(donor.model, Releasing) else ()
@@ -217,10 +202,6 @@ def _has_vehicle(arc: Arc) -> bool:
     return arc.law is Law.BATCH and isinstance(arc.model, Vehicle)
 
 
-def _rate_control(arc: Arc) -> str | None:
-    return arc.control.kind if arc.control is not None and arc.control.kind is ControlKind.RATE else None
-
-
 def _common_problems(where: str, compartment: Compartment, network: Parts) -> Iterator[str]:
     yield from bound_problems(compartment, f"{where}: ")
     states = compartment.model.ranged_states if compartment.model is not None else ()
@@ -229,18 +210,12 @@ def _common_problems(where: str, compartment: Compartment, network: Parts) -> It
     for low, high in compartment.inner:
         if not (math.isfinite(low) and math.isfinite(high)) or low > high:
             yield f"{where}: initial range [{low}, {high}] of an inner state is empty or not finite"
-    control = compartment.control
-    yield from _bound_problems(where, compartment)
-    yield from _context_problems(where, compartment)
-    inputs = compartment.model.input_names if compartment.model is not None else ()
-    if compartment.model is not None and inputs and (control is None or control.kind is not ControlKind.INPUT):
-        yield (
-            f"{where}: model '{compartment.model.kind}' needs a control of kind 'input' for {', '.join(inputs)}, "
-            f"not {control.kind if control else 'none'}"
-        )
+    control, model = compartment.control, compartment.model
+    if model is not None:
+        yield from _model_problems(where, compartment, model)
     if control is None:
         return
-    if control.kind is ControlKind.INPUT and not inputs:
+    if control.kind is ControlKind.INPUT and (model is None or not model.input_names):
         yield f"{where}: control.kind 'input' needs a model with inputs"
     unit = f" {network.mass_unit}/{network.time_unit}" if control.kind is ControlKind.FLOW else ""
     if control.kind is ControlKind.FLOW and control.low < 0 and network.episode.solver != "euler":
@@ -248,37 +223,28 @@ def _common_problems(where: str, compartment: Compartment, network: Parts) -> It
     if not all(map(math.isfinite, (control.low, control.neutral, control.high))):
         yield f"{where}: control bounds must be finite"
     elif not control.low <= control.neutral <= control.high or control.low == control.high:
-        yield (
-            f"{where}: control needs low <= neutral <= high and low < high, "
-            f"got {control.low:g}, {control.neutral:g}, {control.high:g}{unit}"
-        )
+        given = f"{control.low:g}, {control.neutral:g}, {control.high:g}{unit}"
+        yield f"{where}: control needs low <= neutral <= high and low < high, got {given}"
     if control.kind is ControlKind.RATE and control.low < 0:
         yield f"{where}: control.low {control.low:g} is negative; a valve cannot reverse a flow"
 
 
-def _context_problems(where: str, compartment: Compartment) -> Iterator[str]:
-    """Yield what a compartment's model asks the network for that it is not told there."""
-    told: tuple[str, ...] = ()
-    if isinstance(compartment, Node):
-        told = ("stock_kg",)
-    elif isinstance(compartment, Arc) and _has_vehicle(compartment):
-        told = ("load_kg",)
-    model = compartment.model
-    for name in () if model is None else model.context_names:
-        if model is not None and name not in told:
-            yield f"{where}: model '{model.kind}': context_names: {unknown('quantity told to this model', name, told)}"
-
-
-def _bound_problems(where: str, compartment: Compartment) -> Iterator[str]:
-    """Yield starts and controls beyond what the equations of a compartment's model hold for."""
-    model, control = compartment.model, compartment.control
-    if model is None:
-        return
+def _model_problems(where: str, compartment: Compartment, model: CompartmentModel) -> Iterator[str]:
+    """Yield what a model asks for that it is not given, and starts and controls beyond what its equations hold for."""
+    where, control, inputs = f"{where}: model '{model.kind}'", compartment.control, model.input_names
+    if inputs and (control is None or control.kind is not ControlKind.INPUT):
+        given = control.kind if control else "none"
+        yield f"{where} needs a control of kind 'input' for {', '.join(inputs)}, not {given}"
+    carried = ("load_kg",) if isinstance(compartment, Arc) and _has_vehicle(compartment) else ()
+    told = ("stock_kg",) if isinstance(compartment, Node) else carried
+    for name in model.context_names:
+        if name not in told:
+            yield f"{where}: context_names: {unknown('quantity told to this model', name, told)}"
     states = model.ranged_states
     ranges = dict(zip(states, compartment.inner, strict=True)) if len(states) == len(compartment.inner) else {}
     if control is not None:
-        ranges |= dict.fromkeys(model.input_names, (control.low, control.high))
+        ranges |= dict.fromkeys(inputs, (control.low, control.high))
     for name, (low, high) in model.bounds.items():
         if name in ranges and not (low <= ranges[name][0] and ranges[name][1] <= high):
             given = f"[{ranges[name][0]:g}, {ranges[name][1]:g}]"
-            yield f"{where}: model '{model.kind}' holds for {name} in [{low:g}, {high:g}], not for {given}"
+            yield f"{where} holds for {name} in [{low:g}, {high:g}], not for {given}"

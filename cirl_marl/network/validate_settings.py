@@ -1,15 +1,15 @@
-"""What is wrong with the clock, the objective and the observation of a network."""
+"""What is wrong with the clock, the objective, the observation and the services of a network."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.declared import bound_problems
-from cirl_marl.network.elements import MAX_STEPS, Compartment, Episode, Law
-from cirl_marl.network.model import ContinuousModel, DiscreteTimeModel, OwnStepModel
+from cirl_marl.network.elements import MAX_STEPS, Arc, Compartment, Episode, Law, Service
+from cirl_marl.network.model import ContinuousModel, DiscreteTimeModel, Measuring, OwnStepModel
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.units import factor
 
@@ -26,12 +26,11 @@ def setting_problems(network: Parts) -> Iterator[str]:
             yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
         moving = any(isinstance(c.model, ContinuousModel | OwnStepModel) for c in (*network.nodes, *network.arcs))
         if moving or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
-            yield (
-                "solver 'exact' knows no continuous inner physics: a network with models needs solver 'rk4' or 'euler'"
-            )
-    for compartment in (*network.nodes, *network.arcs):
+            yield "solver 'exact' knows no continuous inner physics: a network with models needs 'rk4' or 'euler'"
+    everyone = (*network.nodes, *network.arcs)
+    for compartment in everyone:
         yield from _clock_problems(network, compartment)
-    tracked = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.set_point is not None)
+    tracked = dict.fromkeys(c.id for c in everyone if c.set_point is not None)
     yield from repeated("objective.tracked", objective.tracked)
     yield from repeated("observation.nodes", network.observation.nodes)
     for name in objective.tracked:
@@ -39,10 +38,8 @@ def setting_problems(network: Parts) -> Iterator[str]:
             yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
     if (network.observation.mode == "stocks") != bool(network.observation.nodes):
         yield "observation: mode 'stocks', and only that mode, lists its nodes"
-    signals = dict.fromkeys(node.id for node in network.nodes)
-    for compartment in (*network.nodes, *network.arcs):
-        if compartment.model is not None:
-            signals |= dict.fromkeys(f"{compartment.id}.{name}" for name in compartment.model.state_names)
+    inner = [f"{c.id}.{name}" for c in everyone if c.model is not None for name in c.model.state_names]
+    signals = dict.fromkeys((*(node.id for node in network.nodes), *inner))
     for name in network.observation.nodes:
         if name not in signals:
             yield f"observation: {unknown('node or inner state', name, signals)}"
@@ -62,11 +59,9 @@ def _clock_problems(network: Parts, compartment: Compartment) -> Iterator[str]:
     except CirlError:
         return  # a problem of its own, units.time
     if isinstance(model, DiscreteTimeModel) and not math.isclose(interval, model.interval, rel_tol=1e-9):
-        unit = model.time_unit
-        yield (
-            f"'{compartment.id}': model '{model.kind}' moves in steps of {model.interval:g} {unit}; "
-            f"the control interval is {interval:g} {unit}"
-        )
+        steps = f"in steps of {model.interval:g} {model.time_unit}"
+        given = f"the control interval is {interval:g} {model.time_unit}"
+        yield f"'{compartment.id}': model '{model.kind}' moves {steps}; {given}"
 
 
 def _step_problems(episode: Episode, unit: str) -> Iterator[str]:
@@ -74,18 +69,69 @@ def _step_problems(episode: Episode, unit: str) -> Iterator[str]:
     if step is None or not (math.isfinite(step) and step > 0):
         yield f"solver '{episode.solver}' needs a positive solver_step, got {step}"
         return
-    ratio = episode.control_interval / step
-    if not math.isfinite(episode.control_interval):
+    interval, ratio = episode.control_interval, episode.control_interval / step
+    if not math.isfinite(interval):
         return  # a problem of its own
     if ratio > MAX_STEPS:
-        yield (
-            f"control_interval {episode.control_interval:g} {unit} is {ratio:.6g} solver steps of {step:g} {unit}, "
-            f"more than {MAX_STEPS:,}. Is solver_step in the wrong unit?"
-        )
+        excess = f"{ratio:.6g} solver steps of {step:g} {unit}, more than {MAX_STEPS:,}"
+        yield f"control_interval {interval:g} {unit} is {excess}. Is solver_step in the wrong unit?"
     elif not is_whole(ratio) or round(ratio) < 1:
+        yield f"control_interval {interval} is not a whole number of solver steps of {step} ({ratio:.6g} steps)"
+
+
+def service_problems(network: Parts) -> Iterator[str]:
+    """Yield every mistake in the services of ``network``."""
+    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
+    providers = _providers(network)
+    for service in network.services:
+        yield from _service_problems(service, everyone, providers)
+        yield from _outflow_problems(service, network.arcs)
+
+
+def _providers(network: Parts) -> dict[str, dict[str, None]]:
+    """Return the compartments that may provide a service of each quantity."""
+    nodes, everyone = network.nodes, (*network.nodes, *network.arcs)
+    found = {
+        "flow": [arc.id for arc in network.arcs],
+        "stock": [*(node.id for node in nodes), *(arc.id for arc in network.arcs if arc.law is Law.BATCH)],
+        "measure": [c.id for c in everyone if isinstance(c.model, Measuring)],
+        "outflow": [node.id for node in nodes],
+    }
+    return {quantity: dict.fromkeys(ids) for quantity, ids in found.items()}
+
+
+def _service_problems(
+    service: Service, everyone: Mapping[str, Compartment], providers: Mapping[str, Mapping[str, None]]
+) -> Iterator[str]:
+    where = f"service '{service.id}'"
+    yield from bound_problems(service, f"{where}: ")
+    known = providers.get(service.quantity, providers["outflow"])
+    if service.provider in known and service.quantity == "measure":
+        model = everyone[service.provider].model
+        if isinstance(model, Measuring) and service.measure not in model.measure_names:
+            yield f"{where}: {unknown('measure', service.measure, model.measure_names)}"
+    if service.provider not in known:
+        kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
+        yield f"{where}: provider: {unknown(kind, service.provider, known)}"
+    if service.measure and service.quantity != "measure":
+        yield f"{where}: measure '{service.measure}': quantity '{service.quantity}' takes none"
+    yield from repeated(f"{where}: owed_by", service.owed_by)
+    for debtor in service.owed_by:
+        if debtor not in everyone:
+            yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
+    if not 0 <= service.low <= service.high or not service.high > 0:
+        yield f"{where}: the band [{service.low}, {service.high}] must not be negative or empty"
+    elif service.low == 0 and math.isinf(service.high):
+        yield f"{where}: the band from 0 without an upper end asks for nothing"
+
+
+def _outflow_problems(service: Service, arcs: tuple[Arc, ...]) -> Iterator[str]:
+    """Yield batches among the outflows that a service adds up: they count on arrival, not when they leave."""
+    batches = [arc.id for arc in arcs if arc.law is Law.BATCH and arc.donor == service.provider]
+    if service.quantity == "outflow" and batches:
         yield (
-            f"control_interval {episode.control_interval} is not a whole number of solver steps of {step} "
-            f"({ratio:.6g} steps)"
+            f"service '{service.id}': quantity 'outflow': '{service.provider}' gives batches to {', '.join(batches)}, "
+            "which count on arrival; ask for the 'flow' of that arc (what arrives) or its 'stock' (what is on the way)"
         )
 
 

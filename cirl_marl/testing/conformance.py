@@ -72,16 +72,7 @@ def check_parallel_env(make: Callable[[], AnyEnv], *, steps: int = 200, seed: in
 
 
 def check_vector_env(make: Callable[[], VectorEnv], *, steps: int = 200, seed: int = 0) -> None:
-    """Check a ``VectorEnv``: every copy's arrays, over restarts, in two environments side by side.
-
-    Args:
-        make: makes a fresh environment; called twice.
-        steps: joint steps to check.
-        seed: seed of the environments; the actions are drawn from it too.
-
-    Raises:
-        ConformanceError: at the first breach.
-    """
+    """Check every copy of a ``VectorEnv``, over restarts; arguments and errors are as in ``check_parallel_env``."""
     first, second = make(), make()
     generator = np.random.default_rng(seed)
     observations = first.reset(seed)
@@ -89,10 +80,8 @@ def check_vector_env(make: Callable[[], VectorEnv], *, steps: int = 200, seed: i
     _check_batch(first, observations, 0)
     for step in range(1, steps + 1):
         kept = copy.deepcopy(observations)
-        drawn = {
-            agent: generator.uniform(-1, 1, (first.num_envs, *space.shape))
-            for agent, space in first.action_spaces.items()
-        }
+        shapes = {agent: (first.num_envs, *space.shape) for agent, space in first.action_spaces.items()}
+        drawn = {agent: generator.uniform(-1, 1, shape) for agent, shape in shapes.items()}
         given = copy.deepcopy(drawn)
         result = first.step(given)
         same_or_raise(drawn, given, f"step {step}: the actions were changed")
@@ -147,10 +136,7 @@ class _Watched:
         env = self.env
         observations, infos = env.reset(seed=seed)
         require(set(env.agents) <= set(env.possible_agents), f"agents {env.agents} go beyond possible_agents")
-        require(
-            len(set(env.agents)) == len(env.agents) > 0,
-            f"reset: agents {env.agents} are not distinct or none",
-        )
+        require(len(set(env.agents)) == len(env.agents) > 0, f"reset: agents {env.agents} are not distinct or none")
         self._check_keys({"observations": observations, "infos": infos}, list(env.agents), 0)
         self._check_spaces(0)
         self._check_observations(observations, 0)
@@ -181,10 +167,8 @@ class _Watched:
     def _check_keys(self, returned: Mapping[str, Any], agents: list[Any], step: int) -> None:
         for name, by_agent in returned.items():
             require(isinstance(by_agent, dict), f"step {step}: {name} are a {type(by_agent).__name__}, not a dict")
-            require(
-                set(by_agent) == set(agents),
-                f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}",
-            )
+            same = set(by_agent) == set(agents)
+            require(same, f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}")
 
     def _check_spaces(self, step: int) -> None:
         env = self.env

@@ -23,10 +23,8 @@ def check_member(space: spaces.Space[Any], value: Any, where: str) -> None:
             check_member(part, value[key], f"{where}[{key!r}]")
         return
     if isinstance(space, spaces.Tuple):
-        require(
-            isinstance(value, tuple) and len(value) == len(space.spaces),
-            f"{where}: {value!r} does not fit {space}",
-        )
+        fits = isinstance(value, tuple) and len(value) == len(space.spaces)
+        require(fits, f"{where}: {value!r} does not fit {space}")
         for i, part in enumerate(space.spaces):
             check_member(part, value[i], f"{where}[{i}]")
         return
@@ -49,10 +47,8 @@ def check_memory(observations: Mapping[Any, Any], where: str) -> None:
     arrays = [(agent, leaf) for agent, seen in observations.items() for leaf in _leaves(seen)]
     for (one, mine), (other, theirs) in combinations(arrays, 2):
         if one != other and np.may_share_memory(mine, theirs):
-            require(
-                not np.shares_memory(mine, theirs),
-                f"{where}: agents {one!r} and {other!r} share an observation's memory",
-            )
+            apart = not np.shares_memory(mine, theirs)
+            require(apart, f"{where}: agents {one!r} and {other!r} share an observation's memory")
 
 
 def _leaves(value: Any) -> Iterator[np.ndarray[Any, Any]]:

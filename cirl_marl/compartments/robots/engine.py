@@ -11,11 +11,12 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import mujoco
 import numpy as np
 
+from cirl_marl.network.model import DiscreteTimeModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -98,6 +99,33 @@ def one_per_thread(make: Callable[[], E]) -> Callable[[], E]:
         return found
 
     return engine
+
+
+class Robot(DiscreteTimeModel):
+    """A model that is an engine: its state holds what the library shows, poses of welded bodies and the simulator's."""
+
+    __slots__ = ()
+    input_unit: ClassVar[str] = "1"
+    time_unit: ClassVar[str] = "s"
+    reward_state: ClassVar[RewardState] = "after"
+
+    @staticmethod
+    @abstractmethod
+    def engine() -> Engine:
+        """Return the engine of this thread."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """What the library shows, poses, state of the simulator."""
+        return self.engine().names
+
+    def start(self, stream: np.random.Generator) -> Floats:
+        """Return a start as the library draws it, shape (k,)."""
+        return self.engine().start(stream)
+
+    def advance(self, state: Floats, inputs: Floats) -> Floats:
+        """Return the state after one step of the library, shape (k, B)."""
+        return self.engine().step(state, inputs)
 
 
 def _welded_bodies(model: Any) -> list[int]:

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.robots.engine import Engine, one_per_thread
-from cirl_marl.network.model import DiscreteTimeModel, GoalTask, RewardState
+from cirl_marl.compartments.robots.engine import Engine, Robot, one_per_thread
+from cirl_marl.network.model import GoalTask
 from cirl_marl.network.rowsum import Floats
 
 with redirect_stderr(StringIO()):  # the package prints a notice about its robot hands, which are not used here
@@ -27,14 +27,9 @@ def _names(*groups: tuple[str, str]) -> tuple[str, ...]:
 
 
 OBSERVATION = _names(
-    ("grip", "xyz"),
-    ("object", "xyz"),
-    ("object_from_grip", "xyz"),
+    *((what, "xyz") for what in ("grip", "object", "object_from_grip")),
     ("finger", "rl"),
-    ("object_angle", "xyz"),
-    ("object_slip", "xyz"),
-    ("object_spin", "xyz"),
-    ("grip_move", "xyz"),
+    *((what, "xyz") for what in ("object_angle", "object_slip", "object_spin", "grip_move")),
     ("finger_move", "rl"),
 )
 ACHIEVED, DESIRED = _names(("achieved", "xyz")), _names(("desired", "xyz"))
@@ -68,11 +63,8 @@ class FetchEngine(Engine):
         return np.concatenate([shown["observation"], shown["achieved_goal"], shown["desired_goal"]])
 
 
-engine = one_per_thread(FetchEngine)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fetch(DiscreteTimeModel, GoalTask):
+class Fetch(Robot, GoalTask):
     """FetchWasteSorting: gymnasium-robotics' Fetch pick-and-place with the target fixed on the table.
 
     Inputs in [−1, 1]: displacement of the gripper in x, y, z, in 5 cm, and the fingers. Reward: 0 while the object is
@@ -84,31 +76,16 @@ class Fetch(DiscreteTimeModel, GoalTask):
 
     kind: ClassVar[str] = "fetch"
     input_names: ClassVar[tuple[str, ...]] = ("move_x", "move_y", "move_z", "fingers")
-    input_unit: ClassVar[str] = "1"
-    time_unit: ClassVar[str] = "s"
-    reward_state: ClassVar[RewardState] = "after"
+    engine = staticmethod(one_per_thread(FetchEngine))
     interval: ClassVar[float] = 0.04
     observed: ClassVar[tuple[str, ...]] = (*OBSERVATION, *ACHIEVED, *DESIRED)
     observation_names: ClassVar[tuple[str, ...]] = OBSERVATION
     achieved_names: ClassVar[tuple[str, ...]] = ACHIEVED
     desired_names: ClassVar[tuple[str, ...]] = DESIRED
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Observations, goals, pose of the gripper, state of the simulator."""
-        return engine().names
-
-    def start(self, stream: np.random.Generator) -> Floats:
-        """Return a start as gymnasium-robotics draws it, shape (k,)."""
-        return engine().start(stream)
-
-    def advance(self, state: Floats, inputs: Floats) -> Floats:
-        """Return the state after twenty steps of the simulator, shape (k, B)."""
-        return engine().step(state, inputs)
-
     def goal_reward(self, achieved: Floats, desired: Floats) -> Floats:
         """Return the sparse reward for goals of shape (..., 3)."""
-        reward: Floats = engine().env.compute_reward(achieved, desired, {})
+        reward: Floats = self.engine().env.compute_reward(achieved, desired, {})
         return reward
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
@@ -118,8 +95,7 @@ class Fetch(DiscreteTimeModel, GoalTask):
 
     def success(self, state: Floats, inputs: Floats) -> NDArray[np.bool_]:
         """Return whether the object is at the target, shape (B,)."""
-        found: NDArray[np.bool_] = self.reward(state, inputs) >= 0.0
-        return found
+        return self.reward(state, inputs) >= 0.0
 
     def _goals(self, state: Floats) -> tuple[Floats, Floats]:
         first = len(OBSERVATION)

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.robots.engine import Engine, one_per_thread
-from cirl_marl.network.model import DiscreteTimeModel, RewardState, Task
+from cirl_marl.compartments.robots.engine import Engine, Robot, one_per_thread
+from cirl_marl.network.declared import Quantity, frozen
+from cirl_marl.network.model import Task
 from cirl_marl.network.rowsum import Floats
 
-OBSERVED = (
-    "cos_0",
-    "cos_1",
-    "sin_0",
-    "sin_1",
-    "target_x_m",
-    "target_y_m",
-    "speed_0_rad_s",
-    "speed_1_rad_s",
-    "to_target_x_m",
-    "to_target_y_m",
+OBSERVED = tuple(
+    "cos_0 cos_1 sin_0 sin_1 target_x_m target_y_m speed_0_rad_s speed_1_rad_s to_target_x_m to_target_y_m".split()
 )
 
 
@@ -42,11 +33,8 @@ class ReacherEngine(Engine):
         return np.array([*self.env._get_obs(), np.linalg.norm(apart)])
 
 
-engine = one_per_thread(ReacherEngine)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reacher(DiscreteTimeModel, Task):
+@frozen
+class Reacher(Robot, Task):
     """Gymnasium's Reacher-v5, unchanged, as in the paper.
 
     Inputs are the control signals of both joints in [−1, 1], which Gymnasium documents as torques in N·m; the model
@@ -57,35 +45,16 @@ class Reacher(DiscreteTimeModel, Task):
     float32.
 
     The state holds Gymnasium's ten observations, the distance of tip and target, and the simulator's state.
-
-    Attributes:
-        reach_m: distance that counts as a success. [published]
-        torque_n_m: torque below which the arm counts as at rest. [published]
     """
 
     kind: ClassVar[str] = "reacher"
     input_names: ClassVar[tuple[str, ...]] = ("torque_0_n_m", "torque_1_n_m")
-    input_unit: ClassVar[str] = "1"
-    time_unit: ClassVar[str] = "s"
-    reward_state: ClassVar[RewardState] = "after"
+    engine = staticmethod(one_per_thread(ReacherEngine))
     interval: ClassVar[float] = 0.02
     observed: ClassVar[tuple[str, ...]] = OBSERVED
 
-    reach_m: float = 0.04
-    torque_n_m: float = 0.005
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Observations, distance, state of the simulator."""
-        return engine().names
-
-    def start(self, stream: np.random.Generator) -> Floats:
-        """Return a start as Gymnasium draws it, shape (k,)."""
-        return engine().start(stream)
-
-    def advance(self, state: Floats, inputs: Floats) -> Floats:
-        """Return the state after two steps of the simulator, shape (k, B)."""
-        return engine().step(state, inputs)
+    reach_m: Annotated[float, Quantity("distance that counts as a success [published]")] = 0.04
+    torque_n_m: Annotated[float, Quantity("torque below which the arm counts as at rest [published]")] = 0.005
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −|tip − target| − |inputs|², shape (B,)."""

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments.parameters import check_form, check_positive
 from cirl_marl.compartments.robots.fetch import Fetch
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.errors import CirlError
+from cirl_marl.network.declared import Positive, Quantity, Word, frozen
 from cirl_marl.network.model import DiscreteTimeModel, Releasing, RewardState
 from cirl_marl.network.rowsum import Floats
 
@@ -20,7 +19,7 @@ BOOKS = ("busy", "attempt_step", "done_in_batch", "sorted_now", "missed_now", "c
 BUSY, STEP, DONE, SORTED, MISSED, COMPLETE, KEY, ATTEMPT = range(len(BOOKS))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen
 class SortingStation(DiscreteTimeModel, Releasing):
     """A robot makes one attempt at each item; what it does not finish in time is missed.
 
@@ -31,12 +30,6 @@ class SortingStation(DiscreteTimeModel, Releasing):
     key drawn at the start of the episode, so the next state is a function of the state alone.
 
     Reward: the robot's while it works, else 0.
-
-    Attributes:
-        form: the robot, ``fetch`` or ``reacher``.
-        items_per_batch: items of a batch.
-        item_kg: mass of an item.
-        attempt_steps: control intervals of an attempt.
     """
 
     kind: ClassVar[str] = "sorting_station"
@@ -46,10 +39,10 @@ class SortingStation(DiscreteTimeModel, Releasing):
     context_names: ClassVar[tuple[str, ...]] = ("stock_kg",)
     ports: ClassVar[tuple[str, ...]] = ("sorted", "unsorted")
 
-    form: Literal["fetch", "reacher"] = "fetch"
-    items_per_batch: float = 4
-    item_kg: float = 100.0
-    attempt_steps: float = 50
+    form: Annotated[Literal["fetch", "reacher"], Word("the robot", of=("fetch", "reacher"))] = "fetch"
+    items_per_batch: Annotated[float, Quantity("items of a batch")] = 4
+    item_kg: Annotated[float, Positive("mass of an item")] = 100.0
+    attempt_steps: Annotated[float, Quantity("control intervals of an attempt")] = 50
 
     @property
     def unit_kg(self) -> float:
@@ -63,8 +56,7 @@ class SortingStation(DiscreteTimeModel, Releasing):
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""
-        check_form(self.form, tuple(ROBOTS))
-        check_positive(self.kind, item_kg=self.item_kg)
+        DiscreteTimeModel.__post_init__(self)
         for name in ("items_per_batch", "attempt_steps"):
             value = getattr(self, name)
             if not (float(value).is_integer() and value >= 1):
