@@ -17,7 +17,7 @@ from cirl_marl.definitions.guide import format_guide
 from cirl_marl.definitions.mistakes import mistakes_of
 from cirl_marl.definitions.schema import NetworkTable, table_of
 from cirl_marl.definitions.writing import _Writer, definition_of, fingerprint
-from cirl_marl.network.declared import Declared, Quantity, Word, bound_problems, declarations, frozen, settle
+from cirl_marl.network.declared import Declared, Numbers, Quantity, Word, bound_problems, declarations, frozen
 from cirl_marl.network.elements import Control, Episode, Objective, Observation, Service
 
 DOCUMENT = tomllib.loads((folder("envs") / "copper_net.toml").read_text(encoding="utf-8"))
@@ -31,10 +31,11 @@ class Warmed(Episode):
     warm_up: Annotated[float, Quantity("time before the first decision", of="time", low=0.0)] = 0.0
     mode: Annotated[str, Word("how it warms up", of=MODES)] = "slow"
     heated: Annotated[tuple[str, ...], Declared("what is warmed up", key="what")] = ()
-
-    def __post_init__(self) -> None:
-        """Refuse what is no number."""
-        settle("episode", self)
+    reserve: Annotated[tuple[float, float], Numbers("held back", "(low, high)", (2,), "range", "rate")] = (
+        0.0,
+        0.0,
+    )
+    cold: Annotated[bool, Declared("whether it begins cold")] = False
 
 
 def document(**more: object) -> dict[str, object]:
@@ -54,12 +55,14 @@ def read(**more: object) -> Warmed:
 
 def test_a_new_field_is_read_and_written_with_its_unit() -> None:
     """Given in hours it is in days, and what is written reads back; what is as by default is not written."""
-    given = read(warm_up={"value": 6, "unit": "hour", "source": "x"}, mode="fast", what=["use"])
+    reserve = {"low": 1, "high": 2, "unit": "1/hour", "source": "x"}
+    given = read(warm_up={"value": 6, "unit": "hour", "source": "x"}, mode="fast", what=["use"], reserve=reserve)
+    assert given.reserve == pytest.approx((24.0, 48.0))
     assert given.warm_up == pytest.approx(0.25)
     assert (given.mode, given.heated) == ("fast", ("use",))
     written = _Writer(load_network("copper_net"))._part(given)
     assert written["warm_up"] == {"value": given.warm_up, "unit": "day", "source": "network built in Python"}
-    assert read(**{key: written[key] for key in ("warm_up", "mode", "what")}) == given
+    assert read(**{key: written[key] for key in ("warm_up", "mode", "what", "reserve")}) == given
     assert not {"warm_up", "mode", "what"} & set(_Writer(load_network("copper_net"))._part(read()))
 
 
@@ -70,13 +73,56 @@ def test_a_new_field_is_checked() -> None:
     assert list(bound_problems(replace(read(), warm_up=-1.0))) == ["warm_up -1.0 must be finite and not negative"]
     said = "unknown mode 'fats'. Did you mean 'fast'? Known: slow, fast."
     assert list(bound_problems(replace(read(), mode="fats"), "episode: ")) == [f"episode: {said}"]
-    with pytest.raises(NetworkError, match=r"episode: warm_up must be a number, got \(1.0, 2.0\)"):
+    with pytest.raises(NetworkError, match=r"warmed: warm_up must be a number, got \(1.0, 2.0\)"):
         replace(read(), warm_up=(1.0, 2.0))  # type: ignore[arg-type]
     with pytest.raises(ValidationError) as raised:
         read(warmup={"value": 6, "unit": "hour", "source": "x"})
     assert mistakes_of(raised.value, table_of(Warmed))[0].startswith(
         "warmup: unknown key 'warmup'. Did you mean 'warm_up'"
     )
+
+
+@pytest.mark.parametrize(
+    ("made", "changes", "said"),
+    [
+        (Warmed(), {"cold": "no"}, "warmed: cold must be true or false, got 'no'"),
+        (Warmed(), {"heated": "use"}, "warmed: heated must be (id, …), got 'use'; write ('use',)"),
+        (Warmed(), {"mode": None}, "warmed: mode must be text, got None"),
+        (Episode(), {"horizon": 2.5}, "episode: horizon must be a whole number, got 2.5"),
+        (Episode(), {"control_interval": None}, "episode: control_interval must be a number, got None"),
+        (Objective(), {"circularity_weight": "x"}, "objective: circularity_weight must be a number, got 'x'"),
+        (Objective(), {"tracked": "use"}, "objective: tracked must be (id, …), got 'use'; write ('use',)"),
+        (
+            Service(id="s", provider="a", quantity="stock", low=1.0),
+            {"low": "104"},
+            "service 's': low must be a number, got '104'",
+        ),
+        (
+            Arc(id="k", donor="a", recipient="b"),
+            {"pollutant": "no"},
+            "arc 'k': pollutant must be true or false, got 'no'",
+        ),
+        (Arc(id="k", donor="a", recipient="b"), {"donor": 3}, "arc 'k': donor must be text, got 3"),
+    ],
+)
+def test_values_are_of_their_kind(made: Any, changes: dict[str, Any], said: str) -> None:
+    """Text is no truth value, no number and no list of ids; None is one only where nothing need be given."""
+    with pytest.raises(NetworkError) as raised:
+        replace(made, **changes)
+    assert str(raised.value) == said
+
+
+def test_numbers_without_a_spelling_are_a_fault_of_the_declaration() -> None:
+    """They would be lost on writing."""
+
+    @frozen
+    class Lossy(Episode):
+        """An episode with numbers that no file can hold."""
+
+        lost: Annotated[tuple[float, ...], Numbers("what is lost", "(value, …)")] = ()
+
+    with pytest.raises(TypeError, match="Lossy: numbers need a spelling in definition files: lost"):
+        table_of(Lossy)
 
 
 def test_a_new_field_is_documented() -> None:

@@ -88,12 +88,13 @@ class Converter:
                 self.mistakes.append(f"{where}: {value} must be a whole number of control intervals")
             return int(value)
         if isinstance(given, Range):
-            scale = self._factor(given.unit, "mass", where)
+            assert isinstance(declared, Numbers)
+            scale = self._factor(given.unit, declared.of, where)
             return given.low * scale, given.high * scale
         if isinstance(given, Batches):
             return self._batches(given, where)
         if isinstance(declared, Numbers):
-            return (self._value(given, "flow", where),)
+            return (self._value(given, declared.of, where),)
         return tuple(given) if isinstance(given, list) else given
 
     def _compartment(self, made: type[Node] | type[Arc], id_: str, table: Any, where: str) -> Any:

@@ -28,6 +28,8 @@ Source = Annotated[str, Field(min_length=1, description="where the number comes 
 Identifier = Annotated[str, Field(pattern=IDENTIFIER)]
 IN_MODEL = ("inner", "reward_scale")
 """Fields of compartments that stand in the table of their model."""
+ELSEWHERE = (*IN_MODEL, "times")
+"""Fields with numbers that stand in the table of another field."""
 
 
 class Table(BaseModel):
@@ -101,6 +103,9 @@ class ModelTable(Table):
 def table_of(made: type[Any], **more: Any) -> Any:
     """Return the table of a part: a key for each declared field, with ``more`` that Python has otherwise."""
     told, hints = declarations(made), get_type_hints(made)
+    unspelt = [n for n, each in told.items() if isinstance(each, Numbers) and not each.spelled and n not in ELSEWHERE]
+    if unspelt:
+        raise TypeError(f"{made.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
     spelled = {name: _spelled(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
     keys = {name: _key(made, name, kind) for name, kind in spelled.items() if kind is not None}
     if Number in spelled.values():
@@ -126,7 +131,7 @@ def _spelled(declared: Declared, hint: Any) -> Any:
         return declared.of if isinstance(declared.of, type) else Literal[declared.of]
     if isinstance(declared, Numbers):
         tables = {"range": Range, "batches": Batches, "flow": QuantityTable, "amount": Number}
-        return tables.get(declared.spelled)
+        return tables[declared.spelled] if declared.spelled else None
     if isinstance(declared, Nested):
         return ControlTable if declared.of == "control" else ModelTable
     if isinstance(declared, Quantity):

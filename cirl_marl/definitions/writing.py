@@ -97,7 +97,7 @@ class _Writer:
             if isinstance(declared, Quantity):
                 table[key] = self._quantity(value, declared.kind(part))
             elif isinstance(declared, Numbers):
-                table |= self._numbers(part, declared.spelled, key)
+                table |= self._numbers(part, value, declared, key)
             elif isinstance(declared, Nested):
                 table[key] = self._control(part) if declared.of == "control" else self._model(part)
             else:
@@ -107,19 +107,20 @@ class _Writer:
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
 
-    def _numbers(self, part: Any, spelled: str, key: str) -> dict[str, Any]:
-        if spelled == "range":
-            low, high = map(float, part.initial)
-            return {key: {"low": low, "high": high, "unit": self._units["mass"], "source": SOURCE}}
-        time = self._units["time"]
-        if spelled == "batches":
-            times, masses = ([float(pair[column]) for pair in part.batches] for column in (0, 1))
-            units = {"time_unit": time, "unit": self._units["mass"], "source": SOURCE}
+    def _numbers(self, part: Any, value: Any, declared: Numbers, key: str) -> dict[str, Any]:
+        """Return the table, or tables, that definition files spell several numbers in."""
+        time, unit = self._units["time"], self._units.get(declared.of, "1")
+        if declared.spelled == "range":
+            low, high = map(float, value)
+            return {key: {"low": low, "high": high, "unit": unit, "source": SOURCE}}
+        if declared.spelled == "batches":
+            times, masses = ([float(pair[column]) for pair in value] for column in (0, 1))
+            units = {"time_unit": time, "unit": unit, "source": SOURCE}
             return {key: {"times": times, "masses": masses, **units}}
-        if spelled == "flow" and part.times:
+        if declared.spelled == "flow" and part.times:
             columns = {"times": list(map(float, part.times)), "values": list(map(float, part.flow))}
             return {"series": {**columns, "time_unit": time, "unit": self._units["flow"], "source": SOURCE}}
-        return {key: self._quantity(part.flow[0], "flow")} if spelled == "flow" else {}
+        return {key: self._quantity(value[0], declared.of)} if declared.spelled == "flow" else {}
 
     def _control(self, part: Compartment) -> dict[str, Any]:
         control = part.control

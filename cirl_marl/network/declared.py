@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, MISSING, dataclass, fields
 from enum import StrEnum
 from functools import cache, partial
-from numbers import Real
+from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, dataclass_transform, get_type_hints
 
@@ -129,6 +129,7 @@ class Numbers(Declared):
     form: Annotated[str, "how they are given in Python"] = ""
     shape: Annotated[tuple[int | None, ...], "their shape, None being any length"] = (None,)
     spelled: Annotated[str, "which table of definition files holds them; empty if that of another field does"] = ""
+    of: Annotated[Kind, "kind of quantity; of batches that beside their times"] = "mass"
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
@@ -180,10 +181,22 @@ def settle(owner: str, part_: Any) -> None:
             if value not in declared.of.__members__.values():
                 raise NetworkError(owner, [unknown(declared.called or name, value, declared.of)])
             object.__setattr__(part_, name, declared.of(value))
-        elif (value is not None or default_of(type(part_), name) is not None) and (told := declared.problem(value)):
-            faults.append(f"{name} must be {told}")
+        elif value is not None or default_of(type(part_), name) is not None:
+            told = declared.problem(value) or _plain_problem(value, _hints(part_.__class__)[name])
+            faults += [f"{name} must be {told}"] if told else []
     if faults:
         raise NetworkError(owner, faults)
+
+
+class Checked:
+    """A part of a network that refuses values of another kind than declared; messages call it by its kind and id."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Check every field; take words of enumerations as definitions spell them."""
+        kind = type(self).__name__.lower()
+        settle(f"{kind} '{self.id}'" if hasattr(self, "id") else kind, self)
 
 
 def bound_problems(part_: Any, where: str = "") -> Iterator[str]:
@@ -194,6 +207,25 @@ def bound_problems(part_: Any, where: str = "") -> Iterator[str]:
             yield f"{where}{unknown(declared.called or name, value, declared.of)}"
         elif isinstance(declared, Quantity) and value is not None and (told := declared.bound_problem(value)):
             yield f"{where}{name} {value} {told}"
+
+
+@cache
+def _hints(made: Any) -> Mapping[str, Any]:
+    return get_type_hints(made)
+
+
+def _plain_problem(value: object, hint: Any) -> str:
+    """Return what a text, a truth value, ids or a count must be; nothing for other kinds of fields."""
+    if hint is bool and not isinstance(value, bool | np.bool_):
+        return f"true or false, got {value!r}"
+    if hint is int and not isinstance(value, Integral):
+        return f"a whole number, got {value!r}"
+    if hint is str and not isinstance(value, str):
+        return f"text, got {value!r}"
+    if hint == tuple[str, ...] and (isinstance(value, str) or not isinstance(value, Sequence)):
+        instead = f"; write {(value,)!r}" if isinstance(value, str) else ""
+        return f"(id, …), got {value!r}{instead}"
+    return ""
 
 
 def _problem(value: object, form: str, shape: tuple[int | None, ...]) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 
 from cirl_marl.network.declared import (
     Amount,
+    Checked,
     Declared,
     Kinds,
     Nested,
@@ -25,7 +26,6 @@ from cirl_marl.network.declared import (
     Share,
     Word,
     frozen,
-    settle,
 )
 from cirl_marl.network.model import CompartmentModel
 from cirl_marl.network.rowsum import Floats
@@ -92,7 +92,7 @@ Pair = tuple[float, float]
 
 
 @frozen
-class Control:
+class Control(Checked):
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high]."""
 
     kind: Annotated[
@@ -101,10 +101,6 @@ class Control:
     low: Annotated[float, Amount("value at action −1, of each entry of the action")]
     neutral: Annotated[float, Amount("value while nobody acts on the compartment")]
     high: Annotated[float, Amount("value at action +1, of each entry of the action")]
-
-    def __post_init__(self) -> None:
-        """Refuse what is no number; take a kind as definitions spell it."""
-        settle("control", self)
 
     def action(self, value: Floats) -> Floats:
         """Return the normalised actions, in [-1, 1], that come closest to physical values."""
@@ -123,7 +119,7 @@ INNER = Numbers(
 
 
 @frozen
-class Compartment:
+class Compartment(Checked):
     """What nodes and arcs have in common."""
 
     id: str
@@ -133,10 +129,6 @@ class Compartment:
     model: Annotated[CompartmentModel | None, MODEL] = None
     inner: Annotated[tuple[Pair, ...], INNER] = ()
     reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse what is no number; take roles and laws as definitions spell them."""
-        settle(f"{type(self).__name__.lower()} '{self.id}'", self)
 
     @property
     def actions(self) -> int:
@@ -213,6 +205,7 @@ class Arc(Compartment):
             "e, mass/time (exogenous law); with ``times`` the values of a step function, else a single value",
             "(value, …)",
             spelled="flow",
+            of="flow",
         ),
     ] = (0.0,)
     times: Annotated[
@@ -234,7 +227,7 @@ class Arc(Compartment):
 
 
 @frozen
-class Service:
+class Service(Checked):
     """What the network is there for: a stock or flow to be kept within a band, under an ``id`` of its own.
 
     The level is 1 inside ``[low, high]``, ``q/low`` below it and ``high/q`` above it; the shortfall is 1 - level. A
@@ -266,7 +259,7 @@ class Service:
 
 
 @frozen
-class Episode:
+class Episode(Checked):
     """Time and solver of an episode."""
 
     control_interval: Annotated[float, Positive("h, time between two decisions", of="time", required=True)] = 1.0
@@ -289,7 +282,7 @@ class Episode:
 
 
 @frozen
-class Objective:
+class Objective(Checked):
     """How circularity and rewards are read off the network."""
 
     reference_interval: Annotated[float, Positive("Δ of λ = −(m_fb + Δ·ṁ_fc)", of="time", required=True)] = 1.0
@@ -317,7 +310,7 @@ class Objective:
 
 
 @frozen
-class Observation:
+class Observation(Checked):
     """What agents see by default."""
 
     mode: Annotated[
