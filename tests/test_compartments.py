@@ -257,7 +257,6 @@ class TestRegistry:
         assert {found[kind] for kind in DISCRETE} == {f"robots.{kind}" for kind in DISCRETE}
         assert all(model_class(kind) is model for kind, model in models().items())
 
-    @pytest.mark.medium
     def test_discovery_is_light(self) -> None:
         """A kind that is no robot loads neither torch nor mujoco, and not even asking for what there is loads torch."""
         code = (
@@ -336,7 +335,7 @@ class TestEveryModel:
         for name, values in context.items():
             np.testing.assert_array_equal(values, kept[2][name])
         assert factor(model.time_unit, "s") > 0.0
-        with pytest.raises(AttributeError):
+        with pytest.raises((AttributeError, TypeError)):
             setattr(model, next((each.name for each in fields(model)), "kind"), 1.0)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("size", [2, 7, 64])
@@ -351,8 +350,6 @@ class TestEveryModel:
             for name, value in alone.items():
                 np.testing.assert_array_equal(value, together[name][..., column], err_msg=name)
 
-    @pytest.mark.medium
-    @pytest.mark.sample(6)
     def test_agrees_with_scipy(self, model: ContinuousModel) -> None:
         """Runge-Kutta at a fine step and scipy's DOP853 at 1e-11 agree."""
         state, inputs, context = sample(model, 3)
