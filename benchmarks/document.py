@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -23,8 +24,19 @@ def write_sections(document: Path, sections: Mapping[str, str]) -> None:
         if start not in text or end not in text:
             raise CirlError(f"{document}: has no marks {start} and {end} to write between")
         before, rest = text.split(start, 1)
-        text = f"{before}{start}\n{section}\n{end}{rest.split(end, 1)[1]}"
+        text = f"{before}{start}\n{wrapped(section)}\n{end}{rest.split(end, 1)[1]}"
     write_atomically(document, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def wrapped(text: str) -> str:
+    """Return a document whose lines end before column 120, but for tables and headings."""
+    lines = []
+    for line in text.split("\n"):
+        indent = "  " if line.startswith(("- ", "  ")) else ""
+        plain = len(line) <= 120 or line.startswith(("|", "#"))
+        fill = textwrap.fill(line, 120, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+        lines.append(line if plain else fill)
+    return "\n".join(lines)
 
 
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

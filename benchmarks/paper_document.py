@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from benchmarks.document import markdown_table
+from benchmarks.document import markdown_table, wrapped
 from benchmarks.paper_summary import summary
 from cirl_marl.paper.published import ENVIRONMENTS, HARDWARE, SOURCE
 from cirl_marl.paper.results import WINDOW, Result
@@ -49,7 +49,7 @@ def markdown(results: Sequence[Result], comment: str = "") -> str:
         table = markdown_table(COLUMNS, table_rows(environment, results))
         parts.append(f"{title}\n\n{table}\n\n{notes(environment, results)}\n")
     parts.append(_provenance(results))
-    return "\n".join(parts)
+    return wrapped("\n".join(parts))
 
 
 def _provenance(results: Sequence[Result]) -> str:

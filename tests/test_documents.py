@@ -22,8 +22,6 @@ from cirl_marl.learners import load_recipe, train
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("[a-z]*/README.md")])
-WRITTEN = [path for path in DOCUMENTS if path.name != "paper_tables.md"]
-"""Documents that a benchmark does not write whole."""
 WIDTH = 120
 COMMANDS: dict[str, Any] = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
 
@@ -90,11 +88,10 @@ def test_table_cells_are_short(document: Path) -> None:
     assert [cell for cell in cells if len(cell) > WIDTH] == []
 
 
-@pytest.mark.parametrize("document", WRITTEN, ids=named)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
 def test_lines_wrap(document: Path) -> None:
-    """Lines end before column 120, but for table rows and what a benchmark writes between marks."""
-    text = re.sub(r"^<!-- (\w+) -->$.*?^<!-- /\1 -->$", "", document.read_text(), flags=re.M | re.S)
-    assert [line for line in text.splitlines() if len(line) > WIDTH and not line.startswith("|")] == []
+    """Lines end before column 120, but for table rows."""
+    assert [line for line in document.read_text().splitlines() if len(line) > WIDTH and not line.startswith("|")] == []
 
 
 def test_readme_is_short() -> None:
