@@ -46,7 +46,7 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "paper_tables.md"
 def main(
     out: Annotated[Path, typer.Option(help="Where results are kept; trials need a place of their own.")] = KEPT,
     only: Annotated[list[str] | None, typer.Option(help="ENV or ENV:ALGORITHM; repeatable. Default: all.")] = None,
-    settings: Annotated[str | None, typer.Option(help="published or tuned; default: both.")] = None,
+    settings: Annotated[str | None, typer.Option("--recipe", help="published or tuned; default: both.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each row; default: the paper's.")] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Seeds of each row; default: 3, of slow learners 1.")] = None,
     episodes: Annotated[
