@@ -563,6 +563,17 @@ def test_improvement_that_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert "service level" in capsys.readouterr().out and Path("p.csv").is_file()
 
 
+def test_scenarios_write_files_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Names carry network, scenario and control, of a simulation as of a plan."""
+    monkeypatch.chdir(tmp_path)
+    for command in ("simulate", "plan"):
+        for scenario in ((), ("--scenario", "paper")):
+            assert run(monkeypatch, command, "carbo_net", "--control", "neutral", *scenario) == 0
+    names = {path.name for path in tmp_path.glob("*.csv")}
+    stems = ("carbo_net_neutral", "carbo_net_paper_neutral")
+    assert names == {*(f"{stem}.csv" for stem in stems), *(f"plan_{stem}.csv" for stem in stems)}
+
+
 @pytest.mark.medium
 def test_simulate_with_inner_physics(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -14,7 +14,7 @@ from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Rollout, interval_ends, rollout
 from cirl_marl.definitions.catalogue import load_network, networks, recipes
-from cirl_marl.definitions.reading import Definition
+from cirl_marl.definitions.reading import DEFAULT, Definition
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.figures import time_window
@@ -174,7 +174,7 @@ def simulate(
         run = rollout(env, watched, seed=seed, progress=watched.acted)
     folder = out or Path()
     folder.mkdir(parents=True, exist_ok=True)
-    name = f"{found.name}_{control}"
+    name = _called(found, control)
     time = interval_ends(found)
     env.reset(seed=seed)  # to where the episode began
     began = env.physical
@@ -204,7 +204,8 @@ def plan(
         str | None, typer.Option(help=f"Who acts in a network: {', '.join(CONTROLLERS)}; a run acts by its policies.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="CSV file to write; default: plan_NETWORK_CONTROL.csv or plan_RUN.csv here.")
+        Path | None,
+        typer.Option(help="CSV file to write; default: plan_NETWORK[_SCENARIO]_CONTROL or plan_RUN."),
     ] = None,
     scenario: Scenario = None,
     seed: Annotated[
@@ -222,7 +223,7 @@ def plan(
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     env, controller = _actor(source, control, scenario, min_service)
-    who = f"{env.network.name}_{control}" if control is not None else Path(source).resolve().name
+    who = Path(source).resolve().name if control is None else _called(env.network, control)
     path = Path(f"plan_{who}.csv") if out is None else out
     with bar("planning") as progress:
         watched = Watched(controller, progress)
@@ -233,6 +234,12 @@ def plan(
     if controller.note:
         say(controller.note)
     say(f"wrote {path}")
+
+
+def _called(network: Network, control: str) -> str:
+    """Return the stem of a file of ``control`` in a network, so that no scenario takes the place of another."""
+    scenario = [] if network.scenario_name == DEFAULT else [network.scenario_name]
+    return "_".join([network.name, *scenario, control])
 
 
 def _actor(
