@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import highspy
+import numpy as np
 import pytest
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, load_network
@@ -14,6 +16,7 @@ from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.network import Floats
 from cirl_marl.optimum import NoCertificate, achieved, bound, improved, solver
 from cirl_marl.optimum.mpc import MPC
 
@@ -162,3 +165,21 @@ def test_scales_leave_the_programs_answer() -> None:
     """Multipliers come back in the units of the network: they prove what the plan does."""
     found = bound(replace(yearly(0.5, horizon=2), mass_unit="Mt"), service_weight=0.5)
     assert found.verify().bound == pytest.approx(found.verify().objective, rel=1e-6)
+
+
+def test_a_plan_lies_within_its_boxes_too() -> None:
+    """Any imbalance satisfies every row if it is large enough; where nothing touches the environment its box is 0."""
+    found = bound(yearly(0.5, horizon=2))
+    problem, layout = found.problem, found.problem.layout
+    size = np.maximum(np.abs(problem.low), np.abs(problem.high))
+    size[size == 0] = 1.0
+    scaled = solver._Scaled(problem, size)
+
+    def feasible(plan: Floats) -> bool:
+        answer = SimpleNamespace(getSolution=lambda: SimpleNamespace(col_value=plan / size))
+        return scaled.is_feasible(cast(highspy.Highs, answer))
+
+    plan = found.solution.copy()
+    assert feasible(plan)
+    plan[layout.imbalance] = 1.0
+    assert not feasible(plan)

@@ -92,3 +92,15 @@ def test_scenarios_are_built_when_asked_for(tmp_path: Path) -> None:
     assert sound.scenario("paper").scenario("default") == sound
     with pytest.raises(KeyError):
         sound.scenarios["default"]
+
+
+def test_scenarios_do_not_repeat_what_is_wrong_by_default(tmp_path: Path) -> None:
+    """A fault outside [scenarios] is told once."""
+    text = (folder("envs") / "net_zero.toml").read_text(encoding="utf-8")
+    assert 'to = "atmosphere"' in text
+    path = tmp_path / "net.toml"
+    path.write_text(text.replace('to = "atmosphere"', 'to = "atmosfere"'), encoding="utf-8")
+    with pytest.raises(DefinitionError) as raised:
+        Definition(path).check()
+    (line,) = str(raised.value).splitlines()
+    assert "unknown node 'atmosfere'" in line
