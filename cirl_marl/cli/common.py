@@ -24,7 +24,9 @@ app = typer.Typer(
 console = Console(width=None if sys.stdout.isatty() else 140)
 errors = Console(stderr=True)
 
-NetworkName = Annotated[str, typer.Argument(metavar="NETWORK", help="Name in the catalogue, or a .toml file.")]
+NetworkName = Annotated[
+    str, typer.Argument(metavar="NETWORK", help="Name in the catalogue, or a file: FILE.toml, FILE.toml:REGION.")
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a training run.")]
 Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]

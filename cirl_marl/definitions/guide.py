@@ -10,7 +10,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from cirl_marl.definitions import schema
+from cirl_marl.definitions import quantities, schema
 
 PARTS: dict[str, tuple[Any, str]] = {
     "network": (schema.NetworkTable, "The file itself"),
@@ -24,9 +24,12 @@ PARTS: dict[str, tuple[Any, str]] = {
     "control": (schema.ControlTable, "`control` of a node or an arc"),
     "model": (schema.ModelTable, "`model` of a node or an arc"),
     "service": (schema.ServiceTable, "`[services.NAME]`"),
-    "quantity": (schema.QuantityTable, "Every number with a unit"),
-    "range": (schema.Range, "`initial` of a node"),
-    "series": (schema.Series, "`series` of an arc"),
+    "quantity": (quantities.QuantityTable, "Every number with a unit"),
+    "series": (quantities.SeriesTable, "In the place of a quantity that may change in time"),
+    "column": (quantities.ColumnTable, "In the place of a quantity that may change in time"),
+    "amounts": (quantities.AmountSeries, "In the place of `low`, `neutral` or `high` of a control"),
+    "cells": (quantities.AmountColumn, "In the place of `low`, `neutral` or `high` of a control"),
+    "range": (quantities.Range, "`initial` of a node"),
     "batches": (schema.Batches, "`batches` of an arc"),
 }
 
@@ -50,7 +53,9 @@ def _part(name: str, table: type[BaseModel], place: str) -> str:
 
 def _key(key: str, field: FieldInfo) -> str:
     """Return the line of a key: what it takes, if that is a table of its own, and what it means."""
-    taken = [name for name, (table, _) in PARTS.items() if table in (field.annotation, *get_args(field.annotation))]
+    kinds = [*quantities.forms(field.annotation).values(), field.annotation]
+    kinds += get_args(field.annotation)
+    taken = [name for name, (table, _) in PARTS.items() if table in kinds]
     needed = "required" if field.is_required() else "may be left out"
     about = f": {field.description.replace('``', '`')}" if field.description else ""
     return _wrapped(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in taken), needed])}){about}.")

@@ -171,9 +171,10 @@ def _create(directory: Path, config: RunConfig, network: Network) -> RunDirector
     asked = {group: {name: getattr(now, name)} for name, (group, now) in groups.items() if name in config.options}
     source = network.source
     if source is not None and source.is_file():
-        read = load_network(source, scenario=network.scenario_name).with_options(**asked)
+        read = load_network(network.address, scenario=network.scenario_name).with_options(**asked)
         if read == network:
-            return RunDirectory.create(directory, config, source)
+            files = {"region": read.region, "data_sha256": dict(read.data_sha256)}
+            return RunDirectory.create(directory, config.model_copy(update=files), source)
     with tempfile.TemporaryDirectory() as folder:
         written = Path(folder) / "network.toml"
         write_network(network, written)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import field
 from itertools import pairwise
 from typing import Annotated
 
@@ -34,7 +35,7 @@ class Series(Checked, Changing):
             "time up to which the last value is known to hold; None: for good (``step``), or no longer", of="time"
         ),
     ] = None
-    origin: Annotated[str, Declared("where it was read from, for messages")] = ""
+    origin: Annotated[str, Declared("where it was read from, for messages")] = field(default="", compare=False)
 
     @property
     def end(self) -> float:
