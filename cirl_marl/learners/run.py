@@ -20,6 +20,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from pydantic import StrictInt, ValidationError, field_validator
+from pydantic import Field, StrictInt, ValidationError, field_validator
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.mistakes import mistakes_of
@@ -59,7 +60,7 @@ class RunConfig(Settings):
     envs: StrictInt
     options: dict[str, Any]
     region: str = ""
-    data_sha256: dict[str, str] = {}
+    data_sha256: dict[str, str] = Field(default_factory=dict)
 
     @field_validator("options")
     @classmethod
@@ -94,10 +95,8 @@ class RunDirectory:
             raise RunError(f"{run.path}: a run on disk needs a recipe of plain values: {error}") from error
         run.path.mkdir(parents=True, exist_ok=True)
         kept = run.path / "network" if config.data_sha256 else run.path
-        for name, source in {
-            "network.toml": definition,
-            **{n: definition.parent / n for n in config.data_sha256},
-        }.items():
+        data = {name: definition.parent / name for name in config.data_sha256}
+        for name, source in {"network.toml": definition, **data}.items():
             (kept / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, kept / name)
         write_json(run.path / "versions.json", versions())
@@ -173,15 +172,12 @@ class RunDirectory:
             RunError: if a file of it is missing, or is not the one that it was trained with.
         """
         config = self.config
-        for name in config.data_sha256:
-            self._file(f"network/{name}")
-        address = f"{self.definition}:{config.region}" if config.region else self.definition
-        network = load_network(address, scenario=config.scenario)
         for name, sha256 in config.data_sha256.items():
-            if network.data_sha256.get(name) != sha256:
-                file, given = self.definition.parent / name, network.data_sha256.get(name)
-                raise RunError(f"{file}: is not the file of this training: its SHA-256 was {sha256}, now it is {given}")
-        return network
+            file = self._file(f"network/{name}")
+            if (given := hashlib.sha256(file.read_bytes()).hexdigest()) != sha256:
+                raise RunError(f"{file}: is not the file of this training, whose SHA-256 was {sha256}; it is {given}")
+        address = f"{self.definition}:{config.region}" if config.region else self.definition
+        return load_network(address, scenario=config.scenario)
 
     @property
     def definition(self) -> Path:
