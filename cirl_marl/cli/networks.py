@@ -19,6 +19,7 @@ from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.figures import time_window
 from cirl_marl.network import Network
+from cirl_marl.network.calendar import labels
 from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
 
 if TYPE_CHECKING:
@@ -215,7 +216,8 @@ def plan(
 ) -> None:
     """Write what a policy or controller does in one episode: its actions in physical units over time, as CSV.
 
-    A row is a control interval: when it begins and ends, the value of every control (a flow ordered, a factor on what a
+    A row is a control interval: when it begins and ends, the year or date on which it begins if the network has a
+    start on the calendar, the value of every control (a flow ordered, a factor on what a
     valve lets through, or an input of a model) with its unit, the resulting flows, circularity and service level.
     """
     from cirl_marl.controllers.schedule import schedule
@@ -289,7 +291,8 @@ def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> No
     from cirl_marl.records.files import write_atomically
 
     network, physics = env.network, env.dynamics.inner
-    header = [f"time ({network.time_unit})", f"circularity ({network.mass_unit})", "service level"]
+    calendar, dates = labels(network, np.concatenate([[0.0], time]))
+    header = [f"time ({network.time_unit})", *calendar, f"circularity ({network.mass_unit})", "service level"]
     header += [f"stock of {node.id} ({network.mass_unit})" for node in network.nodes]
     header += [f"flow of {arc.id} ({network.mass_unit}/{network.time_unit})" for arc in network.arcs]
     header += [f"mass on {line.id} ({network.mass_unit})" for line in env.dynamics.batches.lines]
@@ -298,11 +301,12 @@ def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> No
     held = [*start.stock[env.rows.nodes, 0].tolist(), *[""] * len(network.arcs)]
     held += [*env.dynamics.batches.loads(start.stock)[:, 0].tolist(), *start.inner[physics.visible, 0].tolist()]
 
-    columns = (time, run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
+    measured = (run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
+    columns = [time.tolist(), *(each[1:] for each in dates), *(column.tolist() for column in measured)]
 
     def write(target: Path) -> None:
         with target.open("w", newline="") as file:
-            rows = zip(*(column.tolist() for column in columns), strict=True)
-            csv.writer(file).writerows([header, [0.0, "", "", *held], *rows])
+            begin = [0.0, *(each[0] for each in dates), "", "", *held]
+            csv.writer(file).writerows([header, begin, *zip(*columns, strict=True)])
 
     write_atomically(path, write)

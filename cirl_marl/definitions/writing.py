@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from datetime import date
 from typing import Any
 
 import tomlkit
@@ -98,7 +99,7 @@ class _Writer:
             if not needed and value == default_of(type(part), name):
                 continue
             if isinstance(declared, CalendarTime):
-                table[key] = value
+                table[key] = value if isinstance(value, date) else float(value)
             elif isinstance(declared, Quantity):
                 table[key] = self._quantity(value, declared.kind(part))
             elif isinstance(declared, Numbers):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from datetime import date, datetime, timedelta
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats
@@ -48,7 +49,7 @@ def elapsed(moment: Moment, start: Moment, unit: str) -> float:
     return (year(moment) - year(start)) * factor("year", unit)
 
 
-def years(network: Parts, time: Floats) -> Floats:
+def years(network: Parts, time: ArrayLike) -> Floats:
     """Return times since the start of an episode as calendar years; the network must have a start."""
     start = network.episode.start
     assert start is not None
@@ -56,17 +57,17 @@ def years(network: Parts, time: Floats) -> Floats:
     return found
 
 
-def labels(network: Parts, time: Floats) -> tuple[str, list[str]]:
-    """Return what times are called on the calendar, ``year`` or ``date``, and each as text; nothing without a start."""
+def labels(network: Parts, time: Floats) -> tuple[list[str], list[list[str]]]:
+    """Return the headers and the columns of a table for times on the calendar: one each, or none without a start."""
     start = network.episode.start
     if start is None:
-        return "", []
+        return [], []
     if in_years(network.time_unit):
-        return "year", [f"{each:.10g}" for each in years(network, time).tolist()]
+        return ["year"], [[f"{each:.10g}" for each in years(network, time).tolist()]]
     seconds = np.asarray(time, dtype=np.float64) * factor(network.time_unit, "s")
     dates = [_clock(start) + timedelta(seconds=round(each)) for each in seconds.tolist()]
     whole = all(each.time() == each.min.time() for each in dates)
-    return "date", [each.isoformat(" ", "minutes")[: 10 if whole else None] for each in dates]
+    return ["date"], [[each.isoformat(" ", "minutes")[: 10 if whole else None] for each in dates]]
 
 
 def _clock(moment: Moment) -> datetime:

@@ -15,6 +15,7 @@ from scipy.special import stdtrit
 from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dressed, save, shaped, spoken
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import Law
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def save_circularity(
     ``runs`` are λ, mass, and ``services`` service levels by control, of shape (episodes, steps), ``time`` (steps,);
     other shapes raise a ``CirlError``.
     """
+    time = _shown(time, network)
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
     names = list(dict.fromkeys([*runs, *services]))
@@ -133,10 +135,10 @@ def save_trajectory(
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {arc}" for arc in on_the_way]
         stock = np.concatenate([stock, shaped("load", load, (len(on_the_way), *steps))])
-    held_at = time
+    held_at = time = _shown(time, network)
     if start is not None:
         stock = np.column_stack([shaped("start", start, (len(stock),)), stock])
-        held_at = np.concatenate([[0.0], time])
+        held_at = np.concatenate([_shown(np.zeros(1), network), time])
     heights = (1.25, 1.25, 0.8) if service is None else (1.25, 1.25, 0.8, 0.5)
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
     figure.suptitle(title, fontsize=11, fontweight="bold")
@@ -196,8 +198,14 @@ def _dots(time: Floats) -> str:
     return "o" if len(time) == 1 else ""
 
 
+def _shown(time: Floats, network: Network) -> Floats:
+    """Return times as axes show them: as calendar years, if the network has a start."""
+    return time if network.episode.start is None else years(network, time)
+
+
 def _set_time(axes: Axes, time: Floats, network: Network) -> None:
-    axes.set_xlabel(f"time / {network.time_unit}", fontsize=9)
+    axes.set_xlabel("year" if network.episode.start is not None else f"time / {network.time_unit}", fontsize=9)
+    axes.ticklabel_format(axis="x", useOffset=False)  # 2000, not 0 with +2e3 in a corner
     if len(time) > 1:
         axes.set_xlim(float(np.min(time)), float(np.max(time)))
 
