@@ -25,10 +25,8 @@ PARTS: dict[str, tuple[Any, str]] = {
     "model": (schema.ModelTable, "`model` of a node or an arc"),
     "service": (schema.ServiceTable, "`[services.NAME]`"),
     "quantity": (quantities.QuantityTable, "Every number with a unit"),
-    "series": (quantities.SeriesTable, "In the place of a quantity that may change in time"),
-    "column": (quantities.ColumnTable, "In the place of a quantity that may change in time"),
-    "amounts": (quantities.AmountSeries, "In the place of `low`, `neutral` or `high` of a control"),
-    "cells": (quantities.AmountColumn, "In the place of `low`, `neutral` or `high` of a control"),
+    "series": (quantities.SeriesTable, "For a quantity; in a control without `unit` and `source`, which are its own"),
+    "column": (quantities.ColumnTable, "For a quantity; in a control without `unit` and `source`, which are its own"),
     "range": (quantities.Range, "`initial` of a node"),
     "batches": (schema.Batches, "`batches` of an arc"),
 }
@@ -55,7 +53,7 @@ def _key(key: str, field: FieldInfo) -> str:
     """Return the line of a key: what it takes, if that is a table of its own, and what it means."""
     kinds = [*quantities.forms(field.annotation).values(), field.annotation]
     kinds += get_args(field.annotation)
-    taken = [name for name, (table, _) in PARTS.items() if table in kinds]
+    taken = [name for name, (table, _) in PARTS.items() if {table, *table.__bases__} & set(kinds)]
     needed = "required" if field.is_required() else "may be left out"
     about = f": {field.description.replace('``', '`')}" if field.description else ""
     return _wrapped(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in taken), needed])}){about}.")

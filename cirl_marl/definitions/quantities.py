@@ -67,7 +67,7 @@ class AmountSeries(Table):
     interpolation: Interpolation = "step"
     time_unit: TimeUnit = None
     until: Moment | None = Field(
-        None, description="until when the last value holds; without it that of steps holds for good, that of lines not"
+        None, description="when the last value ceases to hold; by default never with steps, at its time with lines"
     )
 
 
@@ -84,7 +84,7 @@ class AmountColumn(Table):
     file: str = Field(description="name of the file, which lies in the folder of the definition or below it")
     column: str = Field(description="the column with the numbers")
     where: dict[str, str] = Field(
-        {}, description="columns and the texts that they have in the rows that are meant; {region} is that of [regions]"
+        {}, description="texts by which rows are chosen, by column; {region} in a text stands for that of [regions]"
     )
     times: str | None = Field(
         None, description="the column with the times; default: ``year``, if there is one that ``where`` leaves free"

@@ -152,8 +152,8 @@ class NetworkTable(Table):
     references: list[str] = Field([], description="where its numbers come from, as a whole")
     regions: dict[Identifier, str] = Field(
         {},
-        description="networks that this file stands for, as the text that replaces {region} in the title and in "
-        "``where``, by what their names end in",
+        description="if the file stands for several networks: by what the name of each ends in, the text for which "
+        "{region} stands in its title and in ``where``",
     )
     units: UnitsTable
     episode: EpisodeTable  # type: ignore[valid-type]

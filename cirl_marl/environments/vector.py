@@ -124,7 +124,7 @@ class VectorEnv:
 
     @property
     def year(self) -> Floats | None:
-        """Calendar year of each copy with its fraction, shape (B,); None if the network has no start on the calendar."""
+        """Calendar year of each copy, with its fraction, shape (B,); None if the network does not begin in a year."""
         episode = self.network.episode
         return None if episode.start is None else years(self.network, self.physical.step * episode.control_interval)
 

@@ -20,6 +20,7 @@ Moment = float | date
 
 YEAR = 365.25
 """Days of a year."""
+LAST_YEAR = 9999
 
 
 def in_years(unit: str) -> bool:
@@ -57,14 +58,14 @@ def years(network: Parts, time: ArrayLike) -> Floats:
     return found
 
 
-def labels(network: Parts, time: Floats) -> tuple[list[str], list[list[str]]]:
+def labels(network: Parts, time: ArrayLike) -> tuple[list[str], list[list[str]]]:
     """Return the headers and the columns of a table for times on the calendar: one each, or none without a start."""
     start = network.episode.start
     if start is None:
         return [], []
     if in_years(network.time_unit):
-        return ["year"], [[f"{each:.10g}" for each in years(network, time).tolist()]]
-    seconds = np.asarray(time, dtype=np.float64) * factor(network.time_unit, "s")
+        return ["year"], [[f"{each:.10g}" for each in np.atleast_1d(years(network, time)).tolist()]]
+    seconds = np.atleast_1d(time) * factor(network.time_unit, "s")
     dates = [_clock(start) + timedelta(seconds=round(each)) for each in seconds.tolist()]
     whole = all(each.time() == each.min.time() for each in dates)
     return ["date"], [[each.isoformat(" ", "minutes")[: 10 if whole else None] for each in dates]]

@@ -210,8 +210,8 @@ class Arc(Compartment):
     share: Annotated[
         Value | None,
         Share(
-            "s (share law); None: what the others leave, or what the control sets. Uncontrolled shares keep their "
-            "proportions in what controlled ones leave",
+            "s (share law); None, in files ``rest``: what the others leave, or what the control sets. Uncontrolled "
+            "shares keep their proportions in what controlled ones leave",
             varies=True,
             none="rest",
         ),
