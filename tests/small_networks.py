@@ -38,7 +38,7 @@ NO_STATES = np.empty((0, 1))
 
 def neutral_rate(dynamics: Dynamics, step: int = 0) -> Floats:
     """Return the rates under neutral control."""
-    return dynamics.rate(dynamics.neutral[:, None], np.array([step]))
+    return dynamics.rate(dynamics.neutral[:, :1], np.array([step]))
 
 
 def start(network: Network) -> Floats:
@@ -51,5 +51,5 @@ def advanced(network: Network, steps: int = 1) -> Floats:
     dynamics = Dynamics(network)
     stock = start(network)
     for step in range(steps):
-        stock = dynamics.advance(stock, NO_STATES, dynamics.neutral[:, None], np.array([step])).stock
+        stock = dynamics.advance(stock, NO_STATES, dynamics.neutral[:, :1], np.array([step])).stock
     return stock[:-1, 0]

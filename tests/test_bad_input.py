@@ -181,9 +181,9 @@ def test_a_whole_state_of_a_simulator_is_a_start() -> None:
     names = [name for name in env.state_names if name.startswith("sorter.")]
     env.reset(seed=3)
     begun = dict(zip(env.state_names, env.state()[0], strict=False))
-    after = env.step({agent: action[None] for agent, action in env.neutral_action.items()})[0]["sorter"]
+    after = env.step(env.neutral_action)[0]["sorter"]
     env.reset(seed=4, options={"initial_state": {name: begun[name] for name in names}})
-    again = env.step({agent: action[None] for agent, action in env.neutral_action.items()})[0]["sorter"]
+    again = env.step(env.neutral_action)[0]["sorter"]
     np.testing.assert_array_equal(after, again)
 
 

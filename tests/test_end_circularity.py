@@ -54,7 +54,7 @@ def test_at_the_end_of_a_filling() -> None:
         name="filling",
         nodes=(Node(id="store", initial=(50.0, 50.0)), Node(id="use"), Node(id="tip", role=TIP)),
         arcs=(
-            Arc(id="supply", donor="store", recipient="use", law=Law.EXOGENOUS, flow=(3.0,)),
+            Arc(id="supply", donor="store", recipient="use", law=Law.EXOGENOUS, flow=3.0),
             Arc(id="loss", donor="use", recipient="tip", rate=0.4),
         ),
         episode=Episode(control_interval=1.5, horizon=1),
@@ -75,7 +75,7 @@ def test_a_scheduled_flow_at_the_end_is_the_one_realised() -> None:
             Node(id="store"),
         ),
         arcs=(
-            Arc(id="demand", donor="mine", recipient="use", law=Law.EXOGENOUS, flow=(8.0,)),
+            Arc(id="demand", donor="mine", recipient="use", law=Law.EXOGENOUS, flow=8.0),
             Arc(id="use_to_store", donor="use", recipient="store", rate=2.0),
         ),
         episode=Episode(control_interval=1.0, horizon=1),

@@ -161,7 +161,7 @@ def test_difference_reward_by_hand(circularity: str) -> None:
     env.reset(1)
     imagined.reset(1)
     rng = np.random.default_rng(0)
-    neutral = env.stack({a: np.tile(n, (2, 1)) for a, n in env.neutral_action.items()})
+    neutral = env.stack(env.neutral_action)
     for _ in range(3):
         actions = rng.uniform(-1, 1, (len(env.agents), 2))
         here = env.snapshot()
@@ -215,7 +215,7 @@ def test_copies_restart_by_themselves() -> None:
     )
     env.reset(0)
     alone.reset(0)
-    neutral = {agent: np.tile(action, (2, 1)) for agent, action in env.neutral_action.items()}
+    neutral = env.neutral_action
     for step in range(1, 8):
         observations, _, terminations, truncations, infos = env.step(neutral)
         expected = alone.advance(alone.stack(neutral)).observation

@@ -30,11 +30,18 @@ from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import write_network
+from cirl_marl.network.series import Series
+
+
+def steps(*times: float) -> Series:
+    """Return a series of 1, 2, …"""
+    return Series(times=times, values=tuple(float(i + 1) for i in range(len(times))))
+
 
 A, B = Node(id="a", initial=(10.0, 10.0)), Node(id="b")
 LINK = Arc(id="k", donor="a", recipient="b", rate=0.1)
 DELAYED = Arc(id="k", donor="a", recipient="b", law=Law.BATCH, delay=1.0, batches=((0.0, 1.0),))
-FED = Arc(id="k", donor="a", recipient="b", law=Law.EXOGENOUS, flow=(1.0,))
+FED = Arc(id="k", donor="a", recipient="b", law=Law.EXOGENOUS, flow=1.0)
 ORDER = Arc(id="k", donor="a", recipient="b", law=Law.CONTROLLED)
 BACKWARD = Control(kind=ControlKind.FLOW, low=-5.0, neutral=0.0, high=5.0)
 VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
@@ -51,7 +58,7 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
             "low -5 kg/day would reverse the flow",
         ),
         ({"nodes": (replace(A, control=replace(VALVE, neutral=3.0)), B)}, "neutral <= high .*, got 0, 3, 2$"),
-        ({"arcs": (replace(LINK, times=(0.0, 5.0), flow=(1.0, 0.0)),)}, "times = .* law 'donor' takes rate"),
+        ({"arcs": (replace(LINK, flow=steps(0.0, 5.0)),)}, "flow = .* law 'donor' takes rate"),
         ({"arcs": (replace(DELAYED, delay=1e-7),)}, "delay 1e-07 is not a whole number"),
         ({"arcs": (DELAYED,), "episode": Episode(control_interval=0.0)}, "control_interval 0.0 must be positive"),
         ({"episode": Episode(control_interval=math.nan, solver="rk4", solver_step=1.0)}, "control_interval nan"),
@@ -69,12 +76,26 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
             {"arcs": (replace(DELAYED, delay=86400.0),)},
             "delay 86400 day is 86400 control intervals.*wrong unit",
         ),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0, 3.0)),)}, "series has 0 times and 3 values: a constant flow has one"),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0,)),)}, "series has 1 times and 2 values: one for each"),
-        ({"arcs": (replace(FED, flow=()),)}, r"flow \(\) must be finite"),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.nan)),)}, r"times \(0.0, nan\) must start at 0"),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.inf)),)}, r"times \(0.0, inf\) must .* be finite"),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(math.nan, 1.0)),)}, r"times \(nan, 1.0\) must start at 0"),
+        (
+            {"arcs": (replace(FED, flow=Series(times=(0.0,), values=(1.0, 2.0), origin="x.csv, t")),)},
+            r"^arc 'k': flow: series has 1 times and 2 values: one for each \(x.csv, t\)$",
+        ),
+        ({"arcs": (replace(FED, flow=Series(times=(), values=())),)}, "series has 0 times and 0 values"),
+        ({"arcs": (replace(FED, flow=steps(0.0, math.nan)),)}, "times must increase and be finite, but nan follows 0"),
+        ({"arcs": (replace(FED, flow=steps(0.0, math.inf)),)}, "times must increase and be finite, but inf follows 0"),
+        ({"arcs": (replace(FED, flow=steps(0.0, 2.0, 1.0)),)}, "times must increase and be finite, but 1 follows 2"),
+        ({"arcs": (replace(FED, flow=steps(math.nan)),)}, "times and values must be finite"),
+        ({"arcs": (replace(FED, flow=steps(0.5)),)}, "series begins at 0.5, after the episode does"),
+        (
+            {"arcs": (replace(FED, flow=replace(steps(0.0, 5.0), interpolation="linear")),)},
+            "arc 'k': flow: series ends at 5, but the episode at 50",
+        ),
+        ({"arcs": (replace(FED, flow=replace(steps(0.0), until=49.0)),)}, "series ends at 49, but the episode at 50"),
+        ({"arcs": (replace(LINK, rate=Series(times=(0.0, 1.0), values=(1.0, -2.0))),)}, "rate -2.0 must be finite and"),
+        (
+            {"nodes": (replace(A, control=replace(VALVE, neutral=steps(0.0, 1.0, 3.0))), B), "arcs": (LINK,)},
+            "low <= neutral <= high and low < high, got .* in interval 3",
+        ),
         ({"services": (OWED, OWED)}, "service 's': the id is used twice$"),
         ({"nodes": (A, B, B)}, "node 'b': the id is used twice$"),
         ({"arcs": (replace(LINK, id="b"),)}, "node and arc 'b': the id is used twice; nodes and arcs share one set"),

@@ -45,7 +45,7 @@ def test_who_is_neutral_makes_no_difference(circularity: str, network: Network, 
     env = VectorEnv(network, num_envs=2, reward="difference", circularity=circularity)
     env.reset(seed)
     rng = np.random.default_rng(seed)
-    neutral = np.concatenate(list(env.neutral_action.values()))[:, None]
+    neutral = env.stack(env.neutral_action)
     for _ in range(network.episode.horizon):
         idle = rng.random(len(neutral)) < 0.5
         outcome = env.advance(np.where(idle[:, None], neutral, rng.uniform(-1, 1, (len(neutral), 2))))

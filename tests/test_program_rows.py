@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, VectorEnv
+from cirl_marl.network.series import Series
 from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
@@ -62,7 +63,7 @@ def certifiable(network: Network, interval: float, pulls: bool) -> Network:
     arcs = []
     for arc in network.arcs:
         if arc.law is Law.BATCH:
-            arc = replace(arc, law=Law.EXOGENOUS, flow=(80.0,), batches=(), delay=0.0)
+            arc = replace(arc, law=Law.EXOGENOUS, flow=80.0, batches=(), delay=0.0)
         elif arc.law is Law.RECIPIENT:
             law = Law.RECIPIENT if pulls else Law.DONOR
             arc = replace(arc, law=law, rate=arc.rate * (0.02 if pulls else 1.0))
@@ -263,8 +264,7 @@ def works(
             donor="store",
             recipient="use",
             law=Law.EXOGENOUS,
-            flow=(10.0, 25.0, 3.0),
-            times=(0.0, 0.5, 1.3),
+            flow=Series(times=(0.0, 0.5, 1.3), values=(10.0, 25.0, 3.0)),
             control=rate_control(0.5, 1.0),
         ),
         Arc(id="loss", donor="use", recipient="sort", rate=0.5),
@@ -272,7 +272,7 @@ def works(
         Arc(id="leak", donor="mine", recipient="tip", rate=0.02),
         Arc(id="pull", donor="mine", recipient="use", law=Law.RECIPIENT, rate=0.05),
         Arc(id="emission", donor="use", recipient="air", rate=0.9, control=rate_control(0.3, 1.0)),
-        Arc(id="repair", donor="use", recipient="store", law=Law.EXOGENOUS, flow=(2.0,)),
+        Arc(id="repair", donor="use", recipient="store", law=Law.EXOGENOUS, flow=2.0),
         order("capture", "air", "use", 9.0),
     )
     services = (
@@ -349,9 +349,9 @@ def test_a_demand_without_a_choice(stock: float, feed: float, asked: float, cut:
         Node(id="end"),
     )
     arcs = (
-        Arc(id="feed", donor="ample", recipient="store", law=Law.EXOGENOUS, flow=(feed,)),
+        Arc(id="feed", donor="ample", recipient="store", law=Law.EXOGENOUS, flow=feed),
         Arc(id="exit", donor="store", recipient="end", rate=0.8),
-        Arc(id="demand", donor="store", recipient="use", law=Law.EXOGENOUS, flow=(asked,)),
+        Arc(id="demand", donor="store", recipient="use", law=Law.EXOGENOUS, flow=asked),
         Arc(id="through", donor="use", recipient="end", rate=1.0),
     )
     for interval in (1.0, 3.0):

@@ -69,7 +69,7 @@ def test_euler_of_the_networks_is_first_order(name: str) -> None:
     dynamics = Dynamics(network)
     control = network.compartments[agent].control
     assert control is not None
-    held = dynamics.neutral[:, None].copy()
+    held = dynamics.neutral[:, :1].copy()
     held[network.control_rows[agent]] = 0.25 * control.low + 0.75 * control.high
     rate = dynamics.rate(held)
 
@@ -145,7 +145,7 @@ def test_eigenvalues(name: str, eigenvalues: list[float]) -> None:
     network = load_network(PAPER[name][0], scenario="paper")
     dynamics = Dynamics(network)
     sets_flow = np.isin(network.controllable, [arc.id for arc in network.arcs if arc.law is Law.CONTROLLED])
-    rate = dynamics.rate(np.where(sets_flow, 0.0, dynamics.neutral)[:, None])
+    rate = dynamics.rate(np.where(sets_flow, 0.0, dynamics.neutral[:, 0])[:, None])
     unit = np.eye(len(network.nodes) + 1)
     matrix = dynamics.incidence(dynamics.flow(unit, np.repeat(rate, unit.shape[1], axis=1)))[:-1, :-1]
     order = [network.node_index[node] for node in network.observation.nodes]

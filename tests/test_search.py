@@ -142,7 +142,7 @@ def test_actions_are_cut_to_their_bounds_and_deviations_with_them() -> None:
     env = VectorEnv(network, num_envs=1)
     env.reset(seed=EVALUATION_SEEDS)
     copies = Population(network, None, starting_states(env), 2)
-    neutral = np.concatenate(list(env.neutral_action.values()))
+    neutral = np.concatenate([each[0] for each in env.neutral_action.values()])
     added = np.zeros((1, 2, 2, copies.entries))
     added[0, 1, 0, 0], added[0, 1, 1, 0] = -0.1, 5.0
     run = copies.run([Neutral()], np.zeros((1, 2), dtype=int), added)

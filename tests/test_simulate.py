@@ -18,6 +18,7 @@ from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Networ
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.network.series import Series
 
 Floats = NDArray[np.float64]
 
@@ -104,7 +105,9 @@ def test_two_nodes_in_exchange() -> None:
 @given(network=any_network)
 def test_intervals_compose(network: Network) -> None:
     """Two half intervals are one interval, where nothing is cut and no series changes."""
-    arcs = tuple(replace(arc, flow=arc.flow[:1], times=()) for arc in network.arcs)
+    arcs = tuple(
+        replace(arc, flow=arc.flow.values[0] if isinstance(arc.flow, Series) else arc.flow) for arc in network.arcs
+    )
     whole = ample(replace(network, arcs=arcs), 0.3)
     assume(stays_positive(whole, 0.3))
     mass = start(whole)[:-1].sum()
@@ -203,7 +206,7 @@ def test_network_without_controls_can_be_simulated() -> None:
 @pytest.mark.parametrize(
     "arc",
     [
-        Arc(id="k", donor="a", recipient="b", law=Law.EXOGENOUS, flow=(2.0, 3.0), times=(0.0, 2.0)),
+        Arc(id="k", donor="a", recipient="b", law=Law.EXOGENOUS, flow=Series(times=(0.0, 2.0), values=(2.0, 3.0))),
         Arc(id="k", donor="a", recipient="b", law=Law.BATCH, batches=((0.0, 5.0),), delay=1.0),
     ],
 )

@@ -20,6 +20,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.figures import time_window
 from cirl_marl.network import Network
 from cirl_marl.network.calendar import labels
+from cirl_marl.network.series import extremes
 from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
 
 if TYPE_CHECKING:
@@ -47,14 +48,14 @@ def show(
 
     found = load_network(network, scenario=scenario)
     env = VectorEnv(found, num_envs=1)
-    middle = {node.id: sum(node.initial) / 2 for node in found.nodes}
+    middle = {node.id: stock for node, stock in zip(found.stores, found.initial.mean(axis=0).tolist(), strict=True)}
     env.reset(seed=0, options={"initial_state": middle})
     stock, flow = env.physical.stock[env.rows.nodes, 0], env.physical.flow[:, 0]
     console.print(nodes_table(found, stock))
     console.print(arcs_table(found, flow))
     for service in found.services:
-        ends = [f"at least {service.low:g}"] if service.low > 0 else []
-        ends += [] if np.isinf(service.high) else [f"at most {service.high:g}"]
+        ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
+        ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
         console.print(
             f"service '{service.id}': {service.measure or service.quantity} of {service.provider} {' and '.join(ends)}"
         )
@@ -293,16 +294,20 @@ def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> No
     network, physics = env.network, env.dynamics.inner
     calendar, dates = labels(network, np.concatenate([[0.0], time]))
     header = [f"time ({network.time_unit})", *calendar, f"circularity ({network.mass_unit})", "service level"]
-    header += [f"stock of {node.id} ({network.mass_unit})" for node in network.nodes]
+    header += [f"stock of {node.id} ({network.mass_unit})" for node in network.stores]
     header += [f"flow of {arc.id} ({network.mass_unit}/{network.time_unit})" for arc in network.arcs]
+    passing = network.nodes[len(network.stores) :]
+    header += [f"throughput of {node.id} ({network.mass_unit}/{network.time_unit})" for node in passing]
     header += [f"mass on {line.id} ({network.mass_unit})" for line in env.dynamics.batches.lines]
     header += [physics.names[row] for row in physics.visible]
     start = env.physical
-    held = [*start.stock[env.rows.nodes, 0].tolist(), *[""] * len(network.arcs)]
+    held = [*start.stock[env.rows.nodes, 0].tolist(), *[""] * (len(network.arcs) + len(passing))]
     held += [*env.dynamics.batches.loads(start.stock)[:, 0].tolist(), *start.inner[physics.visible, 0].tolist()]
 
-    measured = (run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
-    columns = [time.tolist(), *(each[1:] for each in dates), *(column.tolist() for column in measured)]
+    through = network.throughput(run.flow.T)
+    held_at = (*run.stock.T, *run.flow.T, *through, *run.load.T, *run.inner.T)
+    measured = [column.tolist() for column in (run.circularity[0], run.service[0], *held_at)]
+    columns = [time.tolist(), *(each[1:] for each in dates), *measured]
 
     def write(target: Path) -> None:
         with target.open("w", newline="") as file:

@@ -10,7 +10,7 @@ import numpy as np
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.elements import Compartment, ControlKind, Law, Role
+from cirl_marl.network.elements import ControlKind, Law, Role
 from cirl_marl.network.model import Releasing
 from cirl_marl.network.units import factor
 from cirl_marl.network.validate_settings import is_whole
@@ -56,7 +56,7 @@ def _departures(network: Network) -> Iterator[str]:
     interval, horizon = network.episode.control_interval, network.episode.horizon
     end = f"an episode ends at {horizon * interval:g} {network.time_unit}"
     for arc in network.arcs:
-        late = [time for time in arc.times if time >= horizon * interval]
+        late = [time for time in getattr(arc.flow, "times", ()) if time >= horizon * interval]
         if late:
             yield f"arc '{arc.id}': series: {end}, so that what begins at {late[0]:g} {network.time_unit} never comes"
         recipient = network.nodes[network.node_index[arc.recipient]]
@@ -102,7 +102,7 @@ def _states(network: Network, action: float | None, intervals: int) -> Floats:
     state, rows = env.physical, []
     with np.errstate(all="ignore"):
         for step in range(min(network.episode.horizon, intervals)):
-            after = env.dynamics.advance(state.stock, state.inner, controls[:, None], np.array([step]))
+            after = env.dynamics.advance(state.stock, state.inner, controls[:, [step]], np.array([step]))
             state = replace(state, stock=after.stock, inner=after.inner)
             whole = env.rows.start_of(after.stock, after.inner)
             rows.append(np.concatenate([whole[:, 0], after.stock[env.rows.batches, 0]]))
@@ -111,37 +111,27 @@ def _states(network: Network, action: float | None, intervals: int) -> Floats:
 
 def _starved(network: Network) -> Iterator[str]:
     """Yield exogenous flows that their donors cannot feed under neutral control."""
-    ordered = {k: arc for k, arc in enumerate(network.arcs) if arc.law is Law.EXOGENOUS and any(arc.flow)}
+    ordered = [k for k, arc in enumerate(network.arcs) if arc.law is Law.EXOGENOUS]
     if not ordered:
         return
     env, interval = VectorEnv(network, num_envs=1), network.episode.control_interval
     env.reset(seed=0)
-    neutral = {agent: action[None] for agent, action in env.neutral_action.items()}
-    valves = {k: _valve(arc) * _valve(network.nodes[network.node_index[arc.donor]]) for k, arc in ordered.items()}
     short: dict[int, float] = {}
     for step in range(min(network.episode.horizon, INTERVALS)):
         try:
-            env.advance(env.stack(neutral))
+            env.advance(env.stack(env.neutral_action))
         except CirlError as error:
             yield str(error)
             return
-        for k, arc in ordered.items():
-            first = max(0, int(np.searchsorted(arc.times, step * interval, side="right")) - 1)
-            last = max(first, int(np.searchsorted(arc.times, (step + 1) * interval)) - 1)
-            if env.physical.flow[k, 0] < (1 - COARSE) * valves[k] * min(arc.flow[first : last + 1]):
-                short.setdefault(k, step * interval)
+        asked = env.dynamics.rate(env.dynamics.neutral[:, [step]], np.array([step]))[ordered, 0]
+        for place in np.flatnonzero(env.physical.flow[ordered, 0] < (1 - COARSE) * asked):
+            short.setdefault(ordered[place], step * interval)
     for k, time in short.items():
-        arc = ordered[k]
+        arc = network.arcs[k]
         since = (
             f"from {time:g} {network.time_unit} on; give it a larger initial stock if it stands for the world outside"
         )
         yield f"arc '{arc.id}': under neutral control '{arc.donor}' holds too little for its flow {since}"
-
-
-def _valve(compartment: Compartment) -> float:
-    """Return by what neutral control multiplies the flows that a compartment scales."""
-    control = compartment.control
-    return control.neutral if control is not None and control.kind is ControlKind.RATE else 1.0
 
 
 def _aimless(network: Network) -> Iterator[str]:

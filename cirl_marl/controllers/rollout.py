@@ -31,11 +31,11 @@ class Rollout:
     service: Annotated[Floats, "service level, shape (B, steps)"]
     local_returns: Annotated[Floats, "sum of the local rewards of each agent, shape (agents, B)"]
     returns: Annotated[Floats, "sum of the rewards of each agent, shape (agents, B)"]
-    stock: Annotated[Floats, "stocks after each interval in the first copy, shape (steps, nodes), mass"]
+    stock: Annotated[Floats, "stocks after each interval in the first copy, shape (steps, stores), mass"]
     flow: Annotated[Floats, "mean flows of each interval in the first copy, shape (steps, arcs), mass/time"]
     load: Annotated[Floats, "masses that batch arcs hold, likewise, shape (steps, batch arcs), mass"]
     inner: Annotated[Floats, "inner states that an agent may see, likewise, shape (steps, states)"]
-    final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (nodes,), mass"]
+    final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (stores,), mass"]
     mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
 
     @property
@@ -69,7 +69,7 @@ def rollout(
     steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
     circularity, mean, service = np.empty((3, env.num_envs, steps))
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
-    stock, flow = np.empty((steps, len(env.network.nodes))), np.empty((steps, len(env.network.arcs)))
+    stock, flow = np.empty((steps, len(env.network.stores))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
     for t in range(steps):

@@ -76,7 +76,7 @@ def schedule(
     network = env.network
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
-    middle = {node.id: sum(node.initial) / 2 for node in network.nodes}
+    middle = {node.id: stock for node, stock in zip(network.stores, network.initial.mean(axis=0).tolist(), strict=True)}
     inner = env.dynamics.inner
     rows = zip(inner.ranged.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
     middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}
@@ -84,7 +84,7 @@ def schedule(
     first = EVALUATION_SEEDS if seed is None else first_seed(seed)
     run = rollout(env, recorded, seed=first, start=middle if seed is None else None, progress=progress)
     actuators = Actuators(env.dynamics, env.agents, len(recorded.actions))
-    values = actuators.controls(np.array(recorded.actions).T)[actuators.acting]
+    values = actuators.controls(np.array(recorded.actions).T, np.arange(len(recorded.actions)))[actuators.acting]
     ends = interval_ends(network)
     columns = [
         (f"from ({network.time_unit})", ends - network.episode.control_interval),
@@ -109,6 +109,8 @@ def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
             yield f"{agent}: flow ordered ({network.mass_unit}/{network.time_unit})"
         elif control.kind is ControlKind.RATE:
             yield f"{agent}: valve factor (1)"
+        elif control.kind is ControlKind.SHARE:
+            yield f"{agent}: share (1)"
         elif compartment.model is not None:
             yield from (f"{agent}: {name}" for name in compartment.model.input_names)  # they end in their unit
 

@@ -112,8 +112,16 @@ class VectorEnv:
 
     @property
     def neutral_action(self) -> dict[str, Floats]:
-        """Normalised action of each agent that leaves it neutral, shape (entries,) each."""
-        return self._actuators.neutral_action
+        """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each."""
+        step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
+        return self._actuators.neutral_action(np.minimum(step, self.network.episode.horizon - 1))
+
+    def normalised(self, agent: str, values: Floats) -> Floats:
+        """Return the action that comes closest to physical values of an agent's control in the coming interval.
+
+        Values have shape (entries of its action, num_envs), actions (num_envs, entries).
+        """
+        return self._actuators.normalised(agent, values, self.physical.step).T
 
     @property
     def physical(self) -> State:
@@ -192,10 +200,10 @@ class VectorEnv:
         horizon = self.network.episode.horizon
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
-        controls = self._actuators.controls(actions)
+        controls = self._actuators.controls(actions, state.step)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step)
         quantities, flow = self._measured(transition, controls)
-        levels = self.scoring.levels(quantities)
+        levels = self.scoring.levels(quantities, state.step)
         service = self.scoring.service_level(levels)
         terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
         local = self.scoring.local(terms)
@@ -211,10 +219,11 @@ class VectorEnv:
     def local_rewards(self) -> dict[str, Floats]:
         """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
         state = self.physical
-        neutral = np.repeat(self.dynamics.neutral[:, None], self.num_envs, axis=1)
+        done = np.maximum(state.step - 1, 0)  # the interval that the state is scored in
         quantities = self._quantities(state)
-        inner = self.dynamics.inner.rewards(state.inner, state.inner, neutral)
-        rewards = self.scoring.local_of_all(self.scoring.terms(quantities, self.scoring.levels(quantities), inner))
+        inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral.take(done, axis=1))
+        levels = self.scoring.levels(quantities, done)
+        rewards = self.scoring.local_of_all(self.scoring.terms(quantities, levels, inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
 
     def state(self) -> Floats:
@@ -270,7 +279,7 @@ class VectorEnv:
         dynamics, batch = self.dynamics, drawn.shape[1]
         stocks, inner = self.rows.split(drawn)
         stock, step, zeros = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp), np.zeros(batch)
-        neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
+        neutral = dynamics.neutral.take(step, axis=1)
         flow, measures = dynamics.start_flow(stock, inner, neutral), dynamics.inner.measures(inner, neutral)
         return State(stock, inner, flow, measures, step, np.zeros((2, batch)), zeros, zeros)
 
@@ -281,6 +290,8 @@ class VectorEnv:
         flow = quantities[signals.flows]
         np.divide(transition.moved, self.network.episode.control_interval, out=flow)
         quantities[self.rows.nodes] = transition.stock[self.rows.nodes]
+        if signals.passing.start < signals.passing.stop:
+            quantities[signals.passing] = self.network.throughput(flow)
         if signals.inside:
             quantities[signals.states] = transition.inner
             quantities[signals.measures] = dynamics.inner.measures(transition.inner, controls)
@@ -290,12 +301,14 @@ class VectorEnv:
 
     def _quantities(self, state: State) -> Floats:
         loads = self.dynamics.batches.loads(state.stock)
-        return np.concatenate([state.stock[self.rows.nodes], state.flow, state.inner, state.measures, loads])
+        through = self.network.throughput(state.flow)
+        return np.concatenate([state.stock[self.rows.nodes], through, state.flow, state.inner, state.measures, loads])
 
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
-        return self.layout.observe(quantities, time, self.scoring.levels(quantities))
+        levels = self.scoring.levels(quantities, np.maximum(state.step - 1, 0))
+        return self.layout.observe(quantities, time, levels)
 
 
 def _share(weight: float) -> float:

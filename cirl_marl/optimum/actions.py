@@ -52,7 +52,7 @@ def normalised_actions(admissible: Admissible, layout: Layout, planned: Floats) 
 
 def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
     network = admissible.network
-    actuators = Actuators(FlowLaws(network), admissible.agents or None, 1)
+    actuators = Actuators(FlowLaws(network), admissible.agents or None, len(valve))
     actions = np.zeros((len(valve), len(actuators.acting)))
     for agent, entries in actuators.entries.items():
         control = network.compartments[agent].control
@@ -65,7 +65,7 @@ def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
             node = network.node_index[agent]
             sets = next(k for k in np.flatnonzero(network.donors == node) if network.arcs[k].law is Law.CONTROLLED)
             values = own[:, sets]
-        actions[:, entries] = control.action(values)[:, None]
+        actions[:, entries] = actuators.normalised(agent, values[None], np.arange(len(valve))).T
     return actions
 
 

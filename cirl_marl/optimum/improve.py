@@ -99,7 +99,7 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     actuators = Actuators(dynamics, bound.agents or None, flat.shape[1])
     when = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
-    done = dynamics.advance(dynamics.extend(flat[:nodes]), inner, actuators.controls(flat[nodes:]), when)
+    done = dynamics.advance(dynamics.extend(flat[:nodes]), inner, actuators.controls(flat[nodes:], when), when)
     outputs = np.concatenate([done.stock[dynamics.rows.nodes], done.moved / network.episode.control_interval])
     shaped = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (shaped[:, :, :-1] - shaped[:, :, -1:]) / shift[:, None]

@@ -128,7 +128,7 @@ def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike |
     Raises:
         CirlError: for an unknown node, a wrong shape, or a stock that is negative or not finite.
     """
-    start = np.array([sum(node.initial) / 2 for node in network.nodes])
+    start: Floats = network.initial.mean(axis=0)
     if isinstance(initial, Mapping):
         for node, stock in initial.items():
             if node not in network.node_index:

@@ -250,7 +250,7 @@ def _held(admissible: Admissible, layout: Layout) -> list[MatrixRow]:
     """
     network = admissible.network
     neutral = FlowLaws(network)
-    rate = neutral.rate(neutral.neutral[:, None])[:, 0]
+    rate = neutral.rate(neutral.neutral[:, :1])[:, 0]
     free = ~admissible.scheduled & (admissible.factor[0] < admissible.factor[1])
     pairs = [(layout.flow, int(k), int(admissible.driver[k]), float(rate[k])) for k in np.flatnonzero(free)]
     for z, node in enumerate(layout.valves):

@@ -115,7 +115,7 @@ def save_trajectory(
         path: file to write; its folder is made.
         network: the network.
         time: shape (steps,), time.
-        stock: stocks, shape (nodes, steps), mass.
+        stock: stocks, shape (stores, steps), mass.
         flow: flows, shape (arcs, steps), mass/time.
         circularity: λ, shape (steps,), mass.
         start: stocks before the first step, then masses on batch arcs if ``load`` is given, mass; None leaves them out.
@@ -127,10 +127,10 @@ def save_trajectory(
         CirlError: if an array has the wrong shape.
     """
     steps, mass = (len(time),), network.mass_unit
-    stock = shaped("stock", stock, (len(network.nodes), *steps))
+    stock = shaped("stock", stock, (len(network.stores), *steps))
     flow = shaped("flow", flow, (len(network.arcs), *steps))
     circularity = shaped("circularity", circularity, steps)
-    held = [node.id for node in network.nodes]
+    held = [node.id for node in network.stores]
     if load is not None:
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {arc}" for arc in on_the_way]
