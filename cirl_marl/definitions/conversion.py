@@ -94,7 +94,10 @@ class Converter:
             given = getattr(table, name, None)
             if name not in known and given is not None:
                 known[name] = self._read(declared, given, table, f"{where}.{declared.key or name}")
-        return made(**known)
+        try:
+            return made(**known)
+        except NetworkError as error:
+            raise NetworkError(self.table.name, [f"{where}: {problem}" for problem in error.problems]) from None
 
     def _read(self, declared: Declared, given: Any, table: Any, where: str) -> Any:
         """Return what a declared field is in Python."""
