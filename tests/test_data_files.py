@@ -235,8 +235,8 @@ def test_hashes_stand_beside_that_of_the_definition(tmp_path: Path) -> None:
     assert replace(network, data_sha256={}) == network
 
 
-def moved(tmp_path: Path, recipe: Recipe, **options: str) -> tuple[Path, str]:
-    """Train for a moment with a data file in a folder of its own, remove all that it was read from."""
+def moved(tmp_path: Path, recipe: Recipe, scenario: str) -> Path:
+    """Return a short training with a data file in a folder of its own, which is gone."""
     own = tmp_path / "own"
     (own / "data").mkdir(parents=True)
     sold = 'control = { kind = "share", low = 0.1, neutral = 0.5, high = 0.9, unit = "1", source = "x" }'
@@ -245,15 +245,15 @@ def moved(tmp_path: Path, recipe: Recipe, **options: str) -> tuple[Path, str]:
     more = regions + '[scenarios.fixed.arcs.ore]\nflow = { value = 1, unit = "kt/year", source = "x" }\n'
     path = written(own, definition(flow, start="2000", sold=sold, more=more), csv=None)
     (own / "data" / "ores.csv").write_text(CSV)
-    train(f"{path}:japan", recipe, directory=tmp_path / "run", **options)
+    train(f"{path}:japan", recipe, directory=tmp_path / "run", scenario=scenario)
     shutil.rmtree(own)
-    return tmp_path / "run", str(path)
+    return tmp_path / "run"
 
 
 @pytest.mark.parametrize("scenario", ["default", "fixed"])
 def test_a_run_keeps_its_data_files(tmp_path: Path, ppo_recipe: Recipe, scenario: str) -> None:
     """It opens when the folder of the definition is gone; files that are other ones are refused."""
-    directory, _ = moved(tmp_path, ppo_recipe, scenario=scenario)
+    directory = moved(tmp_path, ppo_recipe, scenario)
     run = RunDirectory(directory)
     network = run.make_env(1).network
     assert (network.name, network.scenario_name, network.region) == ("ores_japan", scenario, "japan")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from cirl_marl import Arc, Control, Episode, Law, Network, NetworkError, Node, Role, Series, Service, load_network
@@ -44,7 +45,7 @@ def test_means_are_integrals(
     times = tuple(np.cumsum([-before, *gaps]).tolist())
     series = Series(times=times, values=tuple(values[: len(times)]), interpolation="linear" if linear else "step")
     count = max(1, int((times[-1] if linear else times[-1] + 1.0) / interval))
-    edges = np.arange(count + 1) * interval
+    edges: NDArray[np.float64] = np.arange(count + 1, dtype=np.float64) * np.float64(interval)
     if linear and edges[-1] > times[-1]:
         edges = np.array([0.0, times[-1]]) if times[-1] > 0 else edges[:0]
     for mean, low, high in zip(series.means(edges) if len(edges) else (), edges, edges[1:], strict=False):

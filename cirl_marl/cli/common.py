@@ -21,8 +21,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-console = Console(width=None if sys.stdout.isatty() else 140)
-errors = Console(stderr=True)
+# without emoji=False rich prints a flag or a map for the region of FILE.toml:japan:
+console = Console(width=None if sys.stdout.isatty() else 140, emoji=False)
+errors = Console(stderr=True, emoji=False)
 
 NetworkName = Annotated[
     str, typer.Argument(metavar="NETWORK", help="Name in the catalogue, or a file: FILE.toml, FILE.toml:REGION.")
