@@ -71,13 +71,13 @@ IN_JAPAN = "ores.csv, column 'kt', where country = 'Japan'"
         (
             column(""),
             CSV,
-            "file 'ores.csv', line 6, column 'year': 2000.0 stands in line 2 too; "
+            "file 'ores.csv', line 6, column 'year': '2000' stands in line 2 too; "
             "fix more columns in 'where', or leave one row out",
         ),
         (
             column(JAPAN),
             CSV.replace("2001", "1999"),
-            "file 'ores.csv', line 3, column 'year': 1999.0 comes after 2000.0; sort the rows by 'year'",
+            "file 'ores.csv', line 3, column 'year': '1999' comes after a later time; sort the rows by 'year'",
         ),
         (
             column(JAPAN),

@@ -87,7 +87,11 @@ def test_without_a_region_those_there_are_are_named(tmp_path: Path, asked: str, 
         (REGIONS, "", "title: 'Ores of {region}': a definition without [regions] has no {region}"),
         ('"Japan"', "3", "regions.japan: Input should be a valid string, got 3"),
         ("china", "China", "regions.China: begins with a letter and has lower-case letters, digits and _ only"),
-        (REGIONS, "", ""),
+        (
+            SCENARIO,
+            '[scenarios.more]\nwithout = ["regions.japan"]',
+            "without: 'regions.japan': a scenario cannot set it",
+        ),
         (SCENARIO, '[scenarios.more.regions]\nitaly = "Italy"', "scenarios.more.regions: a scenario cannot set it"),
     ],
 )

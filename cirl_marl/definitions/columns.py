@@ -152,14 +152,15 @@ class _Table:
         for i in chosen:
             line, row = self.rows[i]
             told = f"file '{self.name}', line {line}, column '{column}'"
-            time: Any = _date(row[self.place[column]]) if dated else self._number(line, row, column)
+            text = row[self.place[column]]
+            time: Any = _date(text) if dated else self._number(line, row, column)
             if time is None:
-                raise CirlError(f"{told}: '{row[self.place[column]]}' is no date such as 2020-03-01, as others are")
+                raise CirlError(f"{told}: '{text}' is no date such as 2020-03-01, as others are")
             if time in seen:
                 remedy = "fix more columns in 'where', or leave one row out"
-                raise CirlError(f"{told}: {time} stands in line {seen[time]} too; {remedy}")
-            if latest is not None and time < latest:
-                raise CirlError(f"{told}: {time} comes after {latest}; sort the rows by '{column}'")
+                raise CirlError(f"{told}: '{text}' stands in line {seen[time]} too; {remedy}")
+            if seen and time < latest:
+                raise CirlError(f"{told}: '{text}' comes after a later time; sort the rows by '{column}'")
             seen[time], latest = line, time
         return list(seen)
 

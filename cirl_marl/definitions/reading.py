@@ -22,6 +22,8 @@ from cirl_marl.network import Network
 
 DEFAULT = "default"
 """The scenario that stands outside ``[scenarios]``."""
+FIXED = ("name", "regions", "scenarios")
+"""What is the same in every scenario."""
 
 
 class Definition:
@@ -184,6 +186,8 @@ def _lost(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
     if len(set(paths)) != len(paths):
         yield f"{where}without: names a path twice"
     for path in paths:
+        if path.partition(".")[0] in FIXED:
+            yield f"{where}without: '{path}': a scenario cannot set it"
         for other in paths:
             if path.startswith(f"{other}."):
                 yield f"{where}without: '{path}' lies in '{other}', which goes as a whole"
@@ -208,7 +212,7 @@ def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: 
         for name in given:
             if name not in known:
                 yield f"{where}{table}: {unknown(table[:-1], name, known)}"
-    for key in ("name", "regions", "scenarios"):
+    for key in FIXED:
         if key in override:
             yield f"{where}{key}: a scenario cannot set it"
 
