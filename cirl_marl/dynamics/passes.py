@@ -83,4 +83,4 @@ class Passes:
 
 def _valued(values: Floats, ends: Integers) -> Floats:
     """Return the values at the ends of arcs, 0 at stocks, shape (arcs, n)."""
-    return np.where(ends[:, None] >= 0, values[ends], 0.0)
+    return np.where(ends[:, None] >= 0, values[np.maximum(ends, 0)], 0.0)

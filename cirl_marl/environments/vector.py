@@ -112,15 +112,14 @@ class VectorEnv:
     @property
     def neutral_action(self) -> dict[str, Floats]:
         """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each."""
-        step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
-        return self._actuators.neutral_action(np.minimum(step, self.network.episode.horizon - 1))
+        return self._actuators.neutral_action(self._coming())
 
     def normalised(self, agent: str, values: Floats) -> Floats:
         """Return the action that comes closest to physical values of an agent's control in the coming interval.
 
         Values have shape (entries of its action, num_envs), actions (num_envs, entries).
         """
-        return self._actuators.normalised(agent, values, self.physical.step).T
+        return self._actuators.normalised(agent, values, self._coming()).T
 
     @property
     def physical(self) -> State:
@@ -262,6 +261,11 @@ class VectorEnv:
         drawn[:, which] = self._starts.draw(which)
         self._state = old.renewed(ended, self._fresh(drawn))
         return self._observe(self._state)
+
+    def _coming(self) -> Integers:
+        """Return the index of the coming interval in each copy, shape (num_envs,); at the end that of the last."""
+        step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
+        return np.minimum(step, self.network.episode.horizon - 1)
 
     def _fresh(self, drawn: Floats) -> State:
         """State at the start of an episode; flows and measures are those that neutral control would give."""

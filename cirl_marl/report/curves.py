@@ -41,13 +41,13 @@ class PointSeries:
 def save_circularity(
     path: str | Path, network: Network, time: Floats, runs: Mapping[str, Floats], services: Mapping[str, Floats]
 ) -> Path:
-    """Save λ(t) and, below it, the service level of several controls as a PNG and return its path.
+    """Save λ over time and, below it, the service level of several controls as a PNG and return its path.
 
     Lines are means over episodes; bands are the 95 % confidence intervals of the means (Student's t), where
     there are at least two episodes.
 
-    ``runs`` are λ, mass, and ``services`` service levels by control, of shape (episodes, steps), ``time`` (steps,);
-    other shapes raise a ``CirlError``.
+    ``runs`` are means of λ over the intervals, mass, and ``services`` service levels by control, of shape
+    (episodes, steps), ``time`` (steps,); other shapes raise a ``CirlError``.
     """
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
@@ -55,7 +55,8 @@ def save_circularity(
     for axes, curves, top in ((above, runs, math.inf), (below, services, 1.0)):
         for name, values in curves.items():
             _draw_mean(axes, time, _matching(name, values, time), name, names.index(name), top=top)
-    dressed(above, title="Circularity: means and their 95 % intervals", ylabel=f"λ / {network.mass_unit}")
+    title = "Mean circularity of each step, averaged over episodes, with 95 % intervals"
+    dressed(above, title=title, ylabel=f"λ / {network.mass_unit}")
     dressed(below, title="Service level", ylabel="service level")
     below.set_ylim(-0.03, 1.06)
     _set_time(below, time, network)
@@ -114,8 +115,8 @@ def save_trajectory(
         network: the network.
         time: shape (steps,), time.
         stock: stocks, shape (stores, steps), mass.
-        flow: flows, shape (arcs, steps), mass/time.
-        circularity: λ, shape (steps,), mass.
+        flow: mean flows of each interval, shape (arcs, steps), mass/time.
+        circularity: mean λ of each interval, shape (steps,), mass.
         start: stocks before the first step, then masses on batch arcs if ``load`` is given, mass; None leaves them out.
         load: masses on batch arcs, shape (batch arcs, steps), mass; None leaves them out.
         service: service level, shape (steps,); None leaves it out.
@@ -142,9 +143,9 @@ def save_trajectory(
     figure.suptitle(title, fontsize=11, fontweight="bold")
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     _draw_largest(panels[0], held_at, stock, held, "Stocks", mass)
-    _draw_largest(panels[1], time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}")
+    _draw_largest(panels[1], time, flow, [arc.id for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}")
     _draw_mean(panels[2], time, circularity, "", 0)
-    dressed(panels[2], title="Circularity", ylabel=f"λ / {mass}")
+    dressed(panels[2], title="Mean circularity", ylabel=f"λ / {mass}")
     if service is not None:
         _draw_mean(panels[3], time, shaped("service", service, steps), "", 0)
         dressed(panels[3], title="Service level", ylabel="service level")
