@@ -28,7 +28,8 @@ class Rollout:
 
     circularity: Annotated[Floats, "λ at the end of each interval, shape (B, steps), mass"]
     circularity_mean: Annotated[Floats, "mean of λ over each interval, shape (B, steps), mass"]
-    service: Annotated[Floats, "service level, shape (B, steps)"]
+    service: Annotated[Floats, "mean level of the services, shape (B, steps)"]
+    levels: Annotated[Floats, "level of each service, shape (B, services, steps)"]
     local_returns: Annotated[Floats, "sum of the local rewards of each agent, shape (agents, B)"]
     returns: Annotated[Floats, "sum of the rewards of each agent, shape (agents, B)"]
     stock: Annotated[Floats, "stocks after each interval in the first copy, shape (steps, nodes), mass"]
@@ -46,9 +47,21 @@ class Rollout:
 
     @property
     def episode_service(self) -> Floats:
-        """Mean service level of each episode, shape (B,)."""
+        """Mean of the services' levels in each episode, shape (B,)."""
         mean: Floats = self.service.mean(axis=1)
         return mean
+
+    @property
+    def episode_levels(self) -> Floats:
+        """Mean level of each service in each episode, shape (B, services)."""
+        mean: Floats = self.levels.mean(axis=2)
+        return mean
+
+    @property
+    def least_service(self) -> Floats:
+        """Mean level of the service that lacks most in each episode, shape (B,); 1 without services."""
+        least: Floats = self.episode_levels.min(axis=1, initial=1.0)
+        return least
 
 
 def rollout(
@@ -68,6 +81,7 @@ def rollout(
     controller.start(env, seed)
     steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
     circularity, mean, service = np.empty((3, env.num_envs, steps))
+    levels = np.empty((env.num_envs, len(env.network.services), steps))
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
     stock, flow = np.empty((steps, len(env.network.nodes))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
@@ -75,7 +89,7 @@ def rollout(
     for t in range(steps):
         outcome = env.advance(env.stack(controller.act(observations)))
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
-        service[:, t] = outcome.service_level
+        service[:, t], levels[:, :, t] = outcome.service_level, outcome.levels.T
         local += outcome.local
         returns += outcome.reward
         stock[t], flow[t] = env.physical.stock[rows.nodes, 0], outcome.flow[:, 0]
@@ -85,7 +99,8 @@ def rollout(
         if progress is not None:
             progress(t + 1)
     final = env.physical.stock[rows.nodes].mean(axis=1)
-    return Rollout(circularity, mean, service, local, returns, stock, flow, load, inner, final, total_flow / steps)
+    flows = total_flow / steps
+    return Rollout(circularity, mean, service, levels, local, returns, stock, flow, load, inner, final, flows)
 
 
 def interval_ends(network: Network) -> Floats:
