@@ -201,9 +201,9 @@ def said_levels(network: Network, levels: Floats) -> str:
 
 def _demanded(bound: Bound, min_service: ArrayLike | None) -> Floats | None:
     """Return the demanded levels, shape (..., services); None if there are none."""
-    if min_service is None or bound.min_service is None:
-        if min_service is not None:
-            raise CirlError("min_service: this bound demands no service; solve it with min_service")
+    if min_service is None:
         return bound.min_service
+    if bound.min_service is None:
+        raise CirlError("min_service: this bound demands no service; solve it with min_service")
     check_service(min_service)
     return demanded_levels(bound.network, min_service, np.shape(min_service)[:-1])
