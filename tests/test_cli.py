@@ -533,7 +533,7 @@ def test_infeasible_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     bottles(**{"low = { value = 95": "low = { value = 500"})
     asked = ("plan", "bottles.toml", "--control", "optimum", "--min-service", "0.9", "--out", "p.csv")
     assert run(monkeypatch, *asked) == 2
-    assert "no actions reach a mean service level of 0.9; at most 0." in capsys.readouterr().err
+    assert "no actions reach a mean service level of 0.9 of 'bottles_in_use' (at most 0." in capsys.readouterr().err
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
 
 

@@ -53,7 +53,7 @@ def test_at_the_end_of_a_filling() -> None:
     """What falls into the landfill from a node that is being filled is more at the end than at the start, 0."""
     network = Network(
         name="filling",
-        nodes=(Node(id="store", initial=(50.0, 50.0)), Node(id="use"), Node(id="tip", role=TIP)),
+        nodes=(Node(id="store", initial=(50.0, 50.0)), Node(id="use", initial=(0.0, 0.0)), Node(id="tip", role=TIP)),
         arcs=(
             Arc(id="supply", donor="store", recipient="use", law=Law.EXOGENOUS, flow=3.0),
             Arc(id="loss", donor="use", recipient="tip", rate=0.4),

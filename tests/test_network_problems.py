@@ -144,7 +144,11 @@ def test_networks_that_cannot_be_simulated(changes: dict[str, Any], said: str) -
         (DELAYED, {"batches": ((0.0, 1.0), (2.0,))}, "batches must be ((time, mass), …), got ((0.0, 1.0), (2.0,))"),
         (FED, {"flow": (1.0, 2.0)}, "arc 'k': flow must be a number, got (1.0, 2.0)"),
         (steps(0.0), {"times": 0.0}, "series: times must be (time, …), got 0.0; write (0.0,)"),
-        (LINK, {"delay": steps(0.0)}, "arc 'k': delay must be a number, got Series(times=(0.0,), values=(1.0,))"),
+        (
+            LINK,
+            {"delay": steps(0.0)},
+            "arc 'k': delay must be a number, got Series(times=(0.0,), values=(1.0,), interpolation='step', until=None, origin='')",
+        ),
         (LINK, {"rate": None}, "arc 'k': rate must be a number, got None"),
         (VALVE, {"low": (0.0, 2.0)}, "control: low must be a number, got (0.0, 2.0)"),
     ],

@@ -39,7 +39,7 @@ StartSeed = Annotated[
 EpisodeCount = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
 MinService = Annotated[
     float | None,
-    typer.Option(min=0.0, max=1.0, help="Mean service level that mpc and optimum plan for; default: all there is."),
+    typer.Option(min=0.0, max=1.0, help="Mean level of each service, for mpc and optimum; default: all there is."),
 ]
 
 

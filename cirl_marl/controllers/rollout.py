@@ -46,7 +46,8 @@ class Rollout:
 
     circularity: Annotated[Floats, "λ at the end of each interval, shape (B, steps), mass"]
     circularity_mean: Annotated[Floats, "mean of λ over each interval, shape (B, steps), mass"]
-    service: Annotated[Floats, "service level, shape (B, steps)"]
+    service: Annotated[Floats, "mean level of the services, shape (B, steps)"]
+    levels: Annotated[Floats, "level of each service, shape (B, services, steps)"]
     local_returns: Annotated[Floats, "sum of the local rewards of each agent, shape (agents, B)"]
     returns: Annotated[Floats, "sum of the rewards of each agent, shape (agents, B)"]
     stock: Annotated[Floats, "stocks after each interval in the first copy, shape (steps, stores), mass"]
@@ -65,9 +66,21 @@ class Rollout:
 
     @property
     def episode_service(self) -> Floats:
-        """Mean service level of each episode, shape (B,)."""
+        """Mean of the services' levels in each episode, shape (B,)."""
         mean: Floats = self.service.mean(axis=1)
         return mean
+
+    @property
+    def episode_levels(self) -> Floats:
+        """Mean level of each service in each episode, shape (B, services)."""
+        mean: Floats = self.levels.mean(axis=2)
+        return mean
+
+    @property
+    def least_service(self) -> Floats:
+        """Mean level of the service that lacks most in each episode, shape (B,); 1 without services."""
+        least: Floats = self.episode_levels.min(axis=1, initial=1.0)
+        return least
 
 
 def rollout(
@@ -87,6 +100,7 @@ def rollout(
     controller.start(env, seed)
     steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
     circularity, mean, service = np.empty((3, env.num_envs, steps))
+    levels = np.empty((env.num_envs, len(env.network.services), steps))
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
     stock, flow = np.empty((steps, len(env.network.stores))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
@@ -102,7 +116,7 @@ def rollout(
             short = asked - outcome.flow[orders]
             unmet[t] = np.where(short > ROUNDING * np.abs(asked), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
-        service[:, t] = outcome.service_level
+        service[:, t], levels[:, :, t] = outcome.service_level, outcome.levels.T
         local += outcome.local
         returns += outcome.reward
         stock[t], flow[t] = env.physical.stock[rows.nodes, 0], outcome.flow[:, 0]
@@ -113,9 +127,8 @@ def rollout(
             progress(t + 1)
     unmet *= env.network.episode.control_interval
     final = env.physical.stock[rows.nodes].mean(axis=1)
-    return Rollout(
-        circularity, mean, service, local, returns, stock, flow, load, inner, unmet, final, total_flow / steps
-    )
+    flows = total_flow / steps
+    return Rollout(circularity, mean, service, levels, local, returns, stock, flow, load, inner, unmet, final, flows)
 
 
 def beginning(env: VectorEnv, seed: int | None = None) -> Beginning:

@@ -209,7 +209,9 @@ class Dynamics(FlowLaws):
             self.routing.pass_on(flow, routes)
         return flow
 
-    def _flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Eliminated | None) -> Floats:
+    def _flow_at(
+        self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Eliminated | None
+    ) -> Floats:
         return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate), routes)
 
     def _forward(self, flow: Floats, routes: Eliminated | None) -> Floats:

@@ -198,11 +198,11 @@ class VectorEnv:
         circularity, mean, batched = self._credit.circularity(state, transition, flow)
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
-        measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + service)
+        measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + levels)
         self._state = State(transition.stock, transition.inner, flow, measures, step, batched, *totals)
         observation = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
-        return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
+        return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)
 
     def local_rewards(self) -> dict[str, Floats]:
         """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
@@ -248,9 +248,10 @@ class VectorEnv:
         state, ended = self.physical, outcome.truncated
         steps = np.maximum(state.step, 1)
         final, whole = self.by_agent(outcome.observation), self.state()
+        service = self.scoring.service_level(state.service / steps)
         for agent, info in infos.items():
             info |= {"final_observation": final[agent], "final_state": whole, "_final_observation": ended}
-            info |= {"episode_circularity": state.circularity / steps, "episode_service_level": state.service / steps}
+            info |= {"episode_circularity": state.circularity / steps, "episode_service_level": service}
 
     def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in the copies that ended and return the observation of all."""
@@ -271,10 +272,11 @@ class VectorEnv:
         """State at the start of an episode; flows and measures are those that neutral control would give."""
         dynamics, batch = self.dynamics, drawn.shape[1]
         stocks, inner = self.rows.split(drawn)
-        stock, step, zeros = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp), np.zeros(batch)
+        stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
         neutral = dynamics.neutral.take(step, axis=1)
         flow, measures = dynamics.start_flow(stock, inner, neutral), dynamics.inner.measures(inner, neutral)
-        return State(stock, inner, flow, measures, step, np.zeros((2, batch)), zeros, zeros)
+        sums = (np.zeros(shape) for shape in ((2, batch), (batch,), (len(self.network.services), batch)))
+        return State(stock, inner, flow, measures, step, *sums)
 
     def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
         """Return all quantities in one array, and the mean flows, which are read-only."""

@@ -30,7 +30,7 @@ MARKERS = "osD^vP*X"
 
 @dataclass(frozen=True, slots=True)
 class PointSeries:
-    """Points of one kind in the plane of mean service level and λ̄, mass, shape (points,) each; ``joined`` by a line."""
+    """Points of one kind in the plane of service level and λ̄, mass, shape (points,) each; ``joined`` by a line."""
 
     name: str
     service: Floats
@@ -159,7 +159,8 @@ def save_fronts(
 ) -> Path:
     """Save λ̄ against the service level of policies, plans or controllers as a PNG and return its path.
 
-    ``bound`` is service level and bound on λ̄, shape (points, 2), by service; what lies above is shaded. Empty for none.
+    Of several services it is the mean level of the one that lacks most. ``bound`` is the level of every service and the
+    bound on λ̄, shape (points, 2), by level; what lies above is shaded. Empty for none.
     """
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
@@ -179,7 +180,8 @@ def save_fronts(
     if len(bound):
         _draw_bound(axes, bound)
     dressed(axes, title=title, ylabel=f"λ̄ / {network.mass_unit}")
-    axes.set_xlabel("mean service level", fontsize=9)
+    of = "" if len(network.services) < 2 else " of the service that lacks most"
+    axes.set_xlabel(f"mean service level{of}", fontsize=9)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
     return save(figure, path)
 
