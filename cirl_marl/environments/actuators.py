@@ -98,7 +98,7 @@ class Actuators:
         np.minimum(acting, high, out=acting)
         if self._all_act:
             return acting
-        controls = self._neutral.take(step, axis=1)
+        controls: Floats = self._neutral.take(step, axis=1)
         controls[self.acting] = acting
         return controls
 
