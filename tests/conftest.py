@@ -132,7 +132,7 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
     """Return a network with every law, role and kind of control, drawn from ``seed``; half have shares and series."""
     rng = np.random.default_rng(seed)
     ends = [rng.choice(nodes, 2, replace=False) for _ in range(arcs if nodes > 1 else 0)]
-    laws = [LAWS[rng.integers(len(LAWS))] for _ in ends]
+    laws: list[Law] = [LAWS[rng.integers(len(LAWS))] for _ in ends]
     interval, horizon = float(rng.uniform(0.05, 3)), int(rng.integers(1, 5))
     real = bool(rng.integers(2))
     passing = {i for i in range(1, nodes) if real and rng.random() < 0.4}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from networkx import NetworkXError
+from small_networks import constant
 
 from cirl_marl import (
     Arc,
@@ -154,7 +155,7 @@ def test_snapshot_of_another_definition() -> None:
     network = load_network("copper_net")
     env = VectorEnv(network, num_envs=1)
     env.reset(0)
-    faster = tuple(replace(arc, rate=2 * arc.rate) for arc in network.arcs)
+    faster = tuple(replace(arc, rate=2 * constant(arc.rate)) for arc in network.arcs)
     with pytest.raises(ControlError, match="another definition of network 'copper_net'"):
         VectorEnv(replace(network, arcs=faster), num_envs=1).restore(env.snapshot())
 

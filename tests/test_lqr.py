@@ -294,7 +294,7 @@ def test_store_without_outflow_of_its_own() -> None:
             lambda: LinearSystem.of(
                 chain(**{"in": replace(chain().arcs[0], flow=Series(times=(0.0, 3.0), values=(1.0, 2.0)))})
             ),
-            "a time series drives 'in'",
+            "numbers change in time: in",
         ),
         (
             lambda: LinearSystem.of(

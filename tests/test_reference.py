@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 from paper_classes import trajectory
 from scipy.integrate import solve_ivp
+from small_networks import constant
 
 from cirl_marl import CirlError, Law, VectorEnv, load_network, parallel_env, single_agent_env
 from cirl_marl.dynamics.motion import Dynamics
@@ -70,7 +71,7 @@ def test_euler_of_the_networks_is_first_order(name: str) -> None:
     control = network.compartments[agent].control
     assert control is not None
     held = dynamics.neutral[:, :1].copy()
-    held[network.control_rows[agent]] = 0.25 * control.low + 0.75 * control.high
+    held[network.control_rows[agent]] = 0.25 * constant(control.low) + 0.75 * constant(control.high)
     rate = dynamics.rate(held)
 
     def slope(_: float, stock: NDArray[np.float64]) -> NDArray[np.float64]:

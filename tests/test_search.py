@@ -70,7 +70,7 @@ def test_demanded_service_is_charged() -> None:
     assert len(best) == 21 * 20 + 1  # intervals of the candidates and of each iteration
     assert shares == sorted(shares) and shares[-1] == 1.0 and best[0] == -np.inf
     assert best == sorted(best)
-    missing = max(0.0, 0.9 - found.service)
+    missing = np.maximum(0.0, 0.9 - found.levels).sum()
     assert best[-1] == pytest.approx(found.circularity / 1420.0 - SHORTFALL_PRICE * missing)
     assert missing < 1e-3
 

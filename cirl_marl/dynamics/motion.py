@@ -13,7 +13,7 @@ import numpy as np
 from cirl_marl.dynamics.batches import BatchTransport
 from cirl_marl.dynamics.inner import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.routing import Routes
+from cirl_marl.dynamics.routing import Eliminated
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declared import itemised
@@ -209,10 +209,12 @@ class Dynamics(FlowLaws):
             self.routing.pass_on(flow, routes)
         return flow
 
-    def _flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Routes | None) -> Floats:
+    def _flow_at(
+        self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Eliminated | None
+    ) -> Floats:
         return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate), routes)
 
-    def _forward(self, flow: Floats, routes: Routes | None) -> Floats:
+    def _forward(self, flow: Floats, routes: Eliminated | None) -> Floats:
         """Stop, in place, flows that a model or the stage of a solver would reverse, and pass on what is left."""
         if self.physical and not self._exact:
             np.maximum(flow, 0.0, out=flow)
@@ -221,7 +223,7 @@ class Dynamics(FlowLaws):
         return flow
 
     def _explicit_step(
-        self, stock: Floats, inner: Floats, rate: Floats, routes: Routes | None, controls: Floats
+        self, stock: Floats, inner: Floats, rate: Floats, routes: Eliminated | None, controls: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Take one Runge-Kutta step of stocks and inner states together; models with a step of their own go ahead."""
         h = self.substep
@@ -253,7 +255,7 @@ class Dynamics(FlowLaws):
         return after, self.inner.moved(ahead, change), moved, rate
 
     def _moved_exactly(
-        self, stock: Floats, routes: Routes | None, rate: Floats, settled: Floats | None = None
+        self, stock: Floats, routes: Eliminated | None, rate: Floats, settled: Floats | None = None
     ) -> Floats:
         """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep.
 

@@ -45,7 +45,7 @@ class _Round:
     sources: Annotated[Integers, "node that gives each of ``into``"]
 
 
-class Routes:
+class Eliminated:
     """The eliminated shares of one control interval, in each copy."""
 
     def __init__(self, rounds: Iterable[_Round], values: Floats, shares: Floats, nodes: int) -> None:
@@ -77,7 +77,7 @@ class Routing:
 
     Attributes:
         nodes: number of nodes without stock.
-        arcs: the arcs that leave them, in the order of ``shares`` of ``Routes``.
+        arcs: the arcs that leave them, in the order of ``shares`` of ``Eliminated``.
         donors: which of the nodes each leaves.
     """
 
@@ -102,11 +102,11 @@ class Routing:
         self._entries = RowSum([order.entry(i, j) for i, j in pairs], columns, 1.0, (order.size, len(pairs)))
         self._constant = None if constant is None else self._routes(constant)
 
-    def routes(self, rate: Floats) -> Routes | None:
+    def routes(self, rate: Floats) -> Eliminated | None:
         """Return what to pass flows on with while ``rate``, shape (arcs, B), holds; None if every node stores."""
         return (self._constant or self._routes(rate)) if self.nodes else None
 
-    def pass_on(self, flow: Floats, routes: Routes) -> None:
+    def pass_on(self, flow: Floats, routes: Eliminated) -> None:
         """Fill in what leaves the nodes without stock, given in place what enters them, shape (arcs, B)."""
         through = routes.throughput(self._entering(flow)).take(self.donors, 0)
         through *= routes.shares
@@ -122,9 +122,9 @@ class Routing:
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
         return np.full(self.nodes, float(self._entering(flow[:, None])[:, 0] @ total))
 
-    def _routes(self, rate: Floats) -> Routes:
+    def _routes(self, rate: Floats) -> Eliminated:
         shares = rate.take(self.arcs, 0)
-        return Routes(self._rounds, self._entries(shares), shares, self.nodes)
+        return Eliminated(self._rounds, self._entries(shares), shares, self.nodes)
 
 
 class _Elimination:

@@ -57,9 +57,9 @@ class Actuators:
     def normalised(self, agent: str, values: Floats, step: Integers) -> Floats:
         """Return the actions that come closest to physical values of an agent's control, shape (its entries, B)."""
         _, middle, half, _ = (each[self.entries[agent]] for each in self._held(step))
-        actions: Floats = np.divide(values - middle, half, out=np.zeros_like(values), where=half > 0)
-        np.clip(actions, -1.0, 1.0, out=actions)
-        return actions
+        actions = np.divide(values - middle, half, out=np.zeros_like(values), where=half > 0)
+        clipped: Floats = np.clip(actions, -1.0, 1.0)
+        return clipped
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
@@ -98,7 +98,7 @@ class Actuators:
         np.minimum(acting, high, out=acting)
         if self._all_act:
             return acting
-        controls = self._neutral.take(step, axis=1)
+        controls: Floats = self._neutral.take(step, axis=1)
         controls[self.acting] = acting
         return controls
 

@@ -153,7 +153,10 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         return {agent: seen[0] for agent, seen in observation.items()}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``."""
+        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``.
+
+        Flows are means over the last step, and λ is that of these flows, with what has moved in batches up to its end.
+        """
         if self.render_mode is None:
             raise CirlError(f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when it is made")
         from cirl_marl.drawing.digraph import Canvas

@@ -113,15 +113,14 @@ class VectorEnv:
     @property
     def neutral_action(self) -> dict[str, Floats]:
         """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each."""
-        step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
-        return self._actuators.neutral_action(np.minimum(step, self.network.episode.horizon - 1))
+        return self._actuators.neutral_action(self._coming())
 
     def normalised(self, agent: str, values: Floats) -> Floats:
         """Return the action that comes closest to physical values of an agent's control in the coming interval.
 
         Values have shape (entries of its action, num_envs), actions (num_envs, entries).
         """
-        return self._actuators.normalised(agent, values, self.physical.step).T
+        return self._actuators.normalised(agent, values, self._coming()).T
 
     @property
     def physical(self) -> State:
@@ -210,11 +209,11 @@ class VectorEnv:
         circularity, mean, batched = self._credit.circularity(state, transition, flow)
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
-        measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + service)
+        measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + levels)
         self._state = State(transition.stock, transition.inner, flow, measures, step, batched, *totals)
         observation = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
-        return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
+        return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)
 
     def local_rewards(self) -> dict[str, Floats]:
         """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
@@ -260,9 +259,10 @@ class VectorEnv:
         state, ended = self.physical, outcome.truncated
         steps = np.maximum(state.step, 1)
         final, whole = self.by_agent(outcome.observation), self.state()
+        service = self.scoring.service_level(state.service / steps)
         for agent, info in infos.items():
             info |= {"final_observation": final[agent], "final_state": whole, "_final_observation": ended}
-            info |= {"episode_circularity": state.circularity / steps, "episode_service_level": state.service / steps}
+            info |= {"episode_circularity": state.circularity / steps, "episode_service_level": service}
 
     def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in the copies that ended and return the observation of all."""
@@ -274,14 +274,20 @@ class VectorEnv:
         self._state = old.renewed(ended, self._fresh(drawn))
         return self._observe(self._state)
 
+    def _coming(self) -> Integers:
+        """Return the index of the coming interval in each copy, shape (num_envs,); at the end that of the last."""
+        step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
+        return np.minimum(step, self.network.episode.horizon - 1)
+
     def _fresh(self, drawn: Floats) -> State:
         """State at the start of an episode; flows and measures are those that neutral control would give."""
         dynamics, batch = self.dynamics, drawn.shape[1]
         stocks, inner = self.rows.split(drawn)
-        stock, step, zeros = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp), np.zeros(batch)
+        stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
         neutral = dynamics.neutral.take(step, axis=1)
         flow, measures = dynamics.start_flow(stock, inner, neutral), dynamics.inner.measures(inner, neutral)
-        return State(stock, inner, flow, measures, step, np.zeros((2, batch)), zeros, zeros)
+        sums = (np.zeros(shape) for shape in ((2, batch), (batch,), (len(self.network.services), batch)))
+        return State(stock, inner, flow, measures, step, *sums)
 
     def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
         """Return all quantities in one array, and the mean flows, which are read-only."""
