@@ -16,13 +16,13 @@ from series_definition import column, definition, written
 
 from cirl_marl import Episode, Network, NetworkError, Node, load_network, parallel_env, vector_env
 from cirl_marl.cli.networks import plan, simulate
-from cirl_marl.network.calendar import Moment, elapsed, labels, year, years
+from cirl_marl.network.calendar import When, elapsed, labels, year, years
 from cirl_marl.report import curves
 
 SOLD = 'control = { kind = "share", low = 0.1, neutral = 0.5, high = 0.9, unit = "1", source = "x" }'
 
 
-def network(start: Moment | None, unit: str, interval: float = 1.0) -> Network:
+def network(start: When | None, unit: str, interval: float = 1.0) -> Network:
     """Return a network with this clock."""
     episode = Episode(control_interval=interval, horizon=4, start=start)
     return Network(name="x", nodes=(Node(id="a", initial=(1, 1)),), arcs=(), time_unit=unit, episode=episode)
@@ -42,7 +42,7 @@ def network(start: Moment | None, unit: str, interval: float = 1.0) -> Network:
         (2000.5, "day", 1.0, "date", ["2000-07-01 15:00", "2000-07-02 15:00", "2000-07-03 15:00"]),
     ],
 )
-def test_labels(start: Moment, unit: str, interval: float, header: str, expected: list[str]) -> None:
+def test_labels(start: When, unit: str, interval: float, header: str, expected: list[str]) -> None:
     """Years for units of a month or more, dates for others, with the hour where it is not midnight."""
     assert labels(network(start, unit), np.arange(3) * interval) == ([header], [expected])
     assert labels(network(None, unit), np.arange(3) * interval) == ([], [])

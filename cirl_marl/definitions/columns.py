@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.network.calendar import Moment
+from cirl_marl.network.calendar import When
 
 YEAR = "year"
 """The column of times, if a file has one of this name and nothing else is said."""
@@ -23,7 +23,7 @@ YEAR = "year"
 class Column:
     """Numbers of a column, with the times of the rows as the file has them; a single number without times if None."""
 
-    times: Sequence[Moment] | None
+    times: Sequence[When] | None
     values: Sequence[float]
     origin: str
 
@@ -144,7 +144,7 @@ class _Table:
             raise CirlError(f"file '{self.name}', line {line}, column '{column}': '{text}' {remedy}")
         return value
 
-    def _times(self, chosen: Iterable[int], column: str) -> list[Moment]:
+    def _times(self, chosen: Iterable[int], column: str) -> list[When]:
         """Return the times of rows, which increase; all numbers or all dates, as the first is."""
         dated = _date(self.rows[next(iter(chosen))][1][self.place[column]]) is not None
         seen: dict[Any, int] = {}

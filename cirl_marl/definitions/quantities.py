@@ -41,7 +41,7 @@ def _moment(given: object) -> object:
     raise PydanticCustomError("moment", "must be a number, such as the year 2000 or 2000.5, or a date, as 2020-03-01")
 
 
-Moment = Annotated[
+Time = Annotated[
     Any,
     BeforeValidator(_moment),
     WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "string", "format": "date"}]}),
@@ -62,11 +62,11 @@ TimeUnit = Annotated[
 class AmountSeries(Table):
     """Numbers that change in time, in the unit of the table in which they stand."""
 
-    times: list[Moment] = Field(description="when each value holds; the first not after the start of the episode")
+    times: list[Time] = Field(description="when each value holds; the first not after the start of the episode")
     values: list[Number] = Field(description="one for each time")
     interpolation: Interpolation = "step"
     time_unit: TimeUnit = None
-    until: Moment | None = Field(
+    until: Time | None = Field(
         None, description="when the last value ceases to hold; by default never with steps, at its time with lines"
     )
 
@@ -127,4 +127,4 @@ def forms(kind: Any) -> dict[str, Any]:
     return found
 
 
-Amount = varying(Number, AmountSeries, AmountColumn)
+VaryingAmount = varying(Number, AmountSeries, AmountColumn)

@@ -11,15 +11,15 @@ from typing import Annotated, Any, Literal, get_type_hints
 from pydantic import Field, StrictBool, create_model
 
 from cirl_marl.definitions.quantities import (
-    Amount,
     ColumnTable,
-    Moment,
     Number,
     QuantityTable,
     Range,
     SeriesTable,
     Source,
     Table,
+    Time,
+    VaryingAmount,
     varying,
 )
 from cirl_marl.network.declared import (
@@ -84,7 +84,7 @@ def table_of(made: type[Any], **more: Any) -> Any:
         raise TypeError(f"{made.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
     spelled = {name: _spelled(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
     keys = {name: _key(made, name, kind) for name, kind in spelled.items() if kind is not None}
-    if Amount in spelled.values():
+    if VaryingAmount in spelled.values():
         more |= {"unit": (str, ...), "source": (Source, ...)}
     summary = str(made.__doc__).partition("\n")[0]
     return create_model(f"{made.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
@@ -106,12 +106,12 @@ def _spelled(declared: Declared, hint: Any) -> Any:
     if isinstance(declared, Word):
         return declared.of if isinstance(declared.of, type) else Literal[declared.of]
     if isinstance(declared, Numbers):
-        tables = {"range": Range, "batches": Batches, "amount": Amount}
+        tables = {"range": Range, "batches": Batches, "amount": VaryingAmount}
         return tables[declared.spelled] if declared.spelled else None
     if isinstance(declared, Nested):
         return ControlTable if declared.of == "control" else ModelTable
     if isinstance(declared, CalendarTime):
-        return Moment
+        return Time
     if isinstance(declared, Quantity) and declared.varies:
         return varying(QuantityTable, SeriesTable, ColumnTable, declared.none)
     if isinstance(declared, Quantity):

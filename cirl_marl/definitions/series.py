@@ -9,7 +9,7 @@ from datetime import date
 from cirl_marl.definitions.columns import DataFiles
 from cirl_marl.definitions.quantities import AmountColumn, AmountSeries
 from cirl_marl.errors import CirlError
-from cirl_marl.network.calendar import Moment, elapsed
+from cirl_marl.network.calendar import When, elapsed
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.units import factor
 
@@ -18,10 +18,10 @@ from cirl_marl.network.units import factor
 class Clock:
     """What times of a definition count from: the ``start`` of its episode, if it has one, in the network's ``unit``."""
 
-    start: Moment | None
+    start: When | None
     unit: str
 
-    def times(self, given: Sequence[Moment], time_unit: str | None) -> tuple[float, ...]:
+    def times(self, given: Sequence[When], time_unit: str | None) -> tuple[float, ...]:
         """Return times since the start; given as such in ``time_unit``, or without it as years or dates."""
         if time_unit is not None:
             tick = factor(time_unit, self.unit)

@@ -15,7 +15,7 @@ from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats
 from cirl_marl.network.units import factor
 
-Moment = float | date
+When = float | date
 """A calendar year such as 2000 or 2000.5, or a date."""
 
 YEAR = 365.25
@@ -28,7 +28,7 @@ def in_years(unit: str) -> bool:
     return factor(unit, "day") > 28
 
 
-def year(moment: Moment) -> float:
+def year(moment: When) -> float:
     """Return a moment as a calendar year with its fraction.
 
     >>> year(date(2020, 7, 1)) == 2020 + 182 / 365.25
@@ -39,7 +39,7 @@ def year(moment: Moment) -> float:
     return float(moment)
 
 
-def elapsed(moment: Moment, start: Moment, unit: str) -> float:
+def elapsed(moment: When, start: When, unit: str) -> float:
     """Return the time from ``start`` to ``moment``, in ``unit``; negative if it lies before.
 
     >>> elapsed(2001.5, 2000, "year"), elapsed(date(2020, 3, 1), 2020, "day")
@@ -71,7 +71,7 @@ def labels(network: Parts, time: ArrayLike) -> tuple[list[str], list[list[str]]]
     return ["date"], [[each.isoformat(" ", "minutes")[: 10 if whole else None] for each in dates]]
 
 
-def _clock(moment: Moment) -> datetime:
+def _clock(moment: When) -> datetime:
     """Return a moment on a clock without zones; the fraction of a year is one of 365.25 days."""
     if isinstance(moment, date):
         return datetime(moment.year, moment.month, moment.day)
