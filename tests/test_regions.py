@@ -121,6 +121,9 @@ def test_regions_stand_in_the_catalogue(own_catalogue: Path) -> None:
     assert load_network("copper_net").region == ""
     with pytest.raises(CirlError, match=r"unknown network 'ores_jpan'\. Did you mean 'ores_japan'\? Known: copper_net"):
         load_network("ores_jpan")
+    for wrong in ("copper_net_", "_japan", "japan", "ores_"):
+        with pytest.raises(CirlError, match=f"^unknown network '{wrong}'"):
+            load_network(wrong)
     with pytest.raises(CirlError, match=r"^unknown network 'ores'\. .*Known: ores_china, ores_japan, ores_spain\."):
         load_network("ores")
 

@@ -33,8 +33,7 @@ def networks() -> list[str]:
     >>> "copper_net" in networks()
     True
     """
-    regions = {path.stem: _definition(path).regions for path in folder("envs").glob("*.toml")}
-    return sorted(name for stem, each in regions.items() for name in [f"{stem}_{id_}" for id_ in each] or [stem])
+    return sorted({name for path in folder("envs").glob("*.toml") for name in _regions(path)})
 
 
 def recipes() -> list[str]:
@@ -73,14 +72,18 @@ def recipe_path(name: str | Path) -> Path:
 
 
 def _in_catalogue(name: str) -> tuple[Path, str]:
-    """Return file and region of a network; other files than those whose names it begins with are not read."""
+    """Return file and region of a network; only files with whose names it begins are read, the longest name first."""
     for path in sorted(folder("envs").glob("*.toml"), key=lambda each: -len(each.stem)):
-        region = name.removeprefix(path.stem)
-        if region[:1] in ("", "_") and region[1:] in (_definition(path).regions or [""]):
-            return path, region[1:]
+        if name.startswith(path.stem) and name in (found := _regions(path)):
+            return path, found[name]
     known = networks()
     regions = [each for each in known if each.startswith(f"{name}_")]
     raise CirlError(f"{unknown('network', name, regions or known)} A file of your own must end in .toml.")
+
+
+def _regions(path: Path) -> dict[str, str]:
+    """Return the regions of a definition by the names of their networks; the empty one if it has none."""
+    return {f"{path.stem}_{region}": region for region in _definition(path).regions} or {path.stem: ""}
 
 
 def _definition(path: Path) -> Definition:
