@@ -16,11 +16,10 @@ from cirl_marl.report.curves import save_trajectory
 def write_trajectory(folder: Path, name: str, env: VectorEnv, begun: Beginning, run: Rollout, title: str) -> list[Path]:
     """Write ``name.csv`` and ``name.png`` of what ``run`` did in ``env`` from where it began; return their paths.
 
-    The table has a row for the start and one for the end of each interval: year or date, if the network has a start on
-    the calendar, λ at the end and the mean of λ, the service
-    level, stocks at the end, mean flows, what passes through nodes without stock, masses on the way and inner states
-    that an agent may see. The picture shows λ as a mean, as it does the flows. ``env`` is left at the start of the
-    episode.
+    The table has a row for the start and one for the end of each interval: year or date at the end, if the network has
+    a start on the calendar, λ at the end and the mean of λ, the service level, stocks at the end, mean flows, what
+    passes through nodes without stock, masses on the way and inner states that an agent may see. The picture shows λ as
+    a mean, as it does the flows. ``env`` is left at the start of the episode.
     """
     folder.mkdir(parents=True, exist_ok=True)
     begun.reset(env)
@@ -54,7 +53,7 @@ def write_trajectory(folder: Path, name: str, env: VectorEnv, begun: Beginning, 
 def _header(env: VectorEnv) -> list[str]:
     network, physics = env.network, env.dynamics.inner
     mass, time = network.mass_unit, network.time_unit
-    header = [f"time ({time})", *labels(network, 0.0)[0]]
+    header = [f"time ({time})", *(f"{each} at the end" for each in labels(network, 0.0)[0])]
     header += [f"circularity at the end ({mass})", f"mean circularity ({mass})", "service level"]
     header += [f"stock of {node.id} ({mass})" for node in network.stores]
     header += [f"flow of {arc.id} ({mass}/{time})" for arc in network.arcs]
