@@ -146,7 +146,9 @@ def save_trajectory(
     figure.suptitle(title, fontsize=11, fontweight="bold")
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     _draw_largest(panels[0], held_at, stock, held, "Stocks", mass)
-    _draw_largest(panels[1], middle, flow, [arc.id for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}")
+    _draw_largest(
+        panels[1], middle, flow, [arc.id for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}"
+    )
     _draw_mean(panels[2], middle, circularity, "", 0)
     dressed(panels[2], title="Mean circularity", ylabel=f"λ / {mass}")
     if service is not None:
