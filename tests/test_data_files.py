@@ -301,3 +301,37 @@ def test_check_names_what_is_wrong_in_every_scenario(tmp_path: Path) -> None:
     path = written(tmp_path, definition(column(), start="2000", more=more))
     with pytest.raises(DefinitionError, match=r"scenarios\.other\.arcs\.ore\.flow: file 'no\.csv': is not there"):
         Definition(path).check()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("folder", "file 'folder': is no file"),
+        ("x" * 300 + ".csv", "cannot be read: .* File name too long"),
+        ("round.csv", r"file 'round\.csv': (is no file|cannot be read)"),
+        ("ores\\u0000.csv", "cannot be read: embedded null byte"),
+    ],
+)
+def test_what_cannot_be_read_is_no_traceback(tmp_path: Path, name: str, said: str) -> None:
+    """A folder, a name that no system takes, a link in a circle."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "round.csv").symlink_to("round.csv")
+    path = written(tmp_path, definition(column(file=name), start="2000"))
+    with pytest.raises(DefinitionError, match=rf"arcs\.ore\.flow: .*{said}"):
+        load_network(path)
+
+
+def test_semicolons_are_told(tmp_path: Path) -> None:
+    """A file without commas has one column; the message says what separates them."""
+    path = written(tmp_path, definition(column(), start="2000"), CSV.replace(",", ";"))
+    with pytest.raises(DefinitionError, match=r"unknown column 'kt'.*Separate columns with commas\.$"):
+        load_network(path)
+
+
+def test_files_that_are_too_large_are_refused(tmp_path: Path) -> None:
+    """Before they are read."""
+    path = written(tmp_path, definition(column(), start="2000"))
+    with (tmp_path / "ores.csv").open("ab") as file:
+        file.truncate(300_000_000)
+    with pytest.raises(DefinitionError, match=r"file 'ores\.csv': is larger than 200 MB"):
+        load_network(path)

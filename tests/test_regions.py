@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import typer
 from series_definition import column, definition, written
 
 import cirl_marl
@@ -151,3 +152,15 @@ def test_commands_take_regions(
     list_networks()
     printed = capsys.readouterr().out
     assert "ores_japan" in printed and "ores_china" in printed
+
+
+def test_check_of_a_file_looks_at_every_region(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A mistake in one region shows though nobody named it, beside the others that have none."""
+    path = written(tmp_path, TEXT.replace('"China"', '"Chnia"'))
+    with pytest.raises(typer.Exit):
+        check([str(path)])
+    printed = capsys.readouterr()
+    assert "Did you mean 'China'?" in " ".join(printed.err.split())
+    assert f"{path}:japan: 7 compartments" in " ".join(printed.out.split())

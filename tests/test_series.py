@@ -147,3 +147,22 @@ def test_material_and_references_count_for_no_result() -> None:
     other = replace(network, material="ore", references=("a book",), title="Ores")
     assert fingerprint(other) == fingerprint(network)
     assert fingerprint(replaced(start=2000)) == fingerprint(replaced(start=2000.0)) != fingerprint(network)
+
+
+@given(st.data())
+def test_means_keep_to_the_values_that_they_are_of(data: st.DataObject) -> None:
+    """What holds throughout an interval is its mean to the bit; no mean leaves the range of its values."""
+    knots = data.draw(st.lists(st.integers(1, 39), max_size=6, unique=True).map(sorted))
+    number = st.sampled_from([0.0, 0.1, 0.3, 0.7, 33.3]) | st.floats(0.0, 1e6)
+    values = [data.draw(number) for _ in range(len(knots) + 2)]
+    kind = data.draw(st.sampled_from(["step", "linear"]))
+    shift = data.draw(st.sampled_from([0.0, 4e-15, 0.5]))
+    times = (0.0, *(knot + shift for knot in knots), 41.0)
+    means = Series(times=times, values=tuple(values), interpolation=kind).means(np.arange(41.0))
+    assert means.min() >= min(values)
+    assert means.max() <= max(values)
+    if kind == "step" and shift != 0.5:
+        place = np.searchsorted(times, np.arange(40.0) + 0.5) - 1
+        held = np.array(values)[place]
+        same = np.ones(40, dtype=bool) if shift == 0.0 else ~np.isin(np.arange(40), knots)
+        assert (means[same] == held[same]).all()

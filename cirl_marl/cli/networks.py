@@ -31,7 +31,7 @@ from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.figures import time_window
 from cirl_marl.network import Network
-from cirl_marl.network.series import extremes
+from cirl_marl.network.series import Series, extremes
 from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
 
 if TYPE_CHECKING:
@@ -70,9 +70,9 @@ def show(
     for service in found.services:
         ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
         ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
-        console.print(
-            f"service '{service.id}': {service.measure or service.quantity} of {service.provider} {' and '.join(ends)}"
-        )
+        changing = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
+        measured = f"{service.measure or service.quantity} of {service.provider}"
+        console.print(f"service '{service.id}': {measured} {' and '.join(ends)}{changing}")
     circularity = float(found.circularity(flow))
     console.print(f"λ of the start state: {circularity:.5g} {found.mass_unit}")
     say(f"start: {begun.said}")
@@ -97,7 +97,7 @@ def check(
     What is no mistake but seldom meant is said as a remark. Nothing is trained.
     """
     faulty = False
-    for source in sources:
+    for source in [each for given in sources for each in _with_regions(given)]:
         try:
             if _is_recipe(source):
                 _check_recipe(source, network)
@@ -110,6 +110,17 @@ def check(
             errors.print(plain(error), highlight=False, soft_wrap=True)
     if faulty:
         raise typer.Exit(2)
+
+
+def _with_regions(source: str) -> list[str]:
+    """Return a file as it is, or once for each region that it has."""
+    from cirl_marl.definitions.reading import read_toml
+
+    try:
+        regions = read_toml(Path(source)).get("regions") if source.endswith(".toml") else None
+    except CirlError:  # a mistake of the file, which the check says
+        return [source]
+    return [f"{source}:{region}" for region in regions] if isinstance(regions, dict) and regions else [source]
 
 
 def _is_recipe(source: str) -> bool:

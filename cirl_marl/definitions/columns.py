@@ -15,6 +15,8 @@ from typing import Any
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.calendar import When
 
+LARGEST = 200_000_000
+"""Bytes of the largest file that is read."""
 YEAR = "year"
 """The column of times, if a file has one of this name and nothing else is said."""
 
@@ -57,13 +59,25 @@ class DataFiles:
         return self._table(name).column(column, where, times)
 
     def _table(self, name: str) -> _Table:
+        try:
+            return self._read(name)
+        except CirlError:
+            raise
+        except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: links in a circle; ValueError: odd names
+            raise CirlError(f"file '{name}': cannot be read: {error}") from error
+
+    def _read(self, name: str) -> _Table:
         if name not in self._tables:
             path, told = self._folder / name, f"file '{name}'"
             if Path(name).is_absolute() or ".." in Path(name).parts or not path.resolve().is_relative_to(self._folder):
                 raise CirlError(f"{told}: must lie in {self._folder}, the folder of the definition, or below it")
             if not path.is_file():
+                if path.exists() or path.is_symlink():
+                    raise CirlError(f"{told}: is no file")
                 beside = sorted(each.name for each in path.parent.glob("*.csv"))
                 raise CirlError(f"{told}: is not there; {unknown(f'file in {path.parent}', path.name, beside)}")
+            if path.stat().st_size > LARGEST:
+                raise CirlError(f"{told}: is larger than {LARGEST // 10**6} MB; leave out rows that no 'where' chooses")
             self._stamps[path] = path.stat().st_mtime_ns
             self._tables[name] = _Table(name, path.read_bytes())
         return self._tables[name]
@@ -97,7 +111,8 @@ class _Table:
             times = YEAR
         for each in (column, *where, *([] if times is None else [times])):
             if each not in self.place:
-                raise CirlError(f"file '{self.name}': {unknown('column', each, self.header)}")
+                told = f"file '{self.name}': {unknown('column', each, self.header)}"
+                raise CirlError(told + ("" if len(self.header) > 1 else " Separate columns with commas."))
         chosen = self._chosen(where)
         lines = [self.rows[i][0] for i in chosen]
         values = [self._number(*self.rows[i], column) for i in chosen]

@@ -71,13 +71,13 @@ class Converter:
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),
         }
-        title = self._placed(table.title, "title")
+        title, material = (self._placed(getattr(table, key), key) for key in ("title", "material"))
         if self.mistakes:
             raise NetworkError(table.name, self.mistakes)
         return Network(
             name="_".join([table.name, *([self.region] if self.region else [])]),
             title=title,
-            material=table.material,
+            material=material,
             references=tuple(table.references),
             mass_unit=table.units.mass,
             time_unit=table.units.time,
@@ -136,6 +136,8 @@ class Converter:
         if len(given) != min(1, len(needed)) or not set(given) <= set(needed):
             asked = " or ".join(needed) or f"none of {', '.join(GIVEN)}"
             self.mistakes.append(f"{where}: law '{arc.law}' needs {asked}, got {given or 'none'}")
+        if arc.share is not None and Law(arc.law) is not Law.SHARE:
+            self.mistakes.append(f"{where}.share: law '{arc.law}' takes none; shares need law = \"share\"")
 
     def _batches(self, table: Batches, where: str) -> tuple[tuple[float, float], ...]:
         if len(table.times) != len(table.masses):

@@ -19,6 +19,7 @@ from cirl_marl.definitions.quantities import FORMS
 from cirl_marl.definitions.schema import NetworkTable
 from cirl_marl.errors import DefinitionError, NetworkError, unknown
 from cirl_marl.network import Network
+from cirl_marl.records.files import write_atomically
 
 DEFAULT = "default"
 """The scenario that stands outside ``[scenarios]``."""
@@ -129,7 +130,8 @@ def write_network(network: Network, path: Path) -> None:
     """Write a network built in Python as a definition file; its other scenarios are not written."""
     from cirl_marl.definitions.writing import definition_of
 
-    path.write_text(definition_of(network), encoding="utf-8")
+    text = definition_of(network)
+    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -11,11 +11,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 
+from cirl_marl.errors import NetworkError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.splits import Split, splits
 
+MOST_ROUNDS = 100
+"""Policies that are tried; a handful is enough."""
 SLACK = 1e-8
 """Relative widening that makes up for what the solution of the linear systems leaves open."""
 
@@ -29,7 +32,7 @@ class Passes:
 
     def __init__(self, network: Network) -> None:
         """Compile the splits of ``network``."""
-        stores = len(network.stores)
+        stores, self._network = len(network.stores), network
         self._nodes = len(network.nodes) - stores
         found = [(network.node_index[split.donor] - stores, split) for split in splits(network)]
         self._splits: list[tuple[int, Split, Integers]] = [
@@ -50,7 +53,7 @@ class Passes:
     def total(self, step: int) -> Floats:
         """Return the most passes in all of mass that enters each node, in one interval, shape (nodes,)."""
         passes = np.ones(self._nodes)
-        while True:
+        for _ in range(MOST_ROUNDS):
             entries = [
                 (i, int(j), share)
                 for i, split, ends in self._splits
@@ -59,11 +62,24 @@ class Passes:
             ]
             rows, columns, shares = zip(*entries, strict=True) if entries else ((), (), ())
             kept = sparse.csc_array((shares, (rows, columns)), shape=(self._nodes, self._nodes))
-            better = np.atleast_1d(spsolve(sparse.eye_array(self._nodes, format="csc") - kept, np.ones(self._nodes)))
+            try:
+                better = splu(sparse.eye_array(self._nodes, format="csc") - kept).solve(np.ones(self._nodes))
+            except RuntimeError:  # singular: so little leaves a loop that nothing is left of it in a sum with 1
+                break
             if (better <= passes * (1 + SLACK / 10)).all():
-                most: Floats = np.maximum(better, passes) * (1 + SLACK)
-                return most
+                passes = np.maximum(better, passes)
+                # v ≥ 1 + max_s P(s) v is all that is needed: make up for what the solution leaves open
+                short = float((passes - self.best(passes[:, None], step)[:, 0]).min(initial=1.0))
+                if short > 0:
+                    most: Floats = passes * (1 + SLACK) / min(short, 1.0)
+                    return most
+            if not np.isfinite(better).all() or better.min() < 1.0:
+                break
             passes = np.maximum(better, passes)
+        raise NetworkError(
+            f"network '{self._network.name}'",
+            ["nodes that store nothing pass mass round so often that it cannot be told how much goes through them"],
+        )
 
     def _chosen(self, split: Split, ends: Integers, values: Floats, step: int) -> Floats:
         """Return the shares that are best for ``values``, first of controlled arcs, shape (arcs of the split, n)."""

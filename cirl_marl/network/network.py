@@ -25,7 +25,7 @@ from scipy.sparse import csgraph
 
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network.declared import declarations
-from cirl_marl.network.elements import SINKS, Compartment, Law, Node, Role, Service
+from cirl_marl.network.elements import SINKS, Compartment, ControlKind, Law, Node, Role, Service
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
@@ -122,7 +122,10 @@ class Network(Parts):
             if arc.donor in unknown_:
                 donor, base = self.nodes[self.node_index[arc.donor]], self.held(arc.flow)
                 base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
-                factors = [self.held(c.control.high) for c in (arc, donor) if c.control is not None]
+                # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
+                sets = [c.control for c in (arc, donor) if c.control is not None]
+                acting = (c for c in sets if c.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
+                factors = [self.held(control.high) for control in acting]
                 asked = np.prod([base, *factors], axis=0).sum() * self.episode.control_interval
                 initial[:, self.node_index[arc.donor]] += asked * (1 + RESERVE)
         return _read_only(initial)

@@ -70,7 +70,8 @@ class Series(Checked, Changing):
         """
         slack = 1e-9 * max(length, 1.0)
         if self.times[0] > slack:
-            return f"series begins at {said(self.times[0])}, after the episode does; it needs a value for {said(0.0)}"
+            early = f"series begins at {said(self.times[0])}, after the episode does"
+            return f"{early}; it needs a value for {said(0.0)}, unless its times are of another unit or calendar years"
         if self.end < length - slack:
             missing = f"series ends at {said(self.end)}, but the episode at {said(length)}"
             return f"{missing}; give what is missing, or a shorter horizon"
@@ -87,7 +88,16 @@ class Series(Checked, Changing):
         index = np.maximum(np.searchsorted(times, edges, side="right") - 1, 0)
         within = edges - times[index]
         integral = total[index] + values[index] * within + slopes[index] * within**2 / 2
-        means: Floats = np.diff(integral) / np.diff(edges)
+        # differences of a sum round: what holds throughout is its own mean, and no mean leaves the values it is of
+        begins = values[index] + slopes[index] * within
+        index = np.maximum(np.searchsorted(times, edges, side="left") - 1, 0)
+        ends = values[index] + slopes[index] * (edges - times[index])
+        lowest, highest = np.minimum(begins[:-1], ends[1:]), np.maximum(begins[:-1], ends[1:])
+        of = np.searchsorted(edges, times, side="right") - 1
+        inside = (of >= 0) & (of < len(lowest))
+        np.minimum.at(lowest, of[inside], values[inside])
+        np.maximum.at(highest, of[inside], values[inside])
+        means: Floats = np.clip(np.diff(integral) / np.diff(edges), lowest, highest)
         return means
 
 

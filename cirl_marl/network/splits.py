@@ -21,6 +21,8 @@ from cirl_marl.network.elements import Law
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats
 
+LEAST = 1e-9
+"""Share that has to leave a loop in each round at the least; a smaller one is taken for a rounding of none."""
 SUMS = 1e-6
 """Distance from 1 at which given shares count as summing to it; they are then scaled to do so."""
 
@@ -123,7 +125,7 @@ def trap_problems(network: Parts, divided: Sequence[Split]) -> Iterator[str]:
             when = "" if columns.shape[1] == 1 or (columns == columns[:, :1]).all() else f" in interval {step}"
             yield (
                 f"nodes {', '.join(loop)} store nothing and can pass all they get round in a loop{when}: the arcs that "
-                "leave it need a share, or a lowest share, above 0, or one of the nodes a stock"
+                f"leave it need a share, or a lowest share, above {LEAST:g}, or one of the nodes a stock"
             )
             return
 
@@ -141,7 +143,7 @@ def _trapped(network: Parts, by_donor: dict[str, Split], step: int) -> set[str]:
         if node in held:
             split = by_donor[node]
             leaving = [network.arcs[k].recipient not in held for k in (*split.controlled, *split.others)]
-            if split.least(leaving, step) > 0:
+            if split.least(leaving, step) > LEAST:
                 held.discard(node)
                 waiting += sorted(feeding.get(node, set()) & held)
     return held

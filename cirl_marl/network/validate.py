@@ -244,7 +244,7 @@ def _control_problems(where: str, compartment: Compartment, control: Control, ne
     low, neutral, high = (np.array(network.held(each)) for each in (control.low, control.neutral, control.high))
     if not np.isfinite([low, neutral, high]).all():
         yield f"{where}: control bounds must be finite"
-    elif not ((low <= neutral) & (neutral <= high)).all() or (low == high).all():
+    elif not ((low <= neutral) & (neutral <= high)).all() or control.low == control.high:
         worst = int(np.argmax((low > neutral) | (neutral > high)))
         given = f"{low[worst]:g}, {neutral[worst]:g}, {high[worst]:g}{unit}"
         when = f" in interval {worst}" if any(isinstance(getattr(control, side), Series) for side in SIDES) else ""

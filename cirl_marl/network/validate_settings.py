@@ -12,9 +12,10 @@ import numpy as np
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.calendar import LAST_YEAR, years
 from cirl_marl.network.declared import bound_problems
-from cirl_marl.network.elements import MAX_STEPS, Arc, Compartment, Episode, Law, Service
+from cirl_marl.network.elements import MAX_STEPS, Arc, Compartment, Episode, Law, Node, Service
 from cirl_marl.network.model import ContinuousModel, DiscreteTimeModel, Measuring, OwnStepModel
 from cirl_marl.network.parts import Parts
+from cirl_marl.network.series import extremes
 from cirl_marl.network.units import factor
 
 
@@ -127,7 +128,10 @@ def _service_problems(
         model = everyone[service.provider].model
         if isinstance(model, Measuring) and service.measure not in model.measure_names:
             yield f"{where}: {unknown('measure', service.measure, model.measure_names)}"
-    if service.provider not in known:
+    provider = everyone.get(service.provider)
+    if isinstance(provider, Node) and not provider.stores and service.quantity == "stock":
+        yield f"{where}: provider: '{provider.id}' stores nothing; ask for its outflow"
+    elif service.provider not in known:
         kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
         yield f"{where}: provider: {unknown(kind, service.provider, known)}"
     if service.measure and service.quantity != "measure":
@@ -137,7 +141,9 @@ def _service_problems(
         if debtor not in everyone:
             yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
     low, high = (np.array(network.held(each)) for each in (service.low, service.high))
-    if not ((low >= 0) & (low <= high) & (high > 0)).all():
+    if extremes(service.low)[0] < 0:
+        yield f"{where}: low {extremes(service.low)[0]:g} must not be negative"
+    elif not ((low >= 0) & (low <= high) & (high > 0)).all():
         worst = int(np.argmin((low >= 0) & (low <= high) & (high > 0)))
         yield f"{where}: the band [{low[worst]}, {high[worst]}] must not be negative or empty"
     elif (low == 0).all() and np.isinf(high).all():

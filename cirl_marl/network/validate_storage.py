@@ -21,7 +21,8 @@ def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
             allowed = "only a node whose outflows are all scheduled may leave it out"
             yield f"{where}: initial: missing; {allowed}, and '{unscheduled[0]}' is not"
         if bool(shares) != (extremes(node.rate)[1] > 0):
-            told = f"arc '{shares[0]}' shares what its rate releases" if shares else "a rate is for arcs of law 'share'"
+            remedy = "give the node a rate, 1/time, or stores = false"
+            told = f"arc '{shares[0]}' shares what it releases; {remedy}" if shares else "it is for arcs of law 'share'"
             yield f"{where}: rate = {node.rate!r}: {told}"
         return
     for name, given in (("initial", node.initial), ("model", node.model), ("rate", node.rate or None)):

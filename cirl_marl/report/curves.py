@@ -48,9 +48,9 @@ def save_circularity(
     there are at least two episodes.
 
     ``runs`` are means of λ over the intervals, mass, and ``services`` service levels by control, of shape
-    (episodes, steps), ``time`` (steps,); other shapes raise a ``CirlError``.
+    (episodes, steps), ``time`` the ends of the intervals, (steps,); other shapes raise a ``CirlError``.
     """
-    time = _shown(time, network)
+    time = _shown(time - network.episode.control_interval / 2, network)
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
     names = list(dict.fromkeys([*runs, *services]))

@@ -32,7 +32,8 @@ def nodes_table(network: Network, stock: Floats) -> Table:
         span, held = "stores nothing", ""
         if node.stores:
             low, high = network.initial[:, i]
-            span, held = f"{low:g}" if low == high else f"{low:g} – {high:g}", f"{stock[i]:.5g}"
+            span = f"{low:g}" if low == high else f"{low:g} – {high:g}"
+            span, held = "all that is asked for" if node.initial is None else span, f"{stock[i]:.5g}"
         table.add_row(node.id, node.role.value, span, held, _target(node), control_text(network, node))
     return table
 
