@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy import sparse
 
 from cirl_marl import (
     Arc,
@@ -31,7 +32,7 @@ from cirl_marl import (
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, improved
+from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, held, improved
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verified
 from cirl_marl.optimum.maximise import starting_stocks
@@ -465,11 +466,53 @@ def test_networks_without_certificate(name: str, scenario: str | None, said: str
         bound(name, scenario=scenario)
 
 
-def test_networks_too_large_for_a_certificate() -> None:
-    """What would not fit into memory is said before it is tried."""
-    nodes = [Node(id=f"n{i}", initial=(1.0, 1.0)) for i in range(1001)]
-    with pytest.raises(NoCertificate, match="1,001 nodes are more than the 1,000"):
-        bound(small(nodes, [Arc(id="f", donor="n0", recipient="n1", rate=0.1)], horizon=2))
+@given(network=st.from_type(Network), interval=st.floats(0.02, 0.4))
+def test_large_networks_are_reached_by_the_same_formula(network: Network, interval: float) -> None:
+    """The series that stands for matrices of nodes by nodes gives the same bounds, no closer than they are."""
+    network = certifiable(network, interval, pulls=False)
+    start, when = starting_stocks(network, None), range(network.episode.horizon)
+    small = ComparisonSystem(Admissible.of(network)).reach(start, when)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(held, "DENSE", 0)
+        large = ComparisonSystem(Admissible.of(network)).reach(start, when)
+    np.testing.assert_allclose(large.upper, small.upper, rtol=1e-9, atol=1e-11 * start.sum())
+    np.testing.assert_array_equal(large.uncut, small.uncut)
+
+
+def test_the_series_is_cut_where_it_says() -> None:
+    """What is left out, e^{Mh} x + ∫ e^{Ms} c ds by matrices less the sum of the series, is within its allowance."""
+    rng = np.random.default_rng(1)
+    matrix = sparse.random_array((40, 40), density=0.2, rng=rng) - sparse.diags_array(rng.uniform(0, 3, 40))
+    state, constant = rng.uniform(0, 1, (2, 40))
+    exact, _ = held.Held(matrix, 0.7)(state, constant)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(held, "DENSE", 0)
+        for neglected in (1e-3, 1e-6, 1e-9):
+            patch.setattr(held, "NEGLECTED", neglected)
+            found, missed = held.Held(matrix, 0.7)(state, constant)
+            assert 0 < np.abs(found - exact).max() <= missed <= 40 * neglected * 10
+
+
+@pytest.mark.medium
+def test_a_network_of_five_thousand_nodes() -> None:
+    """The program of a large network is written in seconds, and neutral control satisfies it."""
+    rng = np.random.default_rng(0)
+    size, degree = 5000, 1
+    nodes = [
+        stocked(f"n{i}", float(rng.uniform(1, 9)), control=valve(0.5, 1.0) if i % 3 else None) for i in range(size)
+    ]
+    ends = rng.integers(size, size=(2 * size, 2))
+    arcs = [
+        Arc(id=f"a{k}", donor=f"n{i}", recipient=f"n{j}", rate=0.3)
+        for k, (i, j) in enumerate(ends[ends[:, 0] != ends[:, 1]].tolist())
+    ]
+    network = small(nodes, [*arcs, order("o", "n0", "n1", 1.0)], horizon=3)
+    programs = Programs(Admissible.of(network), degree, None)
+    problem = programs.program(starting_stocks(network, None))
+    assert problem.equal.shape[1] == 3 * programs.layout.size
+    run = rollout(VectorEnv(network, num_envs=1), Neutral())
+    ends_of = problem.high.reshape(3, -1)[:, programs.layout.end(-1) : programs.layout.level]
+    assert (run.stock <= ends_of * (1 + 1e-9)).all()
 
 
 def test_pull_beyond_the_stock_has_no_certificate() -> None:

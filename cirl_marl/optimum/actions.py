@@ -12,7 +12,9 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
 
 
-def normalised_actions(admissible: Admissible, layout: Layout, planned: Floats) -> Floats:
+def normalised_actions(
+    admissible: Admissible, layout: Layout, planned: Floats, intervals: range | None = None
+) -> Floats:
     """Return the actions whose constant factors give the planned mean flows at the planned mean stocks.
 
     v = Z̄/X̄ where a node has several outflows, else what its outflow asks with its own control neutral; then
@@ -22,32 +24,31 @@ def normalised_actions(admissible: Admissible, layout: Layout, planned: Floats) 
         admissible: ranges of the factors.
         layout: of the variables.
         planned: variables of each interval, shape (steps, size).
+        intervals: of the episode, whose first were planned; None is all of them.
 
     Returns:
         Actions in [−1, 1], in the order of ``VectorEnv.stack``, shape (steps, entries).
     """
-    network = admissible.network
+    network, first = admissible.network, 0 if intervals is None else intervals.start
+    during = slice(first, first + len(planned))
+    own_range, valve_range, base = admissible.own[:, during], admissible.valve[:, during], admissible.base[during]
     nodes = len(network.nodes)
     stock, flow, through = layout.means(planned)
     neutral = np.array([1.0 if c.control is None else c.control.neutral for c in network.compartments.values()])
-    is_valve = [node.control is not None and node.control.kind is ControlKind.RATE for node in network.nodes]
-    valve = np.tile(np.where(is_valve, neutral[:nodes], 1.0), (len(planned), 1))
+    valve = admissible.neutral_valve[during].copy()
     by_donor = admissible.driver == network.donors
     for k in np.flatnonzero(by_donor):
         donor = int(network.donors[k])
-        if donor not in layout.valves and admissible.valve[0, donor] < admissible.valve[1, donor]:
-            unit = admissible.base[:, k] * neutral[nodes + k] * stock[:, donor]
+        if donor not in layout.valves and (valve_range[0, :, donor] < valve_range[1, :, donor]).any():
+            unit = base[:, k] * neutral[nodes + k] * stock[:, donor]
             valve[:, donor] = _ratio(flow[:, k], unit, valve[:, donor])
     for z, node in enumerate(layout.valves):
         valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
     # what is left of f̄_k after the valve is the arc's own factor, w_k = f̄_k/(a_k·v·X̄_p)
-    valve = np.clip(valve, admissible.valve[0], admissible.valve[1])
+    valve = np.clip(valve, *valve_range)
     driving = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
-    own = _ratio(
-        flow, admissible.base * driving * valve[:, network.donors], np.broadcast_to(neutral[nodes:], flow.shape)
-    )
-    own = np.clip(own, admissible.own[0], admissible.own[1])
-    return _entries(admissible, valve, own)
+    own = _ratio(flow, base * driving * valve[:, network.donors], np.broadcast_to(neutral[nodes:], flow.shape))
+    return _entries(admissible, valve, np.clip(own, *own_range))
 
 
 def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +15,17 @@ from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
 
-MOST_NODES = 1000
-"""Nodes of the largest network that is bounded; memory grows with their square, time faster."""
-
 
 class NoCertificate(CirlError):
     """A network for which no upper bound is proved; the message says why."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Admissible:
     """The ranges of the factors of every flow, f_k = v·w_k·a_k·x_p for stock-driven flows, u_k·v for scheduled ones.
 
-    v is the valve of the donor and w_k or u_k the arc's own control; each is a single value if nobody acts on it.
+    v is the valve of the donor and w_k or u_k the arc's own control; each is a single value if nobody acts on it. All
+    may differ from interval to interval.
 
     Attributes:
         network: whose flows they are.
@@ -34,8 +33,11 @@ class Admissible:
         driver: node p whose stock drives each arc; −1 for scheduled flows, shape (arcs,).
         base: a_k, 1/time, or the mean of the schedule over each interval, mass/time (1 if a control sets the flow),
             shape (steps, arcs).
-        own: lowest and highest w_k or u_k, shape (2, arcs).
-        valve: lowest and highest v of each node, shape (2, nodes).
+        own: lowest and highest w_k or u_k, shape (2, steps, arcs).
+        valve: lowest and highest v of each node, shape (2, steps, nodes).
+        neutral_rate: v·w_k·a_k or u_k·v while nobody acts, shape (steps, arcs).
+        neutral_valve: v while nobody acts, shape (steps, nodes).
+        served: lower end of the band of each service, shape (steps, services).
     """
 
     network: Network
@@ -44,6 +46,9 @@ class Admissible:
     base: Floats
     own: Floats
     valve: Floats
+    neutral_rate: Floats
+    neutral_valve: Floats
+    served: Floats
 
     @classmethod
     def of(cls, network: Network, agents: Sequence[str] | None = None) -> Admissible:
@@ -60,14 +65,15 @@ class Admissible:
         laws = FlowLaws(network)
         acting = Actuators(laws, agents, 1).agents
         steps = network.episode.horizon
-        own, valve = np.ones((2, len(network.arcs))), np.ones((2, len(network.nodes)))
+        own, valve = np.ones((2, steps, len(network.arcs))), np.ones((2, steps, len(network.nodes)))
+        neutral_valve = np.ones((steps, len(network.nodes)))
         for i, node in enumerate(network.nodes):
             if node.control is not None and node.control.kind is ControlKind.RATE:
-                valve[:, i] = _range(node, acting)
+                valve[:, :, i], neutral_valve[:, i] = _range(node, acting), node.control.neutral
         for k, arc in enumerate(network.arcs):
             setter = _setter(network, arc)
             if setter is not None:
-                own[:, k] = _range(setter, acting)
+                own[:, :, k] = _range(setter, acting)
         return cls(
             network=network,
             agents=acting,
@@ -75,6 +81,9 @@ class Admissible:
             base=laws.rate(np.ones((len(laws.neutral), steps)), np.arange(steps)).T,
             own=own,
             valve=valve,
+            neutral_rate=laws.rate(np.repeat(laws.neutral[:, None], steps, axis=1), np.arange(steps)).T,
+            neutral_valve=neutral_valve,
+            served=np.tile([service.low for service in network.services], (steps, 1)),
         )
 
     @property
@@ -82,24 +91,34 @@ class Admissible:
         """Arcs that flow by schedule, as far as their donor holds enough, shape (arcs,)."""
         return self.driver < 0
 
-    @property
+    @cached_property
     def factor(self) -> Floats:
-        """Lowest and highest v·w_k or v·u_k, shape (2, arcs)."""
-        return self.own * self.valve[:, self.network.donors]
+        """Lowest and highest v·w_k or v·u_k, shape (2, steps, arcs)."""
+        return self.own * self.valve[:, :, self.network.donors]
+
+    @cached_property
+    def kinds(self) -> Integers:
+        """For each interval the first that is like it but for what flows by schedule, shape (steps,)."""
+        driven = ~self.scheduled
+        parts = (*self.own[:, :, driven], self.base[:, driven], *self.valve, self.neutral_rate[:, driven], self.served)
+        _, first, kind = np.unique(np.concatenate(parts, axis=1), axis=0, return_index=True, return_inverse=True)
+        return first[kind.ravel()]
 
     def rate(self, step: int) -> Floats:
         """Return the lowest and highest coefficient of each arc in one interval, shape (2, arcs).
 
         1/time for stock-driven arcs, mass/time for scheduled ones.
         """
-        rate: Floats = self.factor * self.base[step]
+        rate: Floats = self.factor[:, step] * self.base[step]
         return rate
 
 
-def _range(compartment: Compartment, acting: Sequence[str]) -> tuple[float, float]:
+def _range(compartment: Compartment, acting: Sequence[str]) -> Floats:
+    """Return the lowest and highest value of a control, shape (2, 1)."""
     control = compartment.control
     assert control is not None
-    return (control.low, control.high) if compartment.id in acting else (control.neutral, control.neutral)
+    ends = (control.low, control.high) if compartment.id in acting else (control.neutral, control.neutral)
+    return np.array(ends)[:, None]
 
 
 def _setter(network: Network, arc: Arc) -> Arc | Node | None:
@@ -111,9 +130,7 @@ def _setter(network: Network, arc: Arc) -> Arc | Node | None:
 
 
 def _uncertified(network: Network) -> Iterator[str]:
-    """Yield why the theorem does not hold for the flows of ``network``, or its system would not fit into memory."""
-    if len(network.nodes) > MOST_NODES:
-        yield f"{len(network.nodes):,} nodes are more than the {MOST_NODES:,} whose products in pairs are kept"
+    """Yield why the theorem does not hold for the flows of ``network``."""
     if network.episode.solver != "exact":
         yield f"solver '{network.episode.solver}' is not exact within a control interval"
     modelled = [c.id for c in network.compartments.values() if c.model is not None]

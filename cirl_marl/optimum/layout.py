@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
-from scipy import sparse
 
 from cirl_marl.network import Floats, Integers, Network
 
-MatrixRow = list[tuple[int, float]]
-Link = tuple[MatrixRow, MatrixRow]
+Place = TypeVar("Place", int, Integers)
 
 
 @dataclass(frozen=True)
@@ -44,6 +41,11 @@ class Layout:
         return range(self.pieces * (self.degree + 1))
 
     @cached_property
+    def moment_column(self) -> Integers:
+        """The same as an array of shape (moments, 1), to be laid against nodes or arcs."""
+        return np.arange(len(self.moments))[:, None]
+
+    @cached_property
     def piece(self) -> int:
         """Variables of a piece."""
         nodes = len(self.network.nodes)
@@ -59,21 +61,21 @@ class Layout:
         """Length of a piece over d + 1, the integral of each test polynomial."""
         return self.network.episode.control_interval / len(self.moments)
 
-    def stock(self, moment: int) -> int:
+    def stock(self, moment: Place) -> Place:
         """Return the first of the weighted mean stocks X."""
         # each piece: d + 1 blocks of (X, F, Z), equally long, then the stocks at its end
         piece, i = divmod(moment, self.degree + 1)
         return piece * self.piece + i * ((self.piece - len(self.network.nodes)) // (self.degree + 1))
 
-    def flow(self, moment: int) -> int:
+    def flow(self, moment: Place) -> Place:
         """Return the first of the weighted mean flows F."""
         return self.stock(moment) + len(self.network.nodes)
 
-    def valve(self, moment: int) -> int:
+    def valve(self, moment: Place) -> Place:
         """Return the first of Z."""
         return self.flow(moment) + len(self.network.arcs)
 
-    def end(self, piece: int) -> int:
+    def end(self, piece: Place) -> Place:
         """Return the first of the stocks at the end of a piece; −1 is the last."""
         return (piece % self.pieces + 1) * self.piece - len(self.network.nodes)
 
@@ -104,18 +106,3 @@ class Layout:
         for first, count in zip((self.stock, self.flow, self.valve), counts, strict=True):
             parts.append(np.mean([planned[:, first(j) : first(j) + count] for j in self.moments], axis=0))
         return parts[0], parts[1], parts[2]
-
-
-def start_of(layout: Layout, piece: int, node: int, factor: float) -> Link:
-    """Return the entry of a stock at the start of a piece, in this interval or in the one before."""
-    entry = [(layout.end(piece - 1) + node, factor)]
-    return (entry, []) if piece > 0 else ([], entry)
-
-
-def matrix_of(rows: Sequence[MatrixRow], layout: Layout) -> Any:
-    """Return the sparse matrix of rows over the variables of one interval."""
-    entries = [(i, column, value) for i, row in enumerate(rows) for column, value in row]
-    if not entries:
-        return sparse.csr_array((len(rows), layout.size))
-    i, columns, values = zip(*entries, strict=True)
-    return sparse.csr_array((values, (i, columns)), shape=(len(rows), layout.size))

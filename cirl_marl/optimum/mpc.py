@@ -211,8 +211,7 @@ class MPC(Planner):
 
     def _actions(self, problem: Program, intervals: range, planned: Floats) -> Floats:
         """Return the actions of planned intervals, the first of ``intervals``, shape (decisions, entries)."""
-        base = self._admissible.base[intervals.start : intervals.stop][: len(planned)]
-        return normalised_actions(replace(self._admissible, base=base), problem.layout, planned)
+        return normalised_actions(self._admissible, problem.layout, planned, intervals)
 
     def _plan(
         self,

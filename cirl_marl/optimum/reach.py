@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import sparse
 
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
+from cirl_marl.optimum.held import Held
 
 ROUNDING = 1e-9
 """Relative widening of every bound; rounding errors are far smaller."""
@@ -46,35 +47,10 @@ class ComparisonSystem:
 
     def __init__(self, admissible: Admissible) -> None:
         """Compile the system for the ranges of ``admissible``."""
-        network = admissible.network
-        self.admissible, self.network = admissible, network
-        dynamics = Dynamics(network)
+        self.admissible, self.network = admissible, admissible.network
+        dynamics = Dynamics(admissible.network)
         self.substeps, self.substep = dynamics.substeps, dynamics.substep
-        nodes, arcs = len(network.nodes), np.arange(len(network.arcs))
-        self.outgoing, self.incoming = np.zeros((2, nodes, len(arcs)))
-        self.outgoing[network.donors, arcs] = 1.0
-        self.incoming[network.recipients, arcs] = 1.0
-        low, high = admissible.rate(0)
-        driven = ~admissible.scheduled
-        self.pulled = driven & (admissible.driver != network.donors)
-        # rows and columns: x̲ of all nodes, then x̄. x̲ gains the least inflow and loses the greatest outflow, x̄ the
-        # opposite; growth has no outflow at all
-        system, growth = np.zeros((2 * nodes, 2 * nodes)), np.zeros((nodes, nodes))
-        self.pull = np.zeros((nodes, nodes))
-        for k in np.flatnonzero(driven):
-            donor, recipient, p = network.donors[k], network.recipients[k], admissible.driver[k]
-            system[recipient, p] += low[k]
-            system[nodes + recipient, nodes + p] += high[k]
-            growth[recipient, p] += high[k]
-            other = nodes if self.pulled[k] else 0  # what leaves at the least x̲ is driven by x̲ itself or by x̄ elsewhere
-            system[donor, other + p] -= high[k]
-            system[nodes + donor, nodes - other + p] -= low[k]
-            if self.pulled[k]:
-                self.pull[donor, p] += high[k]
-        self.solution, self.response = _held(system, self.substep)
-        self.growth, self.surge = _held(growth, self.substep)
-        turned_over = self.outgoing @ (high * (driven & ~self.pulled)) * self.substep
-        self.share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(nodes), where=turned_over > ROUNDING)
+        self._linear: dict[int, _Linear] = {}
 
     def reach(self, initial: Floats, intervals: range) -> Reach:
         """Bound the stocks from ``initial``, shape (nodes,), on, over the given intervals of the episode.
@@ -88,18 +64,19 @@ class ComparisonSystem:
         lower, upper = initial.copy(), initial.copy()
         highest = np.zeros((steps, nodes))
         uncut = np.ones((steps, len(network.arcs)), dtype=bool)
-        pulled_from = self.outgoing @ self.pulled > 0
         for step, interval in enumerate(intervals):
             least, most = np.where(scheduled, self.admissible.rate(interval), 0.0)
+            incoming, outgoing = self._by_node(most)
+            linear = self._of_kind(int(self.admissible.kinds[interval]))
             for _ in range(self.substeps):
                 # without any outflow no stock ends a substep lower than it began, so this bounds it throughout
-                peak = np.minimum(self.growth @ upper + self.surge @ (self.incoming @ most), mass) * (1 + ROUNDING)
+                peak, missed = linear.growth(upper, incoming)
+                peak = np.minimum(peak + missed, mass) * (1 + ROUNDING)
                 highest[step] = np.maximum(highest[step], peak)
                 # what may be asked in this piece, against what is left at the least: nothing is cut where it suffices
-                asked = (self.outgoing @ most + self.pull @ peak) * self.substep
-                enough = asked <= lower * self.share * (1 - ROUNDING)
-                if (pulled_from & ~enough).any():
-                    node = network.nodes[int((pulled_from & ~enough).argmax())].id
+                enough = (outgoing + linear.pull @ peak) * self.substep <= lower * linear.share * (1 - ROUNDING)
+                if (linear.pulled & ~enough).any():
+                    node = network.nodes[int((linear.pulled & ~enough).argmax())].id
                     raise NoCertificate(
                         f"network '{network.name}': recipients may pull more from node '{node}' than it holds in "
                         f"interval {interval}; no bound is proved for what the solver then does"
@@ -107,23 +84,52 @@ class ComparisonSystem:
                 delivered = enough[network.donors]
                 uncut[step] &= delivered
                 sure = least * delivered
-                constant = np.concatenate(
-                    [
-                        self.incoming @ sure - self.outgoing @ most,
-                        self.incoming @ most - self.outgoing @ sure,
-                    ]
-                )
-                bounds = self.solution @ np.concatenate([lower, upper]) + self.response @ constant
-                lower = np.maximum(bounds[:nodes] - mass * ROUND_OFF, 0.0)
-                upper = np.minimum(bounds[nodes:] + mass * ROUND_OFF, mass)
+                gained, lost = self._by_node(sure)
+                constant = np.concatenate([gained - outgoing, incoming - lost])
+                bounds, missed = linear.solution(np.concatenate([lower, upper]), constant)
+                missed += mass * ROUND_OFF
+                lower = np.maximum(bounds[:nodes] - missed, 0.0)
+                upper = np.minimum(bounds[nodes:] + missed, mass)
         return Reach(highest, uncut)
 
+    def _by_node(self, flow: Floats) -> tuple[Floats, Floats]:
+        """Return the sums of flows into and out of each node, shape (nodes,)."""
+        network, nodes = self.network, len(self.network.nodes)
+        gained = np.bincount(network.recipients, flow, nodes).astype(float)
+        return gained, np.bincount(network.donors, flow, nodes).astype(float)
 
-def _held(matrix: Floats, interval: float) -> tuple[Floats, Floats]:
-    """Return exp(M h) and its integral over [0, h], which answer the state and a constant input."""
-    size = len(matrix)
-    # exp of [[M, I], [0, 0]]·h has both in its upper blocks (Van Loan 1978)
-    extended = np.zeros((2 * size, 2 * size))
-    extended[:size, :size], extended[:size, size:] = matrix, np.eye(size)
-    solved = linalg.expm(extended * interval)
-    return solved[:size, :size], solved[:size, size:]
+    def _of_kind(self, kind: int) -> _Linear:
+        if kind not in self._linear:
+            self._linear[kind] = _Linear(self.admissible, kind, self.substep)
+        return self._linear[kind]
+
+
+class _Linear:
+    """What is proportional to stocks in a kind of interval.
+
+    Attributes:
+        solution: of the lowest and the highest stocks after a substep, shape (2 nodes,).
+        growth: the same of the highest, had they no outflow, shape (nodes,).
+        pull: most that recipients pull from each node, per stock, sparse, 1/time.
+        pulled: nodes from which they do.
+        share: z/(e^z − 1) for the most that leaves a node in proportion to its stock in a substep, z.
+    """
+
+    def __init__(self, admissible: Admissible, kind: int, substep: float) -> None:
+        network, driven = admissible.network, ~admissible.scheduled
+        nodes, low, high = len(network.nodes), *admissible.rate(kind)[:, driven]
+        donor, recipient, p = network.donors[driven], network.recipients[driven], admissible.driver[driven]
+        pulled = donor != p
+        # rows and columns: x̲ of all nodes, then x̄. x̲ gains the least inflow and loses the greatest outflow, x̄ the
+        # opposite; growth has no outflow at all
+        other = np.where(pulled, nodes, 0)  # what leaves at the least x̲ is driven by x̲ itself or by x̄ elsewhere
+        rows = np.stack([recipient, nodes + recipient, donor, nodes + donor], axis=1).ravel()
+        columns = np.stack([p, nodes + p, other + p, nodes - other + p], axis=1).ravel()
+        values = np.stack([low, high, -high, -low], axis=1).ravel()
+        self.solution = Held(sparse.coo_array((values, (rows, columns)), shape=(2 * nodes, 2 * nodes)), substep)
+        self.growth = Held(sparse.coo_array((high, (recipient, p)), shape=(nodes, nodes)), substep)
+        taken = (high[pulled], (donor[pulled], p[pulled]))
+        self.pull = sparse.csr_array(sparse.coo_array(taken, shape=(nodes, nodes)))
+        self.pulled = np.bincount(donor[pulled], minlength=nodes) > 0
+        z = np.bincount(donor[~pulled], high[~pulled], nodes) * substep
+        self.share = np.divide(z, np.expm1(z), out=np.ones(nodes), where=z > ROUNDING)
