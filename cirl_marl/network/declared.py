@@ -50,6 +50,13 @@ def _annotated(made: Any) -> dict[str, Any]:
     return {name: told[0] for name, told in found.items() if told}
 
 
+class Changing:
+    """What may stand for a number that is declared to vary: one that changes in time, made of ``values``."""
+
+    __slots__ = ()
+    values: tuple[float, ...]
+
+
 @itemised
 @dataclass(frozen=True, slots=True)
 class Declared:
@@ -78,7 +85,7 @@ class Kinds(NamedTuple):
     """A kind of quantity that depends on the value of the field ``by``: one ``of`` those named, or ``otherwise``."""
 
     by: str
-    of: Mapping[str, Kind]
+    of: Mapping[str | bool, Kind]
     otherwise: Kind
 
 
@@ -92,6 +99,7 @@ class Quantity(Declared):
     high: Annotated[float, "highest value"] = math.inf
     positive: Annotated[bool, "whether it lies above 0"] = False
     joint: Annotated[bool, "whether its bounds depend on other fields, so that they are checked with these"] = False
+    varies: Annotated[bool, "whether it may change in time"] = False
 
     def kind(self, part: object) -> Kind:
         """Return the kind of quantity in ``part``, a part of a network or its table in a definition file."""
@@ -100,7 +108,7 @@ class Quantity(Declared):
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
-        return _problem(value, "a number", ())
+        return "" if self.varies and isinstance(value, Changing) else _problem(value, "a number", ())
 
     def bound_problem(self, value: float) -> str:
         """Return what a number out of its bounds must be; nothing if it is within."""
@@ -130,13 +138,14 @@ class Numbers(Declared):
     shape: Annotated[tuple[int | None, ...], "their shape, None being any length"] = (None,)
     spelled: Annotated[str, "which table of definition files holds them; empty if that of another field does"] = ""
     of: Annotated[Kind, "kind of quantity; of batches that beside their times"] = "mass"
+    varies: Annotated[bool, "whether it may change in time"] = False
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
-        return _problem(value, self.form, self.shape)
+        return "" if self.varies and isinstance(value, Changing) else _problem(value, self.form, self.shape)
 
 
-Amount = partial(Numbers, form="a number", shape=(), spelled="amount")
+Amount = partial(Numbers, form="a number", shape=(), spelled="amount", varies=True)
 """A number whose unit is that of the table in which it stands."""
 
 
@@ -205,8 +214,11 @@ def bound_problems(part_: Any, where: str = "") -> Iterator[str]:
         value = getattr(part_, name)
         if isinstance(declared, Word) and value not in declared.of:
             yield f"{where}{unknown(declared.called or name, value, declared.of)}"
-        elif isinstance(declared, Quantity) and value is not None and (told := declared.bound_problem(value)):
-            yield f"{where}{name} {value} {told}"
+        elif isinstance(declared, Quantity) and value is not None:
+            for each in value.values if isinstance(value, Changing) else (value,):
+                if told := declared.bound_problem(each):
+                    yield f"{where}{name} {each} {told}"
+                    break
 
 
 @cache

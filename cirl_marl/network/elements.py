@@ -11,8 +11,6 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Literal, get_args
 
-import numpy as np
-
 from cirl_marl.network.declared import (
     Amount,
     Checked,
@@ -28,7 +26,7 @@ from cirl_marl.network.declared import (
     frozen,
 )
 from cirl_marl.network.model import CompartmentModel
-from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.series import Value
 
 
 class Role(StrEnum):
@@ -50,16 +48,19 @@ class Law(StrEnum):
     EXOGENOUS = "exogenous"
     COMPARTMENT = "compartment"
     BATCH = "batch"
+    SHARE = "share"
 
 
 class ControlKind(StrEnum):
     """What an agent sets.
 
-    A factor on flows (``rate``, a valve), the flow itself (``flow``) or an input of the model (``input``).
+    A factor on flows (``rate``, a valve), the flow itself (``flow``), a share of what leaves the donor (``share``) or
+    an input of the model (``input``).
     """
 
     RATE = "rate"
     FLOW = "flow"
+    SHARE = "share"
     INPUT = "input"
 
 
@@ -78,14 +79,16 @@ TAKEN: Mapping[Law, tuple[str, ...]] = {
     Law.DONOR: ("rate",),
     Law.RECIPIENT: ("rate",),
     Law.CONTROLLED: (),
-    Law.EXOGENOUS: ("flow", "times"),
+    Law.EXOGENOUS: ("flow",),
     Law.COMPARTMENT: ("rate", "by"),
     Law.BATCH: ("rate", "by", "port", "batches", "delay"),
+    Law.SHARE: ("share",),
 }
 """What each law takes, of the fields that only some laws take."""
 
 RATE_OF = Kinds("law", {Law.COMPARTMENT: "flow", Law.BATCH: "mass"}, "rate")
 SCALE_OF = Kinds("law", {Law.BATCH: "mass"}, "flow")
+LEVEL_OF = Kinds("stores", {False: "flow"}, "mass")
 BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
 
 Pair = tuple[float, float]
@@ -96,16 +99,15 @@ class Control(Checked):
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high]."""
 
     kind: Annotated[
-        ControlKind, Word("``rate``, a factor; ``flow``, mass/time; or ``input``, of a model", of=ControlKind)
+        ControlKind,
+        Word(
+            "``rate``, a factor; ``flow``, mass/time; ``share``, of what leaves the donor; or ``input``, of a model",
+            of=ControlKind,
+        ),
     ]
-    low: Annotated[float, Amount("value at action −1, of each entry of the action")]
-    neutral: Annotated[float, Amount("value while nobody acts on the compartment")]
-    high: Annotated[float, Amount("value at action +1, of each entry of the action")]
-
-    def action(self, value: Floats) -> Floats:
-        """Return the normalised actions, in [-1, 1], that come closest to physical values."""
-        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        return np.clip((value - middle) / half, -1.0, 1.0)
+    low: Annotated[Value, Amount("value at action −1, of each entry of the action")]
+    neutral: Annotated[Value, Amount("value while nobody acts on the compartment")]
+    high: Annotated[Value, Amount("value at action +1, of each entry of the action")]
 
 
 CONTROL = Nested("its actuator; None if it cannot act")
@@ -140,21 +142,44 @@ class Compartment(Checked):
 
 @frozen
 class Node(Compartment):
-    """A compartment that stores material, with an ``id`` of its own among nodes and arcs.
+    """A compartment that stores material, or hands it on at once, with an ``id`` of its own among nodes and arcs.
 
-    A ``rate`` control scales every outflow, a ``flow`` control sets the one controlled outflow.
+    A ``rate`` control scales every outflow, a ``flow`` control sets the one controlled outflow. Arcs of law ``share``
+    split what ``rate`` releases, or all that passes through a node that stores nothing.
     """
 
     role: Annotated[Role, Word("decides which flows count as finite-time sustainable", of=Role, required=True)] = (
         Role.TECHNOSPHERE
     )
+    stores: Annotated[
+        bool, Declared("whether it holds a stock; what enters one that does not leaves it at once, in shares")
+    ] = True
     initial: Annotated[
-        Pair,
-        Numbers("(low, high) of the initial stock, drawn uniformly, mass", "(low, high)", (2,), "range", required=True),
-    ] = (0.0, 0.0)
-    set_point: Annotated[float | None, Quantity("stock aimed at, mass; None if there is none", of="mass")] = None
+        Pair | None,
+        Numbers(
+            "(low, high) of the initial stock, drawn uniformly, mass; if left out, a node whose outflows are all "
+            "scheduled starts with the most that they can ask for in an episode",
+            "(low, high)",
+            (2,),
+            "range",
+        ),
+    ] = None
+    rate: Annotated[
+        Value,
+        NotNegative(
+            "a, of a stock x the arcs of law ``share`` split a·x, 1/time; 0 without them", of="rate", varies=True
+        ),
+    ] = 0.0
+    set_point: Annotated[
+        float | None, Quantity("stock aimed at, mass, or throughput, mass/time; None if there is none", of=LEVEL_OF)
+    ] = None
     scale: Annotated[
-        float, Positive("reference stock of observations and rewards; files may leave it to scales.stock", of="mass")
+        float,
+        Positive(
+            "reference stock, or throughput, of observations and rewards; files may leave it to scales.stock and "
+            "scales.flow",
+            of=LEVEL_OF,
+        ),
     ] = 1.0
 
 
@@ -164,20 +189,30 @@ class Arc(Compartment):
 
     The law says how much it carries: ``donor`` f = a·x_donor, ``recipient`` f = a·x_recipient, ``controlled`` f = u,
     ``exogenous`` f = e(t), ``compartment`` f = a·y, y the output of the model of the compartment ``by``, ``batch``
-    discrete masses.
+    discrete masses, ``share`` f = s·q, q what the ``rate`` of the donor releases or, if it stores nothing, what enters
+    it.
     """
 
     donor: Annotated[str, Declared("id of the node that gives", key="from")]
     recipient: Annotated[str, Declared("id of the node that receives", key="to")]
     law: Annotated[Law, Word("how much it carries", of=Law, required=True)] = Law.DONOR
     rate: Annotated[
-        float,
+        Value,
         NotNegative(
             "a, 1/time (donor and recipient laws), mass/time per unit of the model's output, or mass per unit that the "
             "donor's model releases (batch law)",
             of=RATE_OF,
+            varies=True,
         ),
     ] = 0.0
+    share: Annotated[
+        Value | None,
+        Share(
+            "s (share law); None: what the others leave, or what the control sets. Uncontrolled shares keep their "
+            "proportions in what controlled ones leave",
+            varies=True,
+        ),
+    ] = None
     by: Annotated[
         str, Declared("compartment whose model gives the flow (compartment law) or releases the batches (batch law)")
     ] = ""
@@ -199,19 +234,7 @@ class Arc(Compartment):
             joint=True,
         ),
     ] = 0.0
-    flow: Annotated[
-        tuple[float, ...],
-        Numbers(
-            "e, mass/time (exogenous law); with ``times`` the values of a step function, else a single value",
-            "(value, …)",
-            spelled="flow",
-            of="flow",
-        ),
-    ] = (0.0,)
-    times: Annotated[
-        tuple[float, ...],
-        Numbers("starts of the steps of an exogenous series, time; empty for a constant", "(time, …)"),
-    ] = ()
+    flow: Annotated[Value, NotNegative("e, mass/time (exogenous law)", of="flow", varies=True)] = 0.0
     pollutant: Annotated[bool, Declared("whether material that enters an environment here is a pollutant")] = True
     set_point: Annotated[float | None, Quantity("mean flow aimed at, mass/time; None if there is none", of="flow")] = (
         None
@@ -244,8 +267,12 @@ class Service(Checked):
             of=("stock", "outflow", "flow", "measure"),
         ),
     ]
-    low: Annotated[float, Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True)]
-    high: Annotated[float, Quantity("upper end, likewise; none if left out", of=BAND_OF, joint=True)] = math.inf
+    low: Annotated[
+        Value, Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True, varies=True)
+    ]
+    high: Annotated[Value, Quantity("upper end, likewise; none if left out", of=BAND_OF, joint=True, varies=True)] = (
+        math.inf
+    )
     weight: Annotated[float, NotNegative("factor of the shortfall in the local rewards", required=True)] = 1.0
     measure: Annotated[str, Declared('name of the measure, for ``quantity = "measure"``')] = ""
     owed_by: Annotated[

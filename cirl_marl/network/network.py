@@ -1,12 +1,12 @@
 """The thermodynamical material network: compartments, flow laws, roles and the circularity they imply.
 
-A network is a digraph of compartments that handle one target material. A *node* holds a stock ``x_i``; an *arc*
-``k: i → j`` carries a flow ``f_k``. Only the network moves mass::
+A network is a digraph of compartments that handle one target material. A *node* holds a stock ``x_i``, or stores
+nothing and hands on at once what enters it; an *arc* ``k: i → j`` carries a flow ``f_k``. Only the network moves mass::
 
     dx/dt = S f,    S[i, k] = -1 if i donates to arc k, +1 if i receives from it
 
-so mass is conserved by construction. Circularity is derived from the roles of the nodes and is never written by hand
-(Zocco et al., CiRL, Definition 2).
+with 0 in place of dx/dt for a node that stores nothing, so mass is conserved by construction. Circularity is derived
+from the roles of the nodes and is never written by hand (Zocco et al., CiRL, Definition 2).
 """
 
 from __future__ import annotations
@@ -24,13 +24,17 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from cirl_marl.errors import CirlError, NetworkError, unknown
-from cirl_marl.network.elements import SINKS, Compartment, Law, Role, Service
+from cirl_marl.network.elements import SINKS, Compartment, Law, Node, Role, Service
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
+from cirl_marl.network.series import Series
 from cirl_marl.network.validate import problems
 
 if TYPE_CHECKING:
     import networkx
+
+RESERVE = 1e-6
+"""Share by which a source without a known reserve starts with more than can be asked of it, so that nothing is cut."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +42,8 @@ class Network(Parts):
     """A thermodynamical material network under one scenario; its attributes are those of ``Parts``."""
 
     def __post_init__(self) -> None:
-        """Refuse a network that cannot be simulated, naming every fault."""
+        """Put nodes with a stock first; refuse a network that cannot be simulated, naming every fault."""
+        object.__setattr__(self, "nodes", tuple(sorted(self.nodes, key=lambda node: not node.stores)))
         found = list(problems(self))
         if found:
             raise NetworkError(f"network '{self.name}'", found)
@@ -99,8 +104,31 @@ class Network(Parts):
         return MappingProxyType({c.id: c for c in (*self.nodes, *self.arcs)})
 
     @cached_property
+    def stores(self) -> tuple[Node, ...]:
+        """Nodes that hold a stock, the first of ``nodes``, in the order of every stock array."""
+        return tuple(node for node in self.nodes if node.stores)
+
+    @cached_property
+    def initial(self) -> Floats:
+        """Lowest and highest stock at the start, shape (2, stores), mass.
+
+        A source without a known reserve starts with the most that its scheduled outflows can ask for in an episode.
+        """
+        ranges = [node.initial or (0.0, 0.0) for node in self.stores]
+        initial = np.array(ranges, dtype=float).reshape(-1, 2).T.copy()
+        unknown_ = {node.id for node in self.stores if node.initial is None}
+        for arc in self.arcs:
+            if arc.donor in unknown_:
+                donor, base = self.nodes[self.node_index[arc.donor]], self.held(arc.flow)
+                base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
+                factors = [self.held(c.control.high) for c in (arc, donor) if c.control is not None]
+                asked = np.prod([base, *factors], axis=0).sum() * self.episode.control_interval
+                initial[:, self.node_index[arc.donor]] += asked * (1 + RESERVE)
+        return _read_only(initial)
+
+    @cached_property
     def node_index(self) -> Mapping[str, int]:
-        """Position of each node in stock arrays."""
+        """Position of each node; those that hold a stock come first, so it is their position in stock arrays too."""
         return MappingProxyType({node.id: i for i, node in enumerate(self.nodes)})
 
     @cached_property
@@ -128,6 +156,17 @@ class Network(Parts):
         """Rows of each controllable compartment in control arrays: one, or one per input of its model."""
         rows = spans(self.compartments[id_].actions for id_ in self.controllable)
         return MappingProxyType(dict(zip(self.controllable, rows, strict=True)))
+
+    @cached_property
+    def control_bounds(self) -> Floats:
+        """Low, neutral and high value of each control in each interval, shape (3, controls, horizon)."""
+        controls = [c.control for id_ in self.controllable for c in [self.compartments[id_]] for _ in range(c.actions)]
+        triples = [(each.low, each.neutral, each.high) for each in controls if each is not None]
+        shape = (3, len(triples), self.episode.horizon)
+        if not any(isinstance(value, Series) for triple in triples for value in triple):
+            constant = np.array(triples, dtype=float).reshape(-1, 3).T
+            return np.broadcast_to(constant[:, :, None], shape)
+        return _read_only(np.array([[self.held(value) for value in side] for side in zip(*triples, strict=True)]))
 
     @cached_property
     def agents(self) -> tuple[str, ...]:
@@ -211,6 +250,22 @@ class Network(Parts):
     def _circularity_parts(self) -> RowSum:
         rows, arcs = np.nonzero(self.circularity_weights)
         return RowSum(rows, arcs, self.circularity_weights[rows, arcs], (2, len(self.arcs)))
+
+    def throughput(self, flow: Floats) -> Floats:
+        """Return what passes through each node that stores nothing, the sum of its outflows, shape (nodes, ...).
+
+        Args:
+            flow: f, shape (arcs, ...), mass/time.
+        """
+        columns = math.prod(flow.shape[1:])
+        through = self._throughputs(np.ascontiguousarray(flow).reshape(len(self.arcs), columns))
+        return through.reshape(-1, *flow.shape[1:])
+
+    @cached_property
+    def _throughputs(self) -> RowSum:
+        passing = np.flatnonzero(self.donors >= len(self.stores))
+        shape = (len(self.nodes) - len(self.stores), len(self.arcs))
+        return RowSum(self.donors[passing] - len(self.stores), passing, 1.0, shape)
 
     def metered(self, service: Service) -> Integers:
         """Return the arcs whose flows add up to what a service of quantity ``flow`` or ``outflow`` measures."""

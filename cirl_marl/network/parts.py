@@ -7,7 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cirl_marl.network.elements import Arc, Episode, Node, Objective, Observation, Service
+from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.series import Series, Value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,7 +20,8 @@ class Parts:
 
     Attributes:
         name: name in the catalogue, or of the definition file.
-        nodes: compartments with a stock, in the order of every stock array.
+        nodes: compartments between arcs; of a ``Network`` those that hold a stock come first, in the order of every
+            stock array.
         arcs: compartments with a flow, in the order of every flow array.
         services: what the network owes its users.
         episode: time and solver.
@@ -47,3 +52,10 @@ class Parts:
     source_sha256: str | None = field(default=None, repr=False, compare=False)
     scenario_name: str = "default"
     scenarios: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def held(self, value: Value) -> Floats:
+        """Return a value in each control interval, its mean over the interval, shape (horizon,)."""
+        horizon = self.episode.horizon
+        if not isinstance(value, Series):
+            return np.broadcast_to(np.float64(value), horizon)
+        return value.means(np.arange(horizon + 1, dtype=np.float64) * self.episode.control_interval)

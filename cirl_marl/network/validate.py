@@ -5,21 +5,28 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import pairwise
+
+import numpy as np
 
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.declared import bound_problems, default_of
-from cirl_marl.network.elements import MAX_STEPS, TAKEN, Arc, Compartment, ControlKind, Law, Node
+from cirl_marl.network.elements import MAX_STEPS, TAKEN, Arc, Compartment, Control, ControlKind, Law, Node
 from cirl_marl.network.model import CompartmentModel, Outflowing, Releasing, Vehicle, model_faults
 from cirl_marl.network.parts import Parts
+from cirl_marl.network.series import Series, extremes
+from cirl_marl.network.splits import splits, trap_problems
 from cirl_marl.network.units import factor
 from cirl_marl.network.validate_settings import is_whole, repeated, service_problems, setting_problems
+from cirl_marl.network.validate_storage import series_problems, share_problems, storage_problems
 
 IDENTIFIER = r"^[a-z][a-z0-9_]*$"
 """How compartments and services may be called; their names are keys of definition files and names of files."""
 
 OWN = tuple(dict.fromkeys(name for taken in TAKEN.values() for name in taken))
 """Fields of arcs that only some laws take."""
+
+
+SIDES = ("low", "neutral", "high")
 
 
 def problems(network: Parts) -> Iterator[str]:
@@ -34,6 +41,10 @@ def problems(network: Parts) -> Iterator[str]:
     if not network.nodes:
         yield "nodes: a network needs at least one"
     kinds = [(c.id, type(c.model)) for c in (*network.nodes, *network.arcs) if c.model is not None]
+    timeless = [*bound_problems(network.episode)] or [*series_problems(network)]
+    yield from timeless
+    if timeless:
+        return  # without a clock, or with such series, there are no values to look at
     strange = [f"'{id_}': model {kind.__name__}: {fault}" for id_, kind in kinds for fault in model_faults(kind)]
     yield from strange
     if strange:
@@ -42,22 +53,30 @@ def problems(network: Parts) -> Iterator[str]:
     yield from _name_problems([("service", service.id) for service in network.services])
     nodes = {node.id: node for node in network.nodes}
     everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
+    outflows: dict[str, list[Arc]] = {}
+    for arc in network.arcs:
+        outflows.setdefault(arc.donor, []).append(arc)
     for node in network.nodes:
         yield from _node_problems(network, node)
-    controlled: dict[str, list[Arc]] = {}
+        yield from storage_problems(node, outflows.get(node.id, ()))
+    lawful = True
     for arc in network.arcs:
-        yield from _arc_problems(network, arc, nodes, everyone)
-        if arc.law is Law.CONTROLLED:
-            controlled.setdefault(arc.donor, []).append(arc)
+        found = list(_arc_problems(network, arc, nodes, everyone))
+        yield from found
+        lawful = lawful and not found
     for node in network.nodes:
-        outflows = controlled.get(node.id, [])
-        if node.control and node.control.kind is ControlKind.FLOW and len(outflows) != 1:
-            yield f"node '{node.id}': control.kind 'flow' needs one controlled outflow, it has {len(outflows)}"
-        for arc in outflows:
+        controlled = [arc for arc in outflows.get(node.id, ()) if arc.law is Law.CONTROLLED]
+        if node.control and node.control.kind is ControlKind.FLOW and len(controlled) != 1:
+            yield f"node '{node.id}': control.kind 'flow' needs one controlled outflow, it has {len(controlled)}"
+        for arc in controlled:
             setting = sum(c.control is not None and c.control.kind is ControlKind.FLOW for c in (node, arc))
             if setting != 1:
                 where = f"on the arc or on its donor '{node.id}'; it has {setting}"
                 yield f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', {where}"
+    if lawful:
+        divided = splits(network)
+        crooked = [problem for each in divided for problem in each.problems()]
+        yield from crooked or trap_problems(network, divided)
     yield from _port_problems(network)
     yield from service_problems(network)
     yield from setting_problems(network)
@@ -100,7 +119,7 @@ def _name_problems(named: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 
 def _node_problems(network: Parts, node: Node) -> Iterator[str]:
-    low, high = node.initial
+    low, high = node.initial or (0.0, 0.0)
     if not (math.isfinite(low) and math.isfinite(high)) or low > high:
         yield f"node '{node.id}': initial range [{low}, {high}] is empty or not finite"
     elif low < 0 and network.episode.solver != "euler":
@@ -127,17 +146,13 @@ def _arc_problems(
         giving = [end for end in ends if end in everyone and isinstance(everyone[end].model, Outflowing)]
         if arc.by not in giving:
             yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
-    if arc.law is Law.BATCH:
+    if arc.law is Law.BATCH and isinstance(arc.rate, Series):
+        yield f"{where}: rate: the mass of a unit cannot change in time"
+    elif arc.law is Law.BATCH:
         yield from _batch_problems(where, arc, network, nodes)
-    if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and arc.rate == 0:
+    if arc.law in (Law.DONOR, Law.RECIPIENT, Law.COMPARTMENT) and extremes(arc.rate)[1] == 0:
         yield f"{where}: law '{arc.law}' needs a positive rate"
-    if not arc.flow or any(not math.isfinite(f) or f < 0 for f in arc.flow):
-        yield f"{where}: flow {arc.flow} must be finite and not negative"
-    if arc.flow and len(arc.flow) != max(len(arc.times), 1):
-        one = "one for each" if arc.times else "a constant flow has one; a series needs the times at which they begin"
-        yield f"{where}: series has {len(arc.times)} times and {len(arc.flow)} values: {one}"
-    if arc.times and (arc.times[0] != 0 or not all(a < b < math.inf for a, b in pairwise(arc.times))):
-        yield f"{where}: series times {arc.times} must start at 0, increase and be finite"
+    yield from share_problems(where, arc, nodes)
     if arc.control and arc.control.kind is ControlKind.FLOW and arc.law is not Law.CONTROLLED:
         yield f"{where}: control.kind 'flow' needs law 'controlled', not '{arc.law}'"
     if arc.control and arc.control.kind is ControlKind.RATE and arc.law is Law.CONTROLLED:
@@ -181,7 +196,7 @@ def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, No
             yield f"{where}: by: batches are released by the model of the donor '{donor.id}', which has ports {ports}"
         elif arc.port not in ports:
             yield f"{where}: {unknown('port', arc.port, ports)}"
-        if arc.rate <= 0:
+        if extremes(arc.rate)[0] <= 0:
             yield f"{where}: law 'batch' with 'by' needs a positive rate, the mass per unit released"
         else:
             yield from _unit_problems(where, arc, network.mass_unit, donor)
@@ -191,7 +206,7 @@ def _unit_problems(where: str, arc: Arc, mass_unit: str, donor: Node) -> Iterato
     """Yield it if a model that knows the mass of what it releases knows another than its arc."""
     unit_kg = donor.model.unit_kg if isinstance(donor.model, Releasing) else None
     try:
-        carried_kg = arc.rate * factor(mass_unit, "kg")
+        carried_kg = extremes(arc.rate)[0] * factor(mass_unit, "kg")
     except CirlError:
         return  # a problem of its own
     if unit_kg is not None and not math.isclose(carried_kg, unit_kg):
@@ -210,23 +225,32 @@ def _common_problems(where: str, compartment: Compartment, network: Parts) -> It
     for low, high in compartment.inner:
         if not (math.isfinite(low) and math.isfinite(high)) or low > high:
             yield f"{where}: initial range [{low}, {high}] of an inner state is empty or not finite"
-    control, model = compartment.control, compartment.model
-    if model is not None:
-        yield from _model_problems(where, compartment, model)
-    if control is None:
-        return
-    if control.kind is ControlKind.INPUT and (model is None or not model.input_names):
+    if compartment.model is not None:
+        yield from _model_problems(where, compartment, compartment.model)
+    if compartment.control is not None:
+        yield from _control_problems(where, compartment, compartment.control, network)
+
+
+def _control_problems(where: str, compartment: Compartment, control: Control, network: Parts) -> Iterator[str]:
+    if control.kind is ControlKind.INPUT and not (compartment.model and compartment.model.input_names):
         yield f"{where}: control.kind 'input' needs a model with inputs"
     unit = f" {network.mass_unit}/{network.time_unit}" if control.kind is ControlKind.FLOW else ""
-    if control.kind is ControlKind.FLOW and control.low < 0 and network.episode.solver != "euler":
-        yield f"{where}: control.low {control.low:g}{unit} would reverse the flow; use a second arc"
-    if not all(map(math.isfinite, (control.low, control.neutral, control.high))):
+    low, neutral, high = (np.array(network.held(each)) for each in (control.low, control.neutral, control.high))
+    if not np.isfinite([low, neutral, high]).all():
         yield f"{where}: control bounds must be finite"
-    elif not control.low <= control.neutral <= control.high or control.low == control.high:
-        given = f"{control.low:g}, {control.neutral:g}, {control.high:g}{unit}"
-        yield f"{where}: control needs low <= neutral <= high and low < high, got {given}"
-    if control.kind is ControlKind.RATE and control.low < 0:
-        yield f"{where}: control.low {control.low:g} is negative; a valve cannot reverse a flow"
+    elif not ((low <= neutral) & (neutral <= high)).all() or (low == high).all():
+        worst = int(np.argmax((low > neutral) | (neutral > high)))
+        given = f"{low[worst]:g}, {neutral[worst]:g}, {high[worst]:g}{unit}"
+        when = f" in interval {worst}" if any(isinstance(getattr(control, side), Series) for side in SIDES) else ""
+        yield f"{where}: control needs low <= neutral <= high and low < high, got {given}{when}"
+    elif control.kind is ControlKind.FLOW and low.min() < 0 and network.episode.solver != "euler":
+        yield f"{where}: control.low {low.min():g}{unit} would reverse the flow; use a second arc"
+    elif control.kind is ControlKind.RATE and low.min() < 0:
+        yield f"{where}: control.low {low.min():g} is negative; a valve cannot reverse a flow"
+    elif control.kind is ControlKind.SHARE and (low.min() < 0 or high.max() > 1):
+        yield f"{where}: control: shares lie in [0, 1], got [{low.min():g}, {high.max():g}]"
+    if control.kind is ControlKind.SHARE and not isinstance(compartment, Arc):
+        yield f"{where}: control.kind 'share' belongs on an arc of law 'share'"
 
 
 def _model_problems(where: str, compartment: Compartment, model: CompartmentModel) -> Iterator[str]:
@@ -243,7 +267,7 @@ def _model_problems(where: str, compartment: Compartment, model: CompartmentMode
     states = model.ranged_states
     ranges = dict(zip(states, compartment.inner, strict=True)) if len(states) == len(compartment.inner) else {}
     if control is not None:
-        ranges |= dict.fromkeys(inputs, (control.low, control.high))
+        ranges |= dict.fromkeys(inputs, (extremes(control.low)[0], extremes(control.high)[1]))
     for name, (low, high) in model.bounds.items():
         if name in ranges and not (low <= ranges[name][0] and ranges[name][1] <= high):
             given = f"[{ranges[name][0]:g}, {ranges[name][1]:g}]"

@@ -6,6 +6,8 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 
+import numpy as np
+
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.declared import bound_problems
 from cirl_marl.network.elements import MAX_STEPS, Arc, Compartment, Episode, Law, Service
@@ -84,7 +86,7 @@ def service_problems(network: Parts) -> Iterator[str]:
     everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
     providers = _providers(network)
     for service in network.services:
-        yield from _service_problems(service, everyone, providers)
+        yield from _service_problems(network, service, everyone, providers)
         yield from _outflow_problems(service, network.arcs)
 
 
@@ -93,7 +95,10 @@ def _providers(network: Parts) -> dict[str, dict[str, None]]:
     nodes, everyone = network.nodes, (*network.nodes, *network.arcs)
     found = {
         "flow": [arc.id for arc in network.arcs],
-        "stock": [*(node.id for node in nodes), *(arc.id for arc in network.arcs if arc.law is Law.BATCH)],
+        "stock": [
+            *(node.id for node in nodes if node.stores),
+            *(arc.id for arc in network.arcs if arc.law is Law.BATCH),
+        ],
         "measure": [c.id for c in everyone if isinstance(c.model, Measuring)],
         "outflow": [node.id for node in nodes],
     }
@@ -101,7 +106,7 @@ def _providers(network: Parts) -> dict[str, dict[str, None]]:
 
 
 def _service_problems(
-    service: Service, everyone: Mapping[str, Compartment], providers: Mapping[str, Mapping[str, None]]
+    network: Parts, service: Service, everyone: Mapping[str, Compartment], providers: Mapping[str, Mapping[str, None]]
 ) -> Iterator[str]:
     where = f"service '{service.id}'"
     yield from bound_problems(service, f"{where}: ")
@@ -119,9 +124,11 @@ def _service_problems(
     for debtor in service.owed_by:
         if debtor not in everyone:
             yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
-    if not 0 <= service.low <= service.high or not service.high > 0:
-        yield f"{where}: the band [{service.low}, {service.high}] must not be negative or empty"
-    elif service.low == 0 and math.isinf(service.high):
+    low, high = (np.array(network.held(each)) for each in (service.low, service.high))
+    if not ((low >= 0) & (low <= high) & (high > 0)).all():
+        worst = int(np.argmin((low >= 0) & (low <= high) & (high > 0)))
+        yield f"{where}: the band [{low[worst]}, {high[worst]}] must not be negative or empty"
+    elif (low == 0).all() and np.isinf(high).all():
         yield f"{where}: the band from 0 without an upper end asks for nothing"
 
 

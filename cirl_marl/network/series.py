@@ -1,0 +1,93 @@
+"""Numbers that change in time, and what they are in each control interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Annotated
+
+import numpy as np
+
+from cirl_marl.network.declared import Changing, Checked, Declared, Numbers, Quantity, Word, frozen
+from cirl_marl.network.rowsum import Floats
+
+
+@frozen
+class Series(Checked, Changing):
+    """A number that changes in time; within a control interval its mean over the interval holds."""
+
+    times: Annotated[
+        tuple[float, ...],
+        Numbers("when each value holds, from the start of the episode, time; the first not after it", "(time, …)"),
+    ]
+    values: Annotated[tuple[float, ...], Numbers("one for each time, in the unit of the quantity", "(value, …)")]
+    interpolation: Annotated[
+        str,
+        Word(
+            "``step``: a value holds until the next one; ``linear``: straight lines between them", of=("step", "linear")
+        ),
+    ] = "step"
+    until: Annotated[
+        float | None,
+        Quantity(
+            "time up to which the last value is known to hold; None: for good (``step``), or no longer", of="time"
+        ),
+    ] = None
+    origin: Annotated[str, Declared("where it was read from, for messages")] = ""
+
+    @property
+    def end(self) -> float:
+        """Time up to which it is known."""
+        if self.until is not None:
+            return self.until
+        return math.inf if self.interpolation == "step" else self.times[-1]
+
+    def problems(self) -> Iterator[str]:
+        """Yield what is wrong with times and values, whatever the episode."""
+        if not self.times or len(self.times) != len(self.values):
+            yield f"series has {len(self.times)} times and {len(self.values)} values: one for each"
+            return
+        for before, after in pairwise(self.times):
+            if not before < after < math.inf:
+                yield f"series: times must increase and be finite, but {after:g} follows {before:g}"
+                return
+        if not all(map(math.isfinite, (self.times[0], *self.values))):
+            yield "series: times and values must be finite"
+
+    def uncovered(self, length: float) -> str:
+        """Return what is missing of an episode of some length; nothing if the series covers it."""
+        slack = 1e-9 * max(length, 1.0)
+        if self.times[0] > slack:
+            return f"series begins at {self.times[0]:g}, after the episode does"
+        if self.end < length - slack:
+            return f"series ends at {self.end:g}, but the episode at {length:g}"
+        return ""
+
+    def means(self, edges: Floats) -> Floats:
+        """Return the mean over each interval between ``edges``, shape (len(edges) − 1,)."""
+        times, values = np.array(self.times), np.array(self.values)
+        slopes = np.zeros(len(times))
+        if self.interpolation == "linear":
+            slopes[:-1] = np.diff(values) / np.diff(times)
+        lengths = np.diff(times)
+        total = np.concatenate([[0.0], np.cumsum(values[:-1] * lengths + slopes[:-1] * lengths**2 / 2)])
+        index = np.maximum(np.searchsorted(times, edges, side="right") - 1, 0)
+        within = edges - times[index]
+        integral = total[index] + values[index] * within + slopes[index] * within**2 / 2
+        means: Floats = np.diff(integral) / np.diff(edges)
+        return means
+
+
+Value = float | Series
+"""What may change in time."""
+
+
+def extremes(value: Value) -> tuple[float, float]:
+    """Return the lowest and the highest value."""
+    return (min(value.values), max(value.values)) if isinstance(value, Series) else (value, value)
+
+
+def varies(value: object) -> bool:
+    """Whether a value changes in time."""
+    return isinstance(value, Series)
