@@ -32,6 +32,7 @@ from cirl_marl import (
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.network.series import Series
 from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, held, improved
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verified
@@ -81,7 +82,7 @@ def episodes(network: Network, seed: int) -> tuple[Floats, Floats, Floats]:
     env = VectorEnv(network, num_envs=COPIES)
     env.reset(seed=0)
     rng = np.random.default_rng(seed)
-    entries = len(env.stack({a: np.tile(n, (COPIES, 1)) for a, n in env.neutral_action.items()}))
+    entries = len(env.stack(env.neutral_action))
     constant = rng.choice([-1.0, 1.0], (entries, COPIES))
     circularity, service = np.zeros((2, COPIES))
     highest = env.physical.stock[: len(network.nodes)].copy()
@@ -89,7 +90,7 @@ def episodes(network: Network, seed: int) -> tuple[Floats, Floats, Floats]:
         actions = rng.choice([-1.0, 1.0], (entries, COPIES))
         actions[:, 12:24] = rng.uniform(-1, 1, (entries, 12))
         actions[:, 24:] = constant[:, 24:]
-        actions[:, -1] = np.concatenate([np.zeros(0), *env.neutral_action.values()])
+        actions[:, -1] = np.concatenate([np.zeros(0), *(each[0] for each in env.neutral_action.values())])
         outcome = env.advance(actions)
         circularity += outcome.circularity_mean / network.episode.horizon
         service += outcome.service_level / network.episode.horizon
@@ -156,7 +157,7 @@ def test_reach(network: Network, interval: float, seed: int) -> None:
     run = rollout(VectorEnv(single, num_envs=1), Neutral())
     dynamics = FlowLaws(single)
     steps = np.arange(single.episode.horizon)
-    asked = dynamics.rate(np.repeat(dynamics.neutral[:, None], len(steps), axis=1), steps).T
+    asked = dynamics.rate(np.repeat(dynamics.neutral[:, :1], len(steps), axis=1), steps).T
     sure = reached.uncut & dynamics.scheduled
     np.testing.assert_allclose(run.flow[sure], asked[sure], rtol=1e-9)
 
@@ -253,7 +254,7 @@ def test_service_costs_its_throughput() -> None:
 def test_net_zero_by_absolute_value() -> None:
     """With ``abs`` removing more than is emitted does not pay: λ̄ = 0 where ``signed`` would give u − e."""
     air = stocked("air", 1000.0, Role.ENVIRONMENT)
-    emission = Arc(id="emission", donor="use", recipient="air", law=Law.EXOGENOUS, flow=(3.0,))
+    emission = Arc(id="emission", donor="use", recipient="air", law=Law.EXOGENOUS, flow=3.0)
     network = small([air, stocked("use", 100.0)], [emission, order("capture", "air", "use", 7.0)])
     assert bound(network).objective == pytest.approx(4.0, rel=1e-9)
     absolute = bound(network.with_options(objective={"net_zero": "abs"}))
@@ -264,7 +265,11 @@ def test_net_zero_by_absolute_value() -> None:
 def test_exogenous_series_is_exact() -> None:
     """A demand that the reserve can meet is met: λ̄ = −Δ·mean of the series."""
     arc = Arc(
-        id="demand", donor="reserve", recipient="use", law=Law.EXOGENOUS, flow=(1.0, 4.0, 2.0), times=(0.0, 1.2, 3.0)
+        id="demand",
+        donor="reserve",
+        recipient="use",
+        law=Law.EXOGENOUS,
+        flow=Series(times=(0.0, 1.2, 3.0), values=(1.0, 4.0, 2.0)),
     )
     found = bound(small([RESERVE, USE], [arc]), agents=None)
     assert found.objective == pytest.approx(-(1.2 * 1 + 1.8 * 4 + 1 * 2) / 4, rel=1e-9)
@@ -272,7 +277,7 @@ def test_exogenous_series_is_exact() -> None:
 
 def test_exogenous_series_that_is_cut_still_bounds() -> None:
     """A demand above what the reserve holds moves all there is at most, and the bound claims no more than none."""
-    arc = Arc(id="demand", donor="reserve", recipient="use", law=Law.EXOGENOUS, flow=(80.0,))
+    arc = Arc(id="demand", donor="reserve", recipient="use", law=Law.EXOGENOUS, flow=80.0)
     found = bound(small([RESERVE, USE], [arc]))
     run = rollout(VectorEnv(small([RESERVE, USE], [arc]), num_envs=1), Neutral())
     assert run.episode_circularity[0] == pytest.approx(-100 / 4, rel=1e-9)

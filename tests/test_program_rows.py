@@ -12,12 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from exact_episode import Controls, Interval, control_of, imbalance, intervals, valve_of
+from exact_episode import Controls, Interval, control_of, imbalance, intervals, mean_of, valve_of
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, VectorEnv
+from cirl_marl.network.series import Series
+from cirl_marl.network.splits import splits
 from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
@@ -57,19 +59,33 @@ class Played:
         return any(piece.cut for each in self.intervals for piece in each.pieces)
 
 
+def scaled(value: float | Series, factor: float) -> float | Series:
+    """Return a number that may change in time, times a factor."""
+    if isinstance(value, Series):
+        return replace(value, values=tuple(factor * each for each in value.values))
+    return factor * value
+
+
 def certifiable(network: Network, interval: float, pulls: bool) -> Network:
     """Return the network without batches, which become constant demands, and with the exact solver."""
     arcs = []
     for arc in network.arcs:
         if arc.law is Law.BATCH:
-            arc = replace(arc, law=Law.EXOGENOUS, flow=(80.0,), batches=(), delay=0.0)
+            arc = replace(arc, law=Law.EXOGENOUS, flow=80.0, batches=(), delay=0.0)
         elif arc.law is Law.RECIPIENT:
             law = Law.RECIPIENT if pulls else Law.DONOR
-            arc = replace(arc, law=law, rate=arc.rate * (0.02 if pulls else 1.0))
+            arc = replace(arc, law=law, rate=scaled(arc.rate, 0.02 if pulls else 1.0))
         arcs.append(arc)
-    nodes = [replace(node, initial=(node.initial[1],) * 2) for node in network.nodes]
-    episode = replace(network.episode, control_interval=interval, solver="exact", solver_step=None)
+    nodes = [replace(node, initial=node.initial and (node.initial[1],) * 2) for node in network.nodes]
+    shorter = min(interval, network.episode.control_interval)  # which its series cover
+    episode = replace(network.episode, control_interval=shorter, solver="exact", solver_step=None)
     return replace(network, nodes=tuple(nodes), arcs=tuple(arcs), episode=episode)
+
+
+def bounds_of(network: Network, agent: str) -> tuple[float | Series, float | Series]:
+    """Return the ends of the range of an agent's control."""
+    control = control_of(network, agent)
+    return control.low, control.high
 
 
 def play(
@@ -93,25 +109,25 @@ def play(
     """
     env = VectorEnv(network, num_envs=1, agents=agents)
     env.reset(seed=0)
-    start = env.physical.stock[: len(network.nodes), 0].copy()
+    start = env.physical.stock[: len(network.stores), 0].copy()
     held: list[Controls] = []
     circularity = service = 0.0
-    for _ in range(network.episode.horizon):
+    for step in range(network.episode.horizon):
         action = rng.uniform(-1, 1, len(env.agents))
         if style != "inside":
             action = np.where(rng.random(len(action)) < {"low": 0.9, "high": 0.1, "ends": 0.5}[style], -1.0, 1.0)
         action = np.array([(fixed or {}).get(agent, each) for agent, each in zip(env.agents, action, strict=True)])
-        values = {each: control_of(network, each).neutral for each in network.controllable}
+        values = {each: mean_of(network, control_of(network, each).neutral, step) for each in network.controllable}
         for agent, chosen in zip(env.agents, action.tolist(), strict=True):
-            control = control_of(network, agent)
-            values[agent] = control.low + (chosen + 1) / 2 * (control.high - control.low)
+            low, high = (mean_of(network, end, step) for end in bounds_of(network, agent))
+            values[agent] = low + (chosen + 1) / 2 * (high - low)
         held.append(values)
         outcome = env.advance(action[:, None])
         circularity += float(outcome.circularity_mean[0]) / network.episode.horizon
         service += float(outcome.service_level[0]) / network.episode.horizon
     happened = list(intervals(network, start, held, env.dynamics.substeps))
     mass, delta = start.sum(), network.objective.reference_interval
-    end = env.physical.stock[: len(network.nodes), 0]
+    end = env.physical.stock[: len(network.stores), 0]
     np.testing.assert_allclose(happened[-1].pieces[-1].end, end, rtol=1e-9, atol=1e-11 * mass)
     size = delta * max(float(each.flow.sum()) for each in happened)
     assert abs(circularity - np.mean([each.circularity for each in happened])) <= 1e-10 * size + 1e-12 * mass
@@ -124,11 +140,14 @@ def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
     """Return v of an episode: for each piece X_i, F_i, Z_i and the stocks at its end; levels, imbalance, valves."""
     network = layout.network
     names = [node.id for node in network.nodes]
+    entering = np.array([[arc.recipient == node.id for arc in network.arcs] for node in network.nodes])
+    entering = entering[len(network.stores) :].T.astype(float).reshape(len(network.arcs), -1)
     found: list[Floats] = []
     for each in happened:
         valve = np.array([valve_of(network, name, each.controls) for name in names])
         for piece in each.pieces:
             for stock, flow in zip(*piece.means(layout.degree), strict=True):
+                stock = np.append(stock, flow @ entering)  # what passes through nodes that store nothing
                 found += [stock, flow, (valve * stock)[layout.valves]]
             found.append(piece.end)
         found += [each.levels, np.array([imbalance(network, each.flow)]), valve[layout.openings]]
@@ -192,7 +211,7 @@ def test_random_networks(
     rng = np.random.default_rng(seed)
     agents = [agent for agent in network.agents if rng.random() < 0.8] or None
     try:
-        Programs(Admissible.of(network, agents), 1, None).program(np.array([n.initial[1] for n in network.nodes]))
+        Programs(Admissible.of(network, agents), 1, None).program(network.initial[1])
     except NoCertificate:
         assume(False)
     assert_holds(play(network, rng, style, agents), degree, weight)
@@ -200,7 +219,7 @@ def test_random_networks(
 
 def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int, int], Network]) -> None:
     """Among thirty of them are cut flows, valves on scheduled flows, series, several substeps, |net flow|, service."""
-    met = dict.fromkeys(("cut", "valve", "series", "substeps", "abs", "service"), 0)
+    met = dict.fromkeys(("cut", "valve", "series", "shares", "passing", "changing", "substeps", "abs", "service"), 0)
     for seed in range(30):
         network = certifiable(make_network(seed, 3 + seed % 6, 4 + seed % 9), 0.3, pulls=False)
         rng = np.random.default_rng(seed)
@@ -209,7 +228,10 @@ def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int
         layout = Programs(Admissible.of(network), 1, None).layout
         met["cut"] += played.cut
         met["valve"] += len(layout.openings) > 0
-        met["series"] += any(arc.times for arc in network.arcs)
+        met["series"] += any(isinstance(arc.flow, Series) for arc in network.arcs)
+        met["shares"] += any(split.controlled for split in splits(network))
+        met["passing"] += len(network.stores) < len(network.nodes)
+        met["changing"] += len(np.unique(Admissible.of(network).kinds)) > 1
         met["substeps"] += layout.pieces > 1
         met["abs"] += network.objective.net_zero == "abs" and any(imbalance(network, e.flow) for e in played.intervals)
         met["service"] += 0 < played.service < 1
@@ -263,8 +285,7 @@ def works(
             donor="store",
             recipient="use",
             law=Law.EXOGENOUS,
-            flow=(10.0, 25.0, 3.0),
-            times=(0.0, 0.5, 1.3),
+            flow=Series(times=(0.0, 0.5, 1.3), values=(10.0, 25.0, 3.0)),
             control=rate_control(0.5, 1.0),
         ),
         Arc(id="loss", donor="use", recipient="sort", rate=0.5),
@@ -272,7 +293,7 @@ def works(
         Arc(id="leak", donor="mine", recipient="tip", rate=0.02),
         Arc(id="pull", donor="mine", recipient="use", law=Law.RECIPIENT, rate=0.05),
         Arc(id="emission", donor="use", recipient="air", rate=0.9, control=rate_control(0.3, 1.0)),
-        Arc(id="repair", donor="use", recipient="store", law=Law.EXOGENOUS, flow=(2.0,)),
+        Arc(id="repair", donor="use", recipient="store", law=Law.EXOGENOUS, flow=2.0),
         order("capture", "air", "use", 9.0),
     )
     services = (
@@ -315,7 +336,7 @@ def test_a_store_that_runs_empty(
     assert cut or stock == 700.0 or style == "low"
     programs = Programs(Admissible.of(network), 1, None)
     layout, supply = programs.layout, network.arc_index["supply"]
-    least = programs.program(np.array([node.initial[1] for node in network.nodes])).low[layout.flow(0) + supply]
+    least = programs.program(network.initial[1]).low[layout.flow(0) + supply]
     assert (least > 0) == (stock == 700.0 and (valve is None or valve[0] > 0))  # nothing is cut at first
     assert (network.node_index["store"] in layout.openings) == (valve is not None)
     assert (layout.pieces > 1) == (interval == 0.8)
@@ -349,9 +370,9 @@ def test_a_demand_without_a_choice(stock: float, feed: float, asked: float, cut:
         Node(id="end"),
     )
     arcs = (
-        Arc(id="feed", donor="ample", recipient="store", law=Law.EXOGENOUS, flow=(feed,)),
+        Arc(id="feed", donor="ample", recipient="store", law=Law.EXOGENOUS, flow=feed),
         Arc(id="exit", donor="store", recipient="end", rate=0.8),
-        Arc(id="demand", donor="store", recipient="use", law=Law.EXOGENOUS, flow=(asked,)),
+        Arc(id="demand", donor="store", recipient="use", law=Law.EXOGENOUS, flow=asked),
         Arc(id="through", donor="use", recipient="end", rate=1.0),
     )
     for interval in (1.0, 3.0):
@@ -404,7 +425,7 @@ def test_the_most_that_is_delivered() -> None:
     With z = a·δ it is x_0·z/(e^z − 1); a greater z, that of the greatest exit, would allow less.
     """
     network = works().with_options(episode={"control_interval": 0.4, "horizon": 1})
-    start = np.array([node.initial[1] for node in network.nodes])
+    start = network.initial[1].copy()
     lowest = {each: control_of(network, each).low for each in network.controllable}
     (happened,) = intervals(network, start, [{**lowest, "supply": 60.0}], 1)
     ordered = [network.arc_index["supply"], network.arc_index["demand"]]

@@ -18,7 +18,7 @@ def normalised_actions(
     """Return the actions whose constant factors give the planned mean flows at the planned mean stocks.
 
     v = Z̄/X̄ where a node has several outflows, else what its outflow asks with its own control neutral; then
-    w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range.
+    w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range. A share is such a w_k, of what is released.
 
     Args:
         admissible: ranges of the factors.
@@ -32,29 +32,27 @@ def normalised_actions(
     network, first = admissible.network, 0 if intervals is None else intervals.start
     during = slice(first, first + len(planned))
     own_range, valve_range, base = admissible.own[:, during], admissible.valve[:, during], admissible.base[during]
-    nodes = len(network.nodes)
     stock, flow, through = layout.means(planned)
-    neutral = np.array([1.0 if c.control is None else c.control.neutral for c in network.compartments.values()])
-    valve = admissible.neutral_valve[during].copy()
+    neutral, valve = admissible.neutral_own[during], admissible.neutral_valve[during].copy()
     by_donor = admissible.driver == network.donors
     for k in np.flatnonzero(by_donor):
         donor = int(network.donors[k])
         if donor not in layout.valves and (valve_range[0, :, donor] < valve_range[1, :, donor]).any():
-            unit = base[:, k] * neutral[nodes + k] * stock[:, donor]
+            unit = base[:, k] * neutral[:, k] * stock[:, donor]
             valve[:, donor] = _ratio(flow[:, k], unit, valve[:, donor])
     for z, node in enumerate(layout.valves):
         valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
     # what is left of f̄_k after the valve is the arc's own factor, w_k = f̄_k/(a_k·v·X̄_p)
     valve = np.clip(valve, *valve_range)
     driving = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
-    own = _ratio(flow, base * driving * valve[:, network.donors], np.broadcast_to(neutral[nodes:], flow.shape))
-    return _entries(admissible, valve, np.clip(own, *own_range))
+    own = _ratio(flow, base * driving * valve[:, network.donors], neutral)
+    return _entries(admissible, valve, np.clip(own, *own_range), during)
 
 
-def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
-    network = admissible.network
-    actuators = Actuators(FlowLaws(network), admissible.agents or None, 1)
-    actions = np.zeros((len(valve), len(actuators.acting)))
+def _entries(admissible: Admissible, valve: Floats, own: Floats, during: slice) -> Floats:
+    network, steps = admissible.network, np.arange(during.start, during.stop)
+    actuators = Actuators(FlowLaws(network), admissible.agents or None, len(steps))
+    actions = np.zeros((len(steps), len(actuators.acting)))
     for agent, entries in actuators.entries.items():
         control = network.compartments[agent].control
         assert control is not None
@@ -66,7 +64,7 @@ def _entries(admissible: Admissible, valve: Floats, own: Floats) -> Floats:
             node = network.node_index[agent]
             sets = next(k for k in np.flatnonzero(network.donors == node) if network.arcs[k].law is Law.CONTROLLED)
             values = own[:, sets]
-        actions[:, entries] = control.action(values)[:, None]
+        actions[:, entries] = actuators.normalised(agent, values[None], steps).T
     return actions
 
 

@@ -81,14 +81,14 @@ def _merit(bound: Bound, run: Rollout, price: float) -> float:
 
 
 def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
-    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, shape (steps, nodes + arcs, nodes | entries)."""
+    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, shape (steps, stores + arcs, stores | entries)."""
     network = bound.network
     steps, entries = bound.actions.shape
-    nodes = len(network.nodes)
+    nodes = len(network.stores)
     dynamics = Dynamics(network)
     stock = np.concatenate([bound.initial[None], run.stock[:-1]])
     inputs = np.concatenate([stock, bound.actions], axis=1)
-    scale = np.array([node.scale for node in network.nodes])
+    scale = np.array([node.scale for node in network.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
@@ -99,7 +99,7 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     actuators = Actuators(dynamics, bound.agents or None, flat.shape[1])
     when = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
-    done = dynamics.advance(dynamics.extend(flat[:nodes]), inner, actuators.controls(flat[nodes:]), when)
+    done = dynamics.advance(dynamics.extend(flat[:nodes]), inner, actuators.controls(flat[nodes:], when), when)
     outputs = np.concatenate([done.stock[dynamics.rows.nodes], done.moved / network.episode.control_interval])
     shaped = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (shaped[:, :, :-1] - shaped[:, :, -1:]) / shift[:, None]
@@ -115,7 +115,7 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | No
     """
     network = bound.network
     steps, entries = bound.actions.shape
-    nodes, arcs, services = len(network.nodes), len(network.arcs), len(network.services)
+    nodes, arcs, services = len(network.stores), len(network.arcs), len(network.services)
     by_stock, by_action = _jacobians(bound, run)
     outputs = nodes + arcs
     size = outputs + entries + services + 1
@@ -130,11 +130,12 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | No
     )
     measure, imbalances = _measures(bound)
     realised = np.concatenate([run.stock, run.flow], axis=1)
-    low = np.array([service.low for service in network.services])
+    low = np.array([network.held(service.low) for service in network.services]).reshape(services, steps)
     # low·level − δq ≤ q, and ±(φ + δφ) ≤ imbalance, with q and φ those of the simulated episode
-    rows = np.zeros((services + 2, size))
-    rows[:services, :outputs], rows[:services, level:imbalance] = -measure, np.diag(low)
-    rows[services:, :outputs], rows[services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0
+    rows = np.zeros((steps, services + 2, size))
+    rows[:, :services, :outputs] = -measure
+    rows[:, np.arange(services), level + np.arange(services)] = low.T
+    rows[:, services:, :outputs], rows[:, services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0
     limits = np.concatenate([realised @ measure.T, -(realised @ imbalances)[:, None] * [1.0, -1.0]], axis=1)
     cost = _cost(bound, size, level, price)
     missing = np.zeros((1, steps * size + 1))
@@ -143,7 +144,11 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | No
         share[level:imbalance] = -1.0 / (steps * services)
         missing[0, :-1], missing[0, -1] = np.tile(share, steps), -1.0
     under = sparse.vstack(
-        [sparse.hstack([sparse.kron(once, rows), sparse.csr_array((steps * len(rows), 1))]), missing], format="csr"
+        [
+            sparse.hstack([_diagonal(rows, rows.shape[1:]), sparse.csr_array((rows.shape[0] * rows.shape[1], 1))]),
+            missing,
+        ],
+        format="csr",
     )
     demanded = (bound.min_service or 0.0) if services and bound.service_weight is None else 0.0
     bounds = np.tile(np.array([-np.inf, np.inf]), (steps, size, 1))
@@ -164,7 +169,8 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | No
         high=high,
     )
     # states and flows change by shares of their largest values, the others by shares of 1
-    largest = np.maximum(np.abs(realised).max(axis=0), [c.scale for c in network.compartments.values()])
+    parts = (*network.stores, *network.arcs)
+    largest = np.maximum(np.abs(realised).max(axis=0), [part.scale for part in parts])
     net = max(float(np.abs(realised @ imbalances).max()), network.objective.circularity_scale)
     sizes = np.concatenate([largest, np.ones(entries + services), [net]])
     found = best_values(problem, np.append(np.tile(sizes, steps), 1.0))
@@ -176,9 +182,9 @@ def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:
 
 
 def _measures(bound: Bound) -> tuple[Floats, Floats]:
-    """Return what each service reads off (x', f̄), shape (services, nodes + arcs), and Δ·σ_env padded with zeros."""
+    """Return what each service reads off (x', f̄), shape (services, stores + arcs), and Δ·σ_env padded with zeros."""
     network = bound.network
-    nodes = len(network.nodes)
+    nodes = len(network.stores)
     measure = np.zeros((len(network.services), nodes + len(network.arcs)))
     for s, service in enumerate(network.services):
         if service.quantity == "stock":
@@ -191,7 +197,7 @@ def _measures(bound: Bound) -> tuple[Floats, Floats]:
 def _cost(bound: Bound, size: int, level: int, price: float) -> Floats:
     """Return the cost of the variables of one interval: minus the share in λ̄, or in the weighted objective."""
     network, steps = bound.network, len(bound.actions)
-    nodes, services = len(network.nodes), len(network.services)
+    nodes, services = len(network.stores), len(network.services)
     cost = np.zeros(size)
     counted = network.circularity_weights.sum(axis=0)
     if network.objective.net_zero == "abs":

@@ -18,7 +18,7 @@ class Layout:
     """Where the variables of one interval lie.
 
     For each piece X_i, F_i and Z_i for i = 0 … d, then the stocks at its end; after the last piece, the levels, the
-    imbalance and the valves.
+    imbalance and the valves. Of a node that stores nothing X_i is its throughput, and there is no stock at the end.
     Z_i = v·X_i is what the valve of a node lets through to several outflows. Moments are counted through all pieces.
 
     Attributes:
@@ -48,8 +48,8 @@ class Layout:
     @cached_property
     def piece(self) -> int:
         """Variables of a piece."""
-        nodes = len(self.network.nodes)
-        return (self.degree + 1) * (nodes + len(self.network.arcs) + len(self.valves)) + nodes
+        means = len(self.network.nodes) + len(self.network.arcs) + len(self.valves)
+        return (self.degree + 1) * means + len(self.network.stores)
 
     @property
     def length(self) -> float:
@@ -62,10 +62,10 @@ class Layout:
         return self.network.episode.control_interval / len(self.moments)
 
     def stock(self, moment: Place) -> Place:
-        """Return the first of the weighted mean stocks X."""
+        """Return the first of the weighted mean stocks X, then throughputs."""
         # each piece: d + 1 blocks of (X, F, Z), equally long, then the stocks at its end
         piece, i = divmod(moment, self.degree + 1)
-        return piece * self.piece + i * ((self.piece - len(self.network.nodes)) // (self.degree + 1))
+        return piece * self.piece + i * ((self.piece - len(self.network.stores)) // (self.degree + 1))
 
     def flow(self, moment: Place) -> Place:
         """Return the first of the weighted mean flows F."""
@@ -77,7 +77,7 @@ class Layout:
 
     def end(self, piece: Place) -> Place:
         """Return the first of the stocks at the end of a piece; −1 is the last."""
-        return (piece % self.pieces + 1) * self.piece - len(self.network.nodes)
+        return (piece % self.pieces + 1) * self.piece - len(self.network.stores)
 
     @property
     def level(self) -> int:

@@ -19,25 +19,26 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.rows import Rows
+from cirl_marl.optimum.shared import followers
 
 
 def falls(admissible: Admissible, layout: Layout, step: int, rows: Rows) -> None:
     """Add the rows of an interval, each at most 0; their keys are (1, node, piece, what, i)."""
     network = admissible.network
-    exits = admissible.driver == network.donors
-    fastest: Floats = np.bincount(network.donors, admissible.rate(step)[1] * exits, len(network.nodes)).astype(float)
-    pulled = network.donors[~admissible.scheduled & ~exits]
+    pulled = network.donors[~admissible.scheduled & (admissible.driver != network.donors)]
     nodes = np.setdiff1d(admissible.driver[~admissible.scheduled], pulled)
+    nodes = nodes[nodes < len(network.stores)]
     if not len(nodes):
         return
-    chain = _Chains(admissible, layout, rows, *_decay(fastest, layout.length, layout.degree))
+    means, delays = _decay(admissible.exits(step)[1], layout.length, layout.degree)
+    chain = _Chains(admissible, layout, rows, means, delays)
     chain.of_stocks(nodes)
     position = np.full(len(network.nodes), -1)
     position[layout.valves] = np.arange(len(layout.valves))
     valve = admissible.valve[:, step]
     through = np.intersect1d(layout.valves, nodes)
     chain.driven(through, 0 * through, layout.valve(0) + position[through], through, valve[:, through], 1.0)
-    arcs = np.flatnonzero(np.isin(admissible.driver, nodes))
+    arcs = np.setdiff1d(np.flatnonzero(np.isin(admissible.driver, nodes)), followers(admissible, step))
     drivers = admissible.driver[arcs]
     via = (position[drivers] >= 0) & (network.donors[arcs] == drivers)
     factor = np.where(via, admissible.own[:, step, arcs], admissible.factor[:, step, arcs])

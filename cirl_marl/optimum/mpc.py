@@ -206,7 +206,7 @@ class MPC(Planner):
             done = window.start - last.intervals.start + self._replan
             planned = last.solution.plan.reshape(len(last.intervals), -1)[:done]
             return replace(last, actions=self._actions(last.problem, last.intervals, planned))
-        neutral = np.concatenate([*self._env.neutral_action.values()])
+        neutral = np.concatenate([each[copy] for each in self._env.neutral_action.values()])
         return _Plan(int(self._env.episodes[copy]), window, None, None, np.tile(neutral, (self._replan, 1)), 1.0)
 
     def _actions(self, problem: Program, intervals: range, planned: Floats) -> Floats:

@@ -58,7 +58,7 @@ class Population:
     @property
     def entries(self) -> int:
         """Entries of a stacked action."""
-        return sum(len(neutral) for neutral in self._env.neutral_action.values())
+        return sum(neutral.shape[1] for neutral in self._env.neutral_action.values())
 
     def run(
         self,

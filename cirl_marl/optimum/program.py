@@ -20,6 +20,7 @@ from cirl_marl.optimum.objective import measures, objective
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.rows import Chained, Rows
 from cirl_marl.optimum.scheduled import deliveries, openings
+from cirl_marl.optimum.shared import followers, passing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +91,7 @@ class Programs:
             linked_equal, equal, linked_under, under = (Rows(layout) for _ in range(4))
             _balances(layout, linked_equal)
             _laws(admissible, layout, kind, equal, under)
+            passing(admissible, layout, kind, equal)
             if held:
                 _held(admissible, layout, kind, equal)
             deliveries(admissible, layout, kind, linked_under)
@@ -100,7 +102,7 @@ class Programs:
         self._weights, self._constant = objective(layout, service_weight)
 
     def program(self, initial: Floats, min_service: float | None = None, intervals: range | None = None) -> Program:
-        """Return the program from ``initial``, shape (nodes,), with at least the mean service level ``min_service``.
+        """Return the program from ``initial``, shape (stores,), with at least the mean service level ``min_service``.
 
         Args:
             initial: stocks at the start, mass.
@@ -155,10 +157,11 @@ def _balances(layout: Layout, rows: Rows) -> None:
     Y_{−1} and Y_d are the stocks at the two ends of the piece, δ its length.
     """
     network, d = layout.network, layout.degree
-    moment, node = layout.moment_column, np.arange(len(network.nodes))
+    moment, node = layout.moment_column, np.arange(len(network.stores))
     row = rows.add(moment, node)
-    rows.put(row[:, network.donors], layout.flow(moment) + np.arange(len(network.arcs)), layout.portion)
-    rows.put(row[:, network.recipients], layout.flow(moment) + np.arange(len(network.arcs)), -layout.portion)
+    for ends, sign in ((network.donors, 1.0), (network.recipients, -1.0)):
+        arcs = np.flatnonzero(ends < len(node))
+        rows.put(row[:, ends[arcs]], layout.flow(moment) + arcs, sign * layout.portion)
     for j in layout.moments:
         piece, i = divmod(j, d + 1)
         if i < d:  # Y_i
@@ -195,7 +198,7 @@ def _laws(admissible: Admissible, layout: Layout, step: int, equal: Rows, under:
             under.put(row, column[:, ~given], sign)
             under.put(row, driver[:, ~given], -sign * bound[~given])
 
-    valves, arcs = layout.valves, np.flatnonzero(~admissible.scheduled)
+    valves, arcs = layout.valves, np.setdiff1d(np.flatnonzero(~admissible.scheduled), followers(admissible, step))
     place = np.arange(len(valves))
     hold(1, place, layout.valve(moment) + place, layout.stock(moment) + valves, admissible.valve[:, step, valves])
     # behind a valve that several outflows share F_i = w·a·Z_i with Z_i = v·X_i; else F_i = v·w·a·X_i
@@ -243,7 +246,7 @@ def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: rang
         low[:, layout.flow(i) : layout.valve(i)] = least
         high[:, layout.valve(i) :][:, : len(layout.valves)] = (reached.upper * valve[1])[:, layout.valves]
     for piece in range(layout.pieces):
-        high[:, layout.end(piece) : layout.end(piece) + len(network.nodes)] = reached.upper
+        high[:, layout.end(piece) : layout.end(piece) + len(network.stores)] = reached.upper[:, : len(network.stores)]
     high[:, layout.level : layout.imbalance] = 1.0
     weights = network.objective.reference_interval * np.abs(network.sustainability * network.environmental)
     high[:, layout.imbalance] = most @ weights

@@ -9,18 +9,19 @@ flow realised.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.passes import Passes
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
 from cirl_marl.optimum.held import Held
+from cirl_marl.optimum.routes import ROUNDING, Routes
 
-ROUNDING = 1e-9
-"""Relative widening of every bound; rounding errors are far smaller."""
 ROUND_OFF = 1e-13
 """Mass by which bounds are widened in each substep, relative to the mass in the network."""
 
@@ -30,7 +31,8 @@ class Reach:
     """What the stocks can be.
 
     Attributes:
-        upper: bound of each stock within each interval, shape (steps, nodes), mass.
+        upper: bound of each stock within each interval, mass, and of what passes through each node that stores
+            nothing, mass/time, shape (steps, nodes).
         uncut: whether the donor of each arc delivers all that is asked, whatever the actions, shape (steps, arcs).
     """
 
@@ -50,29 +52,32 @@ class ComparisonSystem:
         self.admissible, self.network = admissible, admissible.network
         dynamics = Dynamics(admissible.network)
         self.substeps, self.substep = dynamics.substeps, dynamics.substep
+        self._passes = Passes(admissible.network)
+        self._routes: dict[bytes, Routes] = {}
         self._linear: dict[int, _Linear] = {}
 
     def reach(self, initial: Floats, intervals: range) -> Reach:
-        """Bound the stocks from ``initial``, shape (nodes,), on, over the given intervals of the episode.
+        """Bound the stocks from ``initial``, shape (stores,), on, over the given intervals of the episode.
 
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds: the solver then departs from the laws.
         """
         network, scheduled = self.network, self.admissible.scheduled
-        nodes, steps = len(network.nodes), len(intervals)
+        nodes, stores, steps = len(network.nodes), len(network.stores), len(intervals)
         mass = float(initial.sum()) * (1 + ROUNDING)
         lower, upper = initial.copy(), initial.copy()
         highest = np.zeros((steps, nodes))
         uncut = np.ones((steps, len(network.arcs)), dtype=bool)
         for step, interval in enumerate(intervals):
             least, most = np.where(scheduled, self.admissible.rate(interval), 0.0)
-            incoming, outgoing = self._by_node(most)
             linear = self._of_kind(int(self.admissible.kinds[interval]))
+            entering, outgoing = self._by_node(most)
+            incoming = linear.routes.most(entering)
             for _ in range(self.substeps):
                 # without any outflow no stock ends a substep lower than it began, so this bounds it throughout
                 peak, missed = linear.growth(upper, incoming)
                 peak = np.minimum(peak + missed, mass) * (1 + ROUNDING)
-                highest[step] = np.maximum(highest[step], peak)
+                highest[step, :stores] = np.maximum(highest[step, :stores], peak)
                 # what may be asked in this piece, against what is left at the least: nothing is cut where it suffices
                 enough = (outgoing + linear.pull @ peak) * self.substep <= lower * linear.share * (1 - ROUNDING)
                 if (linear.pulled & ~enough).any():
@@ -81,26 +86,30 @@ class ComparisonSystem:
                         f"network '{network.name}': recipients may pull more from node '{node}' than it holds in "
                         f"interval {interval}; no bound is proved for what the solver then does"
                     )
-                delivered = enough[network.donors]
+                delivered = np.append(enough, True)[np.minimum(network.donors, stores)]
                 uncut[step] &= delivered
-                sure = least * delivered
-                gained, lost = self._by_node(sure)
-                constant = np.concatenate([gained - outgoing, incoming - lost])
+                gained, lost = self._by_node(least * delivered)
+                constant = np.concatenate([linear.routes.least(gained) - outgoing, incoming - lost])
                 bounds, missed = linear.solution(np.concatenate([lower, upper]), constant)
                 missed += mass * ROUND_OFF
-                lower = np.maximum(bounds[:nodes] - missed, 0.0)
-                upper = np.minimum(bounds[nodes:] + missed, mass)
+                lower = np.maximum(bounds[:stores] - missed, 0.0)
+                upper = np.minimum(bounds[stores:] + missed, mass)
+            highest[step, stores:] = linear.routes.through(entering[stores:] + linear.sent @ highest[step, :stores])
         return Reach(highest, uncut)
 
     def _by_node(self, flow: Floats) -> tuple[Floats, Floats]:
-        """Return the sums of flows into and out of each node, shape (nodes,)."""
+        """Return the sums of flows into each node, shape (nodes,), and out of each stock, shape (stores,)."""
         network, nodes = self.network, len(self.network.nodes)
-        gained = np.bincount(network.recipients, flow, nodes).astype(float)
-        return gained, np.bincount(network.donors, flow, nodes).astype(float)
+        gained, lost = (np.bincount(ends, flow, nodes).astype(float) for ends in (network.recipients, network.donors))
+        return gained, lost[: len(network.stores)]
 
     def _of_kind(self, kind: int) -> _Linear:
         if kind not in self._linear:
-            self._linear[kind] = _Linear(self.admissible, kind, self.substep)
+            passed_on = self.network.donors >= len(self.network.stores)
+            key = self.admissible.rate(kind)[:, passed_on].tobytes()
+            if key not in self._routes:
+                self._routes[key] = Routes(self.admissible, self._passes, kind)
+            self._linear[kind] = _Linear(self.admissible, kind, self._routes[key], self.substep)
         return self._linear[kind]
 
 
@@ -108,28 +117,52 @@ class _Linear:
     """What is proportional to stocks in a kind of interval.
 
     Attributes:
-        solution: of the lowest and the highest stocks after a substep, shape (2 nodes,).
-        growth: the same of the highest, had they no outflow, shape (nodes,).
-        pull: most that recipients pull from each node, per stock, sparse, 1/time.
-        pulled: nodes from which they do.
-        share: z/(e^z − 1) for the most that leaves a node in proportion to its stock in a substep, z.
+        routes: what passes through nodes that store nothing.
+        solution: of the lowest and the highest stocks after a substep, shape (2 stores,).
+        growth: the same of the highest, had they no outflow, shape (stores,).
+        sent: most that enters each node that stores nothing, per stock, sparse, 1/time.
+        pull: most that recipients pull from each stock, per stock, sparse, 1/time.
+        pulled: stocks from which they do.
+        share: z/(e^z − 1) for the most that leaves a stock in proportion to it in a substep, z.
     """
 
-    def __init__(self, admissible: Admissible, kind: int, substep: float) -> None:
-        network, driven = admissible.network, ~admissible.scheduled
-        nodes, low, high = len(network.nodes), *admissible.rate(kind)[:, driven]
+    def __init__(self, admissible: Admissible, kind: int, routes: Routes, substep: float) -> None:
+        network, self.routes = admissible.network, routes
+        stores, nodes = len(network.stores), len(network.nodes)
+        driven = ~admissible.scheduled & (network.donors < stores)
+        low, high = admissible.rate(kind)[:, driven]
         donor, recipient, p = network.donors[driven], network.recipients[driven], admissible.driver[driven]
-        pulled = donor != p
-        # rows and columns: x̲ of all nodes, then x̄. x̲ gains the least inflow and loses the greatest outflow, x̄ the
+        pulled, split = donor != p, admissible.shared[driven]
+        released, exits = admissible.released(kind)[:, :stores], admissible.exits(kind)[:, :stores]
+
+        def entering(rate: Floats, where: NDArray[np.bool_]) -> Any:
+            return sparse.csr_array((rate[where], (recipient[where], p[where])), shape=(nodes, stores))
+
+        # what a stock releases in shares arrives once, at once or past nodes that store nothing
+        past = ~split & (recipient >= stores)
+        least = sparse.coo_array(routes.least(entering(low, past | split)))
+        once = sparse.coo_array(routes.most(entering(high, split)))
+        once.data = np.minimum(once.data, released[1, once.col])
+        most = sparse.coo_array(routes.most(entering(high, past)) + once)
+        # rows and columns: x̲ of all stocks, then x̄. x̲ gains the least inflow and loses the greatest outflow, x̄ the
         # opposite; growth has no outflow at all
-        other = np.where(pulled, nodes, 0)  # what leaves at the least x̲ is driven by x̲ itself or by x̄ elsewhere
-        rows = np.stack([recipient, nodes + recipient, donor, nodes + donor], axis=1).ravel()
-        columns = np.stack([p, nodes + p, other + p, nodes - other + p], axis=1).ravel()
-        values = np.stack([low, high, -high, -low], axis=1).ravel()
-        self.solution = Held(sparse.coo_array((values, (rows, columns)), shape=(2 * nodes, 2 * nodes)), substep)
-        self.growth = Held(sparse.coo_array((high, (recipient, p)), shape=(nodes, nodes)), substep)
+        other = np.where(pulled, stores, 0)  # what leaves at the least x̲ is driven by x̲ itself or by x̄ elsewhere
+        straight = ~split & ~past
+        kept = np.stack([straight, straight, ~split, ~split], axis=1)
+        own = np.arange(stores)
+        rows = np.stack([recipient, stores + recipient, donor, stores + donor], axis=1)[kept]
+        columns = np.stack([p, stores + p, other + p, stores - other + p], axis=1)[kept]
+        values = np.stack([low, high, -high, -low], axis=1)[kept]
+        rows = np.concatenate([rows, least.row, stores + most.row, own, stores + own])
+        columns = np.concatenate([columns, least.col, stores + most.col, own, stores + own])
+        values = np.concatenate([values, least.data, most.data, -released[1], -released[0]])
+        self.solution = Held(sparse.coo_array((values, (rows, columns)), shape=(2 * stores, 2 * stores)), substep)
+        gains = (np.append(recipient[straight], most.row), np.append(p[straight], most.col))
+        values = np.append(high[straight], most.data)
+        self.growth = Held(sparse.coo_array((values, gains), shape=(stores, stores)), substep)
+        self.sent = entering(high, past | split)[stores:]
         taken = (high[pulled], (donor[pulled], p[pulled]))
-        self.pull = sparse.csr_array(sparse.coo_array(taken, shape=(nodes, nodes)))
-        self.pulled = np.bincount(donor[pulled], minlength=nodes) > 0
-        z = np.bincount(donor[~pulled], high[~pulled], nodes) * substep
-        self.share = np.divide(z, np.expm1(z), out=np.ones(nodes), where=z > ROUNDING)
+        self.pull = sparse.csr_array(sparse.coo_array(taken, shape=(stores, stores)))
+        self.pulled = np.bincount(donor[pulled], minlength=stores) > 0
+        z = exits[1] * substep
+        self.share = np.divide(z, np.expm1(z), out=np.ones(stores), where=z > ROUNDING)

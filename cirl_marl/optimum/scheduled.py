@@ -20,11 +20,9 @@ def deliveries(admissible: Admissible, layout: Layout, step: int, rows: Rows) ->
     the most. What flows in during the piece is not available to them.
     """
     network = admissible.network
-    exits = admissible.driver == network.donors
-    least = np.bincount(network.donors, admissible.rate(step)[0] * exits, len(network.nodes))
-    turned_over = least * layout.length
+    turned_over = admissible.exits(step)[0] * layout.length
     # U·δ ≤ x_start·z/(e^z − 1); the factor falls with z, so the least rate of the exits gives the weakest, valid row
-    share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(len(least)), where=turned_over > 1e-9)
+    share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(len(turned_over)), where=turned_over > 1e-9)
     arcs = np.flatnonzero(admissible.scheduled)
     nodes, place = np.unique(network.donors[arcs], return_inverse=True)
     piece = np.arange(layout.pieces)[:, None]
