@@ -8,7 +8,7 @@ the program against what an episode does.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,12 +41,16 @@ class Piece:
     end: Floats
     cut: bool
 
-    def means(self, degree: int) -> tuple[Floats, Floats]:
-        """Return the stocks and flows weighted with the Bernstein polynomials, (degree + 1, stores | arcs)."""
-        i = np.arange(degree + 1)[:, None]
-        binomial = np.array([[math.comb(degree, int(each))] for each in i[:, 0]])
-        density = (degree + 1) * binomial * POINTS**i * (1 - POINTS) ** (degree - i) * WEIGHTS
-        return density @ self.stock, density @ self.flow
+
+def means(pieces: Sequence[Piece], degree: int) -> tuple[Floats, Floats]:
+    """Return stocks and flows weighted with the Bernstein polynomials over pieces, (degree + 1, stores | arcs)."""
+    i = np.arange(degree + 1)[:, None]
+    binomial = np.array([[math.comb(degree, int(each))] for each in i[:, 0]])
+    points = np.concatenate([(POINTS + place) / len(pieces) for place in range(len(pieces))])
+    weights = np.tile(WEIGHTS, len(pieces)) / len(pieces)
+    density = (degree + 1) * binomial * points**i * (1 - points) ** (degree - i) * weights
+    stock, flow = (np.concatenate([getattr(each, name) for each in pieces]) for name in ("stock", "flow"))
+    return density @ stock, density @ flow
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from exact_episode import Controls, Interval, control_of, imbalance, intervals, mean_of, valve_of
+from exact_episode import Controls, Interval, control_of, imbalance, intervals, mean_of, means, valve_of
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -145,11 +145,13 @@ def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
     found: list[Floats] = []
     for each in happened:
         valve = np.array([valve_of(network, name, each.controls) for name in names])
-        for piece in each.pieces:
-            for stock, flow in zip(*piece.means(layout.degree), strict=True):
+        together = len(each.pieces) // layout.pieces
+        for first in range(0, len(each.pieces), together):
+            merged = each.pieces[first : first + together]
+            for stock, flow in zip(*means(merged, layout.degree), strict=True):
                 stock = np.append(stock, flow @ entering)  # what passes through nodes that store nothing
                 found += [stock, flow, (valve * stock)[layout.valves]]
-            found.append(piece.end)
+            found.append(merged[-1].end)
         found += [each.levels, np.array([imbalance(network, each.flow)]), valve[layout.openings]]
     return np.concatenate(found)
 
@@ -171,14 +173,14 @@ def assert_satisfies(problem: Program, v: Floats, mass: float) -> None:
         assert not wrong.any(), f"{of}: variable {place} is {v[column]}, out of its box"
 
 
-def assert_holds(played: Played, degree: int, weight: float | None = None) -> None:
+def assert_holds(played: Played, degree: int, weight: float | None = None, pieces: int = 12) -> None:
     """All rows hold for the episode and for its second half, and the objective is the simulator's.
 
     Raises:
         NoCertificate: if recipients may empty their donors from the start.
     """
     network, steps = played.network, played.network.episode.horizon
-    programs = Programs(Admissible.of(network, played.agents or None), degree, weight)
+    programs = Programs(Admissible.of(network, played.agents or None), degree, weight, pieces=pieces)
     layout, mass = programs.layout, float(played.start.sum())
     v = variables(layout, played.intervals)
     problem = programs.program(played.start, None if weight is not None else played.service * (1 - 1e-12))

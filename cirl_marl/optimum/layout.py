@@ -23,7 +23,8 @@ class Layout:
 
     Attributes:
         network: whose variables they are.
-        pieces: substeps of the simulator in an interval; scheduled flows are constant within each.
+        pieces: equal parts of an interval.
+        merged: whether pieces are longer than the substeps of the simulator, within which scheduled flows are constant.
         degree: d.
         valves: nodes that have a Z.
         openings: nodes of these with scheduled outflows, on which the valve acts as well; v is then a variable.
@@ -31,6 +32,7 @@ class Layout:
 
     network: Network
     pieces: int
+    merged: bool
     degree: int
     valves: Integers
     openings: Integers

@@ -134,9 +134,15 @@ class _Chains:
             self._orders(row, nodes, spread * (ratio * delays[:, i] - delays[:, i + 1]))
 
     def _orders(self, row: Integers, nodes: Integers, weight: Floats) -> None:
-        """Put a weight at every scheduled outflow of each row's node; rows are of shape (pieces, nodes)."""
+        """Put a weight at every scheduled outflow of each row's node; rows are of shape (pieces, nodes).
+
+        In merged pieces what is asked in the interval stands for it; a flow that may be cut is below it at times.
+        """
         counts = self.counts[nodes]
         which = np.repeat(np.arange(len(nodes)), counts)
         offset = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
         arcs = self.orders[self.starts[nodes[which]] + offset]
-        self.rows.put(row[:, which], self.layout.flow(self.first[:, None]) + arcs, weight[which])
+        moment = 0 * self.first if self.layout.merged else self.first
+        self.rows.put(row[:, which], self.layout.flow(moment[:, None]) + arcs, weight[which])
+        if self.layout.merged:
+            self.rows.loosen(row[:, which], arcs, np.maximum(-weight[which], 0.0))

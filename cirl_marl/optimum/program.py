@@ -19,8 +19,12 @@ from cirl_marl.optimum.monotone import falls
 from cirl_marl.optimum.objective import measures, objective
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.rows import Chained, Rows
-from cirl_marl.optimum.scheduled import deliveries, openings
+from cirl_marl.optimum.scheduled import deliveries, openings, orders
 from cirl_marl.optimum.shared import followers, passing
+
+
+PIECES = 12
+"""Most pieces of an interval; where the simulator has more substeps, they are merged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +76,13 @@ class Programs:
     """
 
     def __init__(
-        self, admissible: Admissible, degree: int, service_weight: float | None, *, held: bool = False
+        self,
+        admissible: Admissible,
+        degree: int,
+        service_weight: float | None,
+        *,
+        held: bool = False,
+        pieces: int = PIECES,
     ) -> None:
         """Write down what does not depend on the start.
 
@@ -82,14 +92,16 @@ class Programs:
             service_weight: w of λ̄/circularity_scale + w·service; None if λ̄ is maximised.
             held: whether controls are constant within an interval to first order; the program then makes better plans
                 and bounds nothing.
+            pieces: most parts of an interval.
         """
         self.admissible = admissible
         self._system = ComparisonSystem(admissible)
-        self.layout = layout = _layout(admissible, self._system.substeps, degree)
+        self.layout = layout = _layout(admissible, self._system.substeps, pieces, degree)
         self._equal, self._under = Chained(layout), Chained(layout)
         for kind in np.unique(admissible.kinds).tolist():
             linked_equal, equal, linked_under, under = (Rows(layout) for _ in range(4))
             _balances(layout, linked_equal)
+            orders(admissible, layout, equal, under)
             _laws(admissible, layout, kind, equal, under)
             passing(admissible, layout, kind, equal)
             if held:
@@ -116,8 +128,10 @@ class Programs:
         when = range(network.episode.horizon) if intervals is None else intervals
         steps, kinds = len(when), self.admissible.kinds[when.start : when.stop]
         reached = self._system.reach(initial, when)
-        equal, equal_to = self._equal.over(kinds, initial)
-        under, under_to = self._under.over(kinds, initial)
+        asked = self.admissible.factor[1] * self.admissible.base
+        cut = np.where(self.admissible.scheduled & ~reached.uncut, asked[when.start : when.stop], 0.0)
+        equal, equal_to = self._equal.over(kinds, initial, cut)
+        under, under_to = self._under.over(kinds, initial, cut)
         opened, opened_to = openings(self.admissible, reached, layout, when)
         blocks, limits = [under, opened], [under_to, opened_to]
         if min_service is not None and network.services:
@@ -139,7 +153,7 @@ class Programs:
         )
 
 
-def _layout(admissible: Admissible, pieces: int, degree: int) -> Layout:
+def _layout(admissible: Admissible, substeps: int, most: int, degree: int) -> Layout:
     network = admissible.network
     nodes = len(network.nodes)
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
@@ -147,7 +161,7 @@ def _layout(admissible: Admissible, pieces: int, degree: int) -> Layout:
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
-    return Layout(network, pieces, degree, valves, openings)
+    return Layout(network, min(substeps, most), substeps > most, degree, valves, openings)
 
 
 def _balances(layout: Layout, rows: Rows) -> None:
@@ -179,12 +193,6 @@ def _balances(layout: Layout, rows: Rows) -> None:
 def _laws(admissible: Admissible, layout: Layout, step: int, equal: Rows, under: Rows) -> None:
     """Add the flow laws of an interval: rows that are 0 and rows at most 0; keys (0, moment, what, which, side)."""
     network, moment = admissible.network, layout.moment_column
-    orders = np.flatnonzero(admissible.scheduled)
-    first = moment - moment % (layout.degree + 1)
-    later = (moment > first).ravel()  # a scheduled flow is constant in its piece: F_i = F_0
-    row = equal.add(0, moment[later], 0, orders)
-    equal.put(row, layout.flow(moment[later]) + orders, 1.0)
-    equal.put(row, layout.flow(first[later]) + orders, -1.0)
 
     def hold(what: int, which: Integers, column: Integers, driver: Integers, factor: Floats) -> None:
         """Hold low·driver ≤ column ≤ high·driver, with columns of shape (moments, which)."""

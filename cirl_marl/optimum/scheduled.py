@@ -17,8 +17,10 @@ def deliveries(admissible: Admissible, layout: Layout, step: int, rows: Rows) ->
     """Add U·δ − x_start·z/(e^z − 1), at most 0, for the scheduled outflow U of each node; keys (0, piece, node).
 
     This is how the simulator cuts scheduled flows, with z = a·δ for the proportional exits of rate a; the least a gives
-    the most. What flows in during the piece is not available to them.
+    the most. What flows in during the piece is not available to them. Of merged pieces nothing is said.
     """
+    if layout.merged:
+        return
     network = admissible.network
     turned_over = admissible.exits(step)[0] * layout.length
     # U·δ ≤ x_start·z/(e^z − 1); the factor falls with z, so the least rate of the exits gives the weakest, valid row
@@ -29,6 +31,22 @@ def deliveries(admissible: Admissible, layout: Layout, step: int, rows: Rows) ->
     row = rows.add(0, piece, nodes)
     rows.put(row[:, place], layout.flow(piece * (layout.degree + 1)) + arcs, 1.0)
     rows.at_start(row, piece, nodes, -share[nodes] / layout.length)
+
+
+def orders(admissible: Admissible, layout: Layout, equal: Rows, under: Rows) -> None:
+    """Add that a scheduled flow is constant in its piece, F_i = F_0; keys (0, moment, 0, arc, side).
+
+    If pieces are merged, a flow that nothing can cut is constant in the interval.
+    """
+    moment, arcs = layout.moment_column, np.flatnonzero(admissible.scheduled)
+    first = 0 * moment if layout.merged else moment - moment % (layout.degree + 1)
+    later = (moment > first).ravel()
+    for rows, side, sign in ((under, 0, 1.0), (under, 1, -1.0)) if layout.merged else ((equal, 0, 1.0),):
+        row = rows.add(0, moment[later], 0, arcs, side)
+        rows.put(row, layout.flow(moment[later]) + arcs, sign)
+        rows.put(row, layout.flow(first[later]) + arcs, -sign)
+        if layout.merged:
+            rows.loosen(row, arcs, 1.0)
 
 
 def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: range) -> tuple[Any, Floats]:
