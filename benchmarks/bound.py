@@ -29,7 +29,7 @@ from cirl_marl.optimum.mpc import MPC
 DOCUMENT = Path(__file__).parent.parent / "docs" / "bound.md"
 NETWORKS = ("copper_net", "carbo_net")
 SERVICE = 0.99
-"""Mean service level demanded, but in the section on its price."""
+"""Mean level demanded of every service, but in the section on its price."""
 PRICED = 0.985
 STEP = 0.005
 """Demanded levels differ by this for the difference quotient of the price."""
@@ -169,12 +169,13 @@ def _plan(name: str, degree: int) -> Rows:
 def _price(name: str) -> Rows:
     """Hold what the bound pays for service against what the ``team`` reward charges for its shortfall.
 
-    Per unit of the mean service level, in λ̄: S services of weight g cost (1 − w)·g·S·(1 − level) beside w·λ/c.
+    Per unit of the level of every service, in λ̄: S services of weight g cost (1 − w)·g·S·(1 − level) beside w·λ/c.
     """
     found = bound(name, min_service=PRICED, degree=1)
     below, above = (bound(name, min_service=PRICED + step, degree=1, near=found).objective for step in (-STEP, STEP))
-    multiplier, quotient = -float(found.certificate.under[-1]), (below - above) / (2 * STEP)
     network = found.network
+    multiplier = -float(found.certificate.under[-len(network.services) :].sum())
+    quotient = (below - above) / (2 * STEP)
     weights = {service.weight for service in network.services}
     if len(weights) != 1:
         raise CirlError(f"network '{name}': services of different weights {sorted(weights)} have no common price")
@@ -244,9 +245,9 @@ def _mpc(name: str, horizon: int | None) -> Rows:
     else:
         run, label = rollout(env, MPC(horizon=horizon, min_service=SERVICE)), f"MPC, horizon={horizon}"
     seconds = time.process_time() - began
-    proved = envelope(name, starts, min_service=SERVICE).at(starts, np.minimum(1.0, run.episode_service))
+    proved = envelope(name, starts, min_service=SERVICE).at(starts, np.minimum(1.0, run.episode_levels))
     gaps = gap(proved, run.episode_circularity)
-    service = run.episode_service
+    service = run.least_service
     shown = f"{_percent(gaps.min())} to {_percent(gaps.max())}"
     yield _row((name, label, f"{service.min():.4f}", f"{service.max():.4f}", shown, f"{seconds:.0f}"))
 

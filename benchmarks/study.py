@@ -280,9 +280,9 @@ def _lqr_table(episodes: int) -> Iterator[str]:
             "mpc": MPC(service_weight=SERVICE_FIRST),
         }
         runs = {label: rollout(env, each, seed=first_seed(0)) for label, each in acting.items()}
-        measure = yardstick(env.network, env.agents, starts, [run.episode_service for run in runs.values()])
+        measure = yardstick(env.network, env.agents, starts, [run.episode_levels for run in runs.values()])
         for label, run in runs.items():
-            proved = measure.at(starts, run.episode_service)
+            proved = measure.at(starts, run.episode_levels)
             assert proved is not None
             left = over_episodes(gap(proved, run.episode_circularity))
             cells = [_figure(over_episodes(each), "{:.4g}") for each in (run.episode_circularity, run.episode_service)]

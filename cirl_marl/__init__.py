@@ -28,6 +28,7 @@ from cirl_marl.network.elements import (
     Role,
     Service,
 )
+from cirl_marl.network.series import Series
 
 __version__ = "0.1.0"
 
@@ -50,6 +51,7 @@ __all__ = [
     "RecipeError",
     "Role",
     "RunError",
+    "Series",
     "Service",
     "SingleAgentEnv",
     "Snapshot",

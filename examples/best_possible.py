@@ -20,8 +20,8 @@ env = vector_env("copper_net", num_envs=2, horizon=horizon)
 env.reset(seed=0)
 starts = env.physical.stock[env.rows.nodes].T
 run = rollout(env, MPC(min_service=service, replan=8), seed=0)
-proved = envelope("copper_net", starts, solves=2, min_service=run.episode_service, horizon=horizon)
-gaps = gap(proved.at(starts, run.episode_service), run.episode_circularity)
+proved = envelope("copper_net", starts, solves=2, min_service=run.episode_levels, horizon=horizon)
+gaps = gap(proved.at(starts, run.episode_levels), run.episode_circularity)
 
 summary = (
     f"no actions reach more than λ̄ = {proof.bound:.2f} kt with a service level of {service}; the plan reaches "

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Series, Service
 from cirl_marl.definitions.reading import Definition
 from cirl_marl.dynamics.motion import Dynamics
 
@@ -32,13 +32,14 @@ settings.register_profile(
     derandomize="CI" in os.environ,
     suppress_health_check=[HealthCheck.too_slow],
 )
+
 settings.register_profile("all", settings.get_profile("cirl_marl"), max_examples=75)
 settings.register_profile("thorough", settings.get_profile("cirl_marl"), max_examples=1000, derandomize=False)
 settings.load_profile("cirl_marl")
 
 GUIDE = Path(__file__).parent.parent / "envs" / "README.md"
 ROLES = list(Role)
-LAWS = [law for law in Law if law is not Law.COMPARTMENT]
+LAWS = [law for law in Law if law not in (Law.COMPARTMENT, Law.SHARE)]
 SEED = "CIRL_TEST_SEED"
 
 
@@ -128,23 +129,38 @@ def own_copper_run(copper_run: Path, tmp_path: Path) -> Path:
 
 
 def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = False) -> Network:
-    """Return a network with every law, role and kind of control, drawn from ``seed``."""
+    """Return a network with every law, role and kind of control, drawn from ``seed``; half have shares and series."""
     rng = np.random.default_rng(seed)
     ends = [rng.choice(nodes, 2, replace=False) for _ in range(arcs if nodes > 1 else 0)]
-    laws = [LAWS[rng.integers(len(LAWS))] for _ in ends]
-    interval = float(rng.uniform(0.05, 3))
+    laws: list[Law] = [LAWS[rng.integers(len(LAWS))] for _ in ends]
+    interval, horizon = float(rng.uniform(0.05, 3)), int(rng.integers(1, 5))
+    real = bool(rng.integers(2))
+    passing = {i for i in range(1, nodes) if real and rng.random() < 0.4}
+    dividing = passing | {i for i in range(nodes) if real and nodes > len(passing) + 1 and rng.random() < 0.2}
+    for k, (i, j) in enumerate(ends):
+        if laws[k] in (Law.BATCH, Law.RECIPIENT) and {int(i), int(j)} & passing:
+            laws[k] = Law.DONOR
+        if int(i) in passing or (int(i) in dividing and laws[k] is Law.DONOR):
+            laws[k] = Law.SHARE
     orders = np.bincount([i for (i, _), law in zip(ends, laws, strict=True) if law is Law.CONTROLLED], minlength=nodes)
-    sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) for i in range(nodes)]
+    sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) and i not in passing for i in range(nodes)]
     batched = {f"node_{i}" for (i, _), law in zip(ends, laws, strict=True) if law is Law.BATCH}
+    values = _Values(rng, interval * horizon, real)
+    drawn = [
+        _arc(values, k, int(i), int(j), law, sets_flow[int(i)], int(i) not in passing, interval)
+        for k, ((i, j), law) in enumerate(zip(ends, laws, strict=True))
+    ]
+    sinks = [i for i in range(nodes) if i not in passing]
+    # the rest of every split goes to a stock, so that no loop keeps what it gets
+    for i in sorted(dividing):
+        to = int(rng.choice([j for j in sinks if j != i]))
+        drawn.append(Arc(id=f"rest_{i}", donor=f"node_{i}", recipient=f"node_{to}", law=Law.SHARE))
     network = Network(
         name="random",
-        nodes=tuple(_node(rng, i, sets_flow[i]) for i in range(nodes)),
-        arcs=tuple(
-            _arc(rng, k, int(i), int(j), law, sets_flow[int(i)], interval)
-            for k, ((i, j), law) in enumerate(zip(ends, laws, strict=True))
-        ),
-        services=tuple(_services(rng, nodes, len(ends), batched)),
-        episode=Episode(control_interval=interval, horizon=int(rng.integers(1, 5))),
+        nodes=tuple(_node(values, i, sets_flow[i], i not in passing, i in dividing) for i in range(nodes)),
+        arcs=tuple(drawn),
+        services=tuple(_services(values, nodes, len(ends), batched, passing)),
+        episode=Episode(control_interval=interval, horizon=horizon),
         objective=Objective(
             reference_interval=float(rng.uniform(0.1, 3)),
             net_zero=str(rng.choice(["signed", "abs"])),
@@ -158,29 +174,60 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
     return network.with_options(episode={"solver": "rk4", "solver_step": step})
 
 
-def _control(rng: np.random.Generator, kind: ControlKind) -> Control:
-    most = 1.5 if kind is ControlKind.RATE else 10 ** rng.uniform(-1, 3)
-    low, neutral, high = np.sort(rng.random(3)) * most
-    low *= rng.integers(2)
-    neutral = rng.choice([low, neutral, high])
-    return Control(kind=kind, low=float(low), neutral=float(neutral), high=float(high))
+class _Values:
+    """Draws numbers, of which some change in time."""
+
+    def __init__(self, rng: np.random.Generator, length: float, changing: bool) -> None:
+        self.rng, self._length, self._changing = rng, length, changing
+
+    def __call__(self, value: float, most: float = 2.0) -> float | Series:
+        """Return a value, or a series from it to at most ``most`` times as much."""
+        if not self._changing or self.rng.random() < 0.6:
+            return value
+        inside = np.sort(self.rng.uniform(0, self._length, self.rng.integers(0, 4)))
+        times = [-float(self.rng.integers(2)), *(inside + 1e-3), self._length + 1.0]
+        values = value * self.rng.uniform(1.0, most, len(times))
+        kind = str(self.rng.choice(["step", "linear"]))
+        return Series(times=tuple(times), values=tuple(values.tolist()), interpolation=kind)
+
+    def control(self, kind: ControlKind) -> Control:
+        """Draw an actuator."""
+        rng = self.rng
+        most = 1.5 if kind is ControlKind.RATE else 10 ** rng.uniform(-1, 3)
+        low, neutral, high = np.sort(rng.random(3)) * most
+        low *= rng.integers(2)
+        neutral = rng.choice([low, neutral, high])
+        return Control(kind=kind, low=float(low), neutral=float(neutral), high=self(float(high)))
+
+    def share(self, most: float) -> Control:
+        """Draw what sets a share; of 20 of them the lower bounds and neutral values sum to less than 1."""
+        low, neutral = np.sort(self.rng.uniform(0.0, 0.045, 2))
+        high = self.rng.uniform(neutral, max(most, neutral + 0.001))
+        return Control(kind=ControlKind.SHARE, low=float(low), neutral=float(neutral), high=float(high))
 
 
-def _node(rng: np.random.Generator, i: int, sets_flow: bool) -> Node:
+def _node(values: _Values, i: int, sets_flow: bool, stores: bool, divides: bool) -> Node:
+    rng = values.rng
     low = float(rng.integers(2) * rng.uniform(0, 300))
     acts = sets_flow or i == 0 or rng.random() < 0.3
+    initial = (low, low + float(rng.integers(2) * rng.uniform(0, 300)))
+    control = values.control(ControlKind.FLOW if sets_flow else ControlKind.RATE) if acts and stores else None
     return Node(
         id=f"node_{i}",
-        role=ROLES[rng.integers(len(ROLES))],
-        initial=(low, low + float(rng.integers(2) * rng.uniform(0, 300))),
+        role=ROLES[rng.integers(len(ROLES))] if stores else Role.TECHNOSPHERE,
+        stores=stores,
+        initial=initial if stores else None,
+        rate=values(float(10 ** rng.uniform(-2, 0.7))) if stores and divides else 0.0,
         set_point=float(rng.uniform(0, 300)) if rng.random() < 0.5 else None,
         scale=float(rng.uniform(1, 300)),
-        control=_control(rng, ControlKind.FLOW if sets_flow else ControlKind.RATE) if acts else None,
+        control=control,
     )
 
 
-def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_flow: bool, interval: float) -> Arc:
-    control = None
+def _arc(
+    values: _Values, k: int, i: int, j: int, law: Law, donor_sets_flow: bool, stored: bool, interval: float
+) -> Arc:
+    rng, control, share = values.rng, None, None
     if law is Law.BATCH:
         times, masses = rng.integers(0, 5, 3) * interval, rng.uniform(0, 200, 3)
         return Arc(
@@ -194,22 +241,24 @@ def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_
             pollutant=bool(rng.integers(2)),
         )
     if law is Law.CONTROLLED and not donor_sets_flow:
-        control = _control(rng, ControlKind.FLOW)
+        control = values.control(ControlKind.FLOW)
+    elif law is Law.SHARE and rng.random() < 0.5:
+        control = values.share(0.9 if stored else 0.045)
+    elif law is Law.SHARE:
+        share = values(float(rng.uniform(0, 0.02)))
     elif law is not Law.CONTROLLED and rng.random() < 0.4:
-        control = _control(rng, ControlKind.RATE)
-    flow, starts = [0.0], []
+        control = values.control(ControlKind.RATE)
+    flow: float | Series = 0.0
     if law is Law.EXOGENOUS:
-        steps = int(rng.integers(1, 5))
-        flow = (rng.integers(0, 2, steps) * rng.uniform(0, 200, steps)).tolist()
-        starts = [0.0, *np.cumsum(rng.uniform(0.01, 2, steps - 1)).tolist()] if rng.integers(2) or steps > 1 else []
+        flow = values(float(rng.integers(0, 2) * rng.uniform(0, 200)), 5.0)
     return Arc(
         id=f"arc_{k}",
         donor=f"node_{i}",
         recipient=f"node_{j}",
         law=law,
-        rate=float(10 ** rng.uniform(-2, 0.7)) * (law in (Law.DONOR, Law.RECIPIENT)),
-        flow=tuple(flow),
-        times=tuple(starts),
+        rate=values(float(10 ** rng.uniform(-2, 0.7))) if law in (Law.DONOR, Law.RECIPIENT) else 0.0,
+        share=share,
+        flow=flow,
         set_point=float(rng.uniform(0, 100)) if rng.random() < 0.3 else None,
         scale=float(rng.uniform(1, 100)),
         pollutant=bool(rng.integers(2)),
@@ -217,14 +266,16 @@ def _arc(rng: np.random.Generator, k: int, i: int, j: int, law: Law, donor_sets_
     )
 
 
-def _services(rng: np.random.Generator, nodes: int, arcs: int, batched: set[str]) -> list[Service]:
-    """Draw services; of a node in ``batched`` the stock, as batches are no outflow."""
-    services = []
+def _services(values: _Values, nodes: int, arcs: int, batched: set[str], passing: set[int]) -> list[Service]:
+    """Draw services: no outflow of a node in ``batched``, as batches are none, and no stock of one in ``passing``."""
+    rng, services = values.rng, []
     for s in range(rng.integers(0, 3)):
         quantity = str(rng.choice(["stock", "outflow", "flow"] if arcs else ["stock", "outflow"]))
         provider = f"arc_{rng.integers(arcs)}" if quantity == "flow" else f"node_{rng.integers(nodes)}"
         if quantity == "outflow" and provider in batched:
             quantity = "stock"
+        if quantity == "stock" and int(provider.removeprefix("node_")) in passing:
+            quantity = "outflow"
         low = float(rng.uniform(0.1, 200))
         high = low * float(rng.uniform(1, 3)) if rng.integers(2) else np.inf
         services.append(
@@ -232,7 +283,7 @@ def _services(rng: np.random.Generator, nodes: int, arcs: int, batched: set[str]
                 id=f"service_{s}",
                 provider=provider,
                 quantity=quantity,
-                low=low,
+                low=values(low, 1.0 if np.isfinite(high) else 2.0),
                 high=high,
                 weight=float(rng.random()),
             )

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from cirl_marl import Arc, Episode, Network, Node
 from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.network.series import Value
 
 Floats = NDArray[np.float64]
 
@@ -38,18 +39,25 @@ NO_STATES = np.empty((0, 1))
 
 def neutral_rate(dynamics: Dynamics, step: int = 0) -> Floats:
     """Return the rates under neutral control."""
-    return dynamics.rate(dynamics.neutral[:, None], np.array([step]))
+    return dynamics.rate(dynamics.neutral[:, [step]], np.array([step]))
 
 
 def start(network: Network) -> Floats:
     """Return the upper initial stocks with the unit row, one column."""
-    return np.array([*(node.initial[1] for node in network.nodes), 1.0])[:, None]
+    return np.append(network.initial[1], 1.0)[:, None]
+
+
+def constant(value: Value | None) -> float:
+    """Return a number of a network that does not change in time."""
+    assert isinstance(value, float)
+    return value
 
 
 def advanced(network: Network, steps: int = 1) -> Floats:
-    """Return the stocks after ``steps`` intervals of neutral control, shape (nodes,)."""
-    dynamics = Dynamics(network)
-    stock = start(network)
+    """Return the stocks after ``steps`` intervals of neutral control, shape (stores,)."""
+    if steps > network.episode.horizon:
+        network = network.with_options(episode={"horizon": steps})
+    dynamics, stock = Dynamics(network), start(network)
     for step in range(steps):
-        stock = dynamics.advance(stock, NO_STATES, dynamics.neutral[:, None], np.array([step])).stock
+        stock = dynamics.advance(stock, NO_STATES, dynamics.neutral[:, [step]], np.array([step])).stock
     return stock[:-1, 0]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from networkx import NetworkXError
+from small_networks import constant
 
 from cirl_marl import (
     Arc,
@@ -154,7 +155,7 @@ def test_snapshot_of_another_definition() -> None:
     network = load_network("copper_net")
     env = VectorEnv(network, num_envs=1)
     env.reset(0)
-    faster = tuple(replace(arc, rate=2 * arc.rate) for arc in network.arcs)
+    faster = tuple(replace(arc, rate=2 * constant(arc.rate)) for arc in network.arcs)
     with pytest.raises(ControlError, match="another definition of network 'copper_net'"):
         VectorEnv(replace(network, arcs=faster), num_envs=1).restore(env.snapshot())
 
@@ -181,9 +182,9 @@ def test_a_whole_state_of_a_simulator_is_a_start() -> None:
     names = [name for name in env.state_names if name.startswith("sorter.")]
     env.reset(seed=3)
     begun = dict(zip(env.state_names, env.state()[0], strict=False))
-    after = env.step({agent: action[None] for agent, action in env.neutral_action.items()})[0]["sorter"]
+    after = env.step(env.neutral_action)[0]["sorter"]
     env.reset(seed=4, options={"initial_state": {name: begun[name] for name in names}})
-    again = env.step({agent: action[None] for agent, action in env.neutral_action.items()})[0]["sorter"]
+    again = env.step(env.neutral_action)[0]["sorter"]
     np.testing.assert_array_equal(after, again)
 
 

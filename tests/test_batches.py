@@ -72,7 +72,7 @@ def network(nth: int = 3, work: int = 20, starts: tuple[float, ...] = (0.0, 10.0
         name="belt_net",
         nodes=(
             Node(id="reservoir", role=Role.NONRENEWABLE_RESERVOIR, initial=(800.0, 800.0)),
-            Node(id="sorter", model=Belt(nth=nth, work=work)),
+            Node(id="sorter", initial=(0.0, 0.0), model=Belt(nth=nth, work=work)),
             Node(id="incinerator", role=Role.INCINERATOR),
         ),
         arcs=(

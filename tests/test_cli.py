@@ -12,17 +12,22 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import highspy
 import numpy as np
 import pytest
 
 import cirl_marl
-from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, cli, learners
+from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, VectorEnv, cli, learners
+from cirl_marl.controllers.rollout import beginning, first_seed
 from cirl_marl.definitions.catalogue import folder, networks
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.learners import RunDirectory, train
 from cirl_marl.optimum import search_each
+from cirl_marl.report import run as pictures
+from cirl_marl.report import trajectory
+from cirl_marl.report.curves import save_trajectory
 
 
 @pytest.fixture(autouse=True)
@@ -52,6 +57,7 @@ def test_networks_and_show(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     """The catalogue is listed; a network's tables, λ and picture appear."""
     assert run(monkeypatch, "networks") == 0
     listed = capsys.readouterr().out
+    assert cirl_marl.load_network("copper_net").title.endswith("collection draws on copper in use, not on discards")
     assert all(word in listed for word in ("copper_net", "carbo_net", "independent_ppo"))
     assert run(monkeypatch, "show", "copper_net") == 0
     shown = capsys.readouterr().out
@@ -253,6 +259,59 @@ series = { times = [0, 1], time_unit = "year", values = [5, 6], unit = "t/day", 
         assert "holds too little" not in capsys.readouterr().out
 
 
+def test_check_remarks_on_sources(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Material from the technosphere costs λ nothing; a source may be too small for today or for the highest order."""
+    free = "node 'world': nothing enters it, and what it delivers counts nothing in λ; if it stands for mining"
+    little = "control 'world' holds too little for its flow from {} day on"
+    for stock, role, said in (
+        ("30", "technosphere", [free, "under neutral " + little.format(3)]),
+        ("100", "technosphere", [free, "under the highest " + little.format(5)]),
+        ("140", "technosphere", [free]),
+        ("140", "nonrenewable_reservoir", []),
+        ("0", "technosphere", ["under neutral " + little.format(0)]),
+    ):
+        source = SOURCE.replace("30", stock).replace("technosphere", role)
+        Path("bottles.toml").write_text(guide() + source)
+        assert run(monkeypatch, "check", "bottles.toml") == 0
+        printed = capsys.readouterr().out
+        assert printed.count("remark on scenario 'default'") == len(said)
+        assert all(each in printed for each in said)
+
+
+LOSS = """
+[arcs.loss]
+from = "households"
+to = "landfill"
+law = "donor"
+rate = { value = 0.02, unit = "1/day", source = "what nobody collects" }
+"""
+
+
+def test_check_remarks_on_valves_that_are_no_shares(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A valve on one of two outflows; none where it is the only outflow, on the node, or on both."""
+    valve = 'control = { kind = "rate", low = 1, neutral = 1, high = 1.33, unit = "1", source = "more collection" }'
+    rate = 'rate = { value = 0.05, unit = "1/day", source = "a bottle lives 20 days" }'
+    old = next(line for line in guide().splitlines() if line.startswith("control") and "deposit scheme" in line)
+    text = guide({old: valve})
+    highest = "arc 'disposal': at its highest its valve lets through 77% of what leaves 'households' in proportion to "
+    on_node = guide({old: "", "set_point = { value = 100": f"{valve}\nset_point = {{ value = 100"})
+    for definition, said in (
+        (text + LOSS, highest + 'its stock, not 95%: 1.33 × 71%; law = "share" with control.kind = "share" sets a'),
+        (guide() + LOSS, "at its lowest its valve lets through 33% of what leaves 'households'"),
+        (text, ""),
+        (on_node + LOSS, ""),
+        (text + LOSS + valve, ""),
+    ):
+        assert rate in definition
+        Path("bottles.toml").write_text(definition)
+        assert run(monkeypatch, "check", "bottles.toml") == 0
+        printed = capsys.readouterr().out
+        assert said in printed
+        assert ("its valve lets through" in printed) == bool(said)
+
+
 def test_check_names_the_scenario_that_cannot_run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -285,7 +344,11 @@ def idle_network() -> Network:
     valve = Control(kind=ControlKind.RATE, low=0.0, neutral=0.5, high=1.0)
     return Network(
         name="idle",
-        nodes=(Node(id="depot", initial=(5.0, 5.0), control=valve), Node(id="shop"), Node(id="attic")),
+        nodes=(
+            Node(id="depot", initial=(5.0, 5.0), control=valve),
+            Node(id="shop", initial=(0.0, 0.0)),
+            Node(id="attic"),
+        ),
         arcs=(
             Arc(id="send", donor="depot", recipient="shop", law=Law.BATCH, delay=1.0, batches=((0.0, 1.0),)),
             Arc(id="burn", donor="shop", recipient="depot", rate=0.1, pollutant=False),
@@ -350,7 +413,14 @@ def test_short_trainings_say_that_there_are_no_curves(
 @pytest.mark.medium
 @pytest.mark.parametrize("control", ["neutral", "random", "constant"])
 def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every interval is a row with λ, service, stocks and flows."""
+    """Every interval is a row with λ, service, stocks and flows; the mean of λ is that of the mean flows beside it."""
+    drawn: list[np.ndarray] = []
+
+    def recorded(*arguments: Any, **options: Any) -> Path:
+        drawn.append(arguments[5])
+        return save_trajectory(*arguments, **options)
+
+    monkeypatch.setattr(trajectory, "save_trajectory", recorded)
     extra = ["--set", "mine=-0.5"] if control == "constant" else []
     assert run(monkeypatch, "simulate", "copper_net", "--control", control, "--steps", "7", "--out", "out", *extra) == 0
     with Path(f"out/copper_net_{control}.csv").open(newline="") as file:
@@ -360,10 +430,12 @@ def test_simulate_writes_csv_and_picture(control: str, monkeypatch: pytest.Monke
     stocks = [name for name in rows[0] if name.startswith("stock of")]
     masses = [sum(float(row[name]) for name in stocks) for row in rows]
     np.testing.assert_allclose(masses, masses[0], rtol=1e-12)
-    assert {"circularity (kt)", "service level", "stock of use (kt)", "flow of mine_to_refinery (kt/day)"} <= set(
-        rows[0]
-    )
+    assert {"circularity at the end (kt)", "service level", "stock of use (kt)"} <= set(rows[0])
+    mean = [float(row["mean circularity (kt)"]) for row in rows[1:]]
+    counted = [f"flow of {arc} (kt/day)" for arc in ("mine_to_refinery", "use_to_landfill")]
+    np.testing.assert_allclose(mean, [-sum(float(row[name]) for name in counted) for row in rows[1:]], rtol=1e-12)
     assert Path(f"out/copper_net_{control}.png").is_file()
+    np.testing.assert_allclose(drawn[0], mean, rtol=1e-12, err_msg="λ in the picture is that of the flows above it")
 
 
 @pytest.mark.medium
@@ -461,7 +533,7 @@ def test_infeasible_plan(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     bottles(**{"low = { value = 95": "low = { value = 500"})
     asked = ("plan", "bottles.toml", "--control", "optimum", "--min-service", "0.9", "--out", "p.csv")
     assert run(monkeypatch, *asked) == 2
-    assert "no actions reach a mean service level of 0.9; at most 0." in capsys.readouterr().err
+    assert "no actions reach a mean service level of 0.9 of 'bottles_in_use' (at most 0." in capsys.readouterr().err
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
 
 
@@ -569,9 +641,108 @@ def test_scenarios_write_files_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp
     for command in ("simulate", "plan"):
         for scenario in ((), ("--scenario", "paper")):
             assert run(monkeypatch, command, "carbo_net", "--control", "neutral", *scenario) == 0
-    names = {path.name for path in tmp_path.glob("*.csv")}
+    for scenario in ((), ("--scenario", "paper")):
+        assert run(monkeypatch, "show", "carbo_net", *scenario) == 0
+    names = {path.name for path in tmp_path.iterdir()}
     stems = ("carbo_net_neutral", "carbo_net_paper_neutral")
-    assert names == {*(f"{stem}.csv" for stem in stems), *(f"plan_{stem}.csv" for stem in stems)}
+    tables = {*(f"{stem}.csv" for stem in stems), *(f"plan_{stem}.csv" for stem in stems)}
+    assert names == tables | {f"{stem}.png" for stem in (*stems, "carbo_net", "carbo_net_paper")}
+
+
+@pytest.mark.medium
+def test_sweeps_of_scenarios_have_folders_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sweep of a scenario leaves that of the default one where it is."""
+    bottles()
+    for scenario in ((), ("--scenario", "crisis")):
+        assert run(monkeypatch, "pareto", "bottles.toml", "--points", "2", "--episodes", "2", *scenario) == 0
+    assert {path.name for path in Path("runs").iterdir()} == {"pareto-bottles", "pareto-bottles_crisis"}
+
+
+@pytest.mark.parametrize("network", ["bottles.toml", "net_zero"])
+def test_show_simulate_and_plan_start_alike(
+    network: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the middle of all ranges, or with a seed at the first start of its evaluation; each says which."""
+    bottles()
+    found = cirl_marl.load_network(network)
+    for seed, said in (
+        ((), "start: the middle of all initial ranges"),
+        (("--seed", "2"), "start: the first episode of evaluation 2"),
+    ):
+        env = VectorEnv(found, num_envs=1)
+        beginning(env, 2 if seed else None).reset(env)
+        started = env.state()[0, : len(found.nodes)]
+        if seed:
+            env.reset(seed=first_seed(2))
+            np.testing.assert_array_equal(env.state()[0, : len(found.nodes)], started)
+        else:
+            np.testing.assert_allclose(started, found.initial.mean(axis=0))
+        figures = []
+        for command in (("show",), ("simulate",), ("plan", "--control", "neutral", "--out", "plan.csv")):
+            name, *options = command
+            assert run(monkeypatch, name, network, *options, *seed) == 0
+            printed = capsys.readouterr().out
+            assert said in printed.splitlines()
+            figures += re.findall(r"λ̄ = (\S+)", printed)
+        assert len(figures) == 2 and figures[0] == figures[1]
+        with Path(f"{found.name}_neutral.csv").open(newline="") as file:
+            first = next(csv.DictReader(file))
+        stocks = [float(value) for name, value in first.items() if name.startswith("stock of")]
+        np.testing.assert_allclose(stocks, started, rtol=1e-12)
+
+
+SOURCE = """
+[nodes.world]
+role = "technosphere"
+initial = { low = 30, high = 30, unit = "t", source = "too little" }
+[arcs.imports]
+from = "world"
+to = "households"
+law = "controlled"
+control = { kind = "flow", low = 0, neutral = 10, high = 20, unit = "t/day", source = "trade" }
+"""
+
+
+def test_flows_that_are_cut_are_said(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A source that is too small shows in the output of every run, though the service is all there."""
+    Path("bottles.toml").write_text(guide() + SOURCE)
+    for command in ("simulate", "plan"):
+        assert run(monkeypatch, command, "bottles.toml", "--control", "neutral") == 0
+        printed = capsys.readouterr().out
+        assert "service level 1.0000" in printed
+        said = "arc 'imports' moved 40 t (57.1%) less than asked for, first at 3 day: 'world' held too little"
+        assert said in printed.splitlines()
+    Path("bottles.toml").write_text(guide() + SOURCE.replace("30", "1e6"))
+    assert run(monkeypatch, "simulate", "bottles.toml") == 0
+    assert "less than asked for" not in capsys.readouterr().out
+    options = ("--recipe", "independent_a2c", "--steps", "320", "--envs", "8", "--episodes", "2", "--out", "run")
+    Path("bottles.toml").write_text(guide() + SOURCE)
+    assert run(monkeypatch, "train", "bottles.toml", *options) == 0
+    assert f"neutral: {said}" in capsys.readouterr().out.splitlines()
+    assert run(monkeypatch, "evaluate", "run", "--episodes", "2") == 0
+    assert f"neutral: {said}" in capsys.readouterr().out.splitlines()
+
+
+def test_pictures_of_a_run_show_mean_circularity(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """λ beside mean flows is that of these flows, and the curve is of the means that λ̄ is the mean of."""
+    drawn: dict[str, tuple[Any, ...]] = {}
+    for name in ("save_before_after", "save_circularity"):
+
+        def record(path: Path, *arguments: Any, name: str = name) -> Path:
+            drawn[name] = arguments
+            return path
+
+        monkeypatch.setattr(pictures, name, record)
+    shutil.copytree(trained, "run")
+    kept = RunDirectory("run")
+    figures, rollouts, env = pictures.evaluate_run(kept, episodes=2, bounds=False)
+    pictures.draw_run(kept, rollouts, env)
+    network, before, after, _, shown = drawn["save_before_after"]
+    assert shown == pytest.approx([float(network.circularity(flow)) for _, flow in (before, after)], rel=1e-9)
+    for name, curve in drawn["save_circularity"][2].items():
+        assert curve.mean() == pytest.approx(figures["controllers"][name]["circularity"]["value"], rel=1e-12)
 
 
 @pytest.mark.medium

@@ -291,7 +291,7 @@ def test_services_do_not_hide_compartments_of_their_name(bottles: Network) -> No
     """A service may have the id of a node; a change of either is seen."""
     node = bottles.nodes[1]
     named = replace(bottles, services=(replace(bottles.services[0], id=node.id), *bottles.services[1:]))
-    wider = replace(node, initial=(node.initial[0], node.initial[1] + 1.0))
+    wider = replace(node, initial=(bottles.initial[0, 1], bottles.initial[1, 1] + 1.0))
     other = replace(named, nodes=(bottles.nodes[0], wider, *bottles.nodes[2:]))
     (found,) = differences(VectorEnv(named, num_envs=1), VectorEnv(other, num_envs=1))
     assert f"'{node.id}'" in found

@@ -122,7 +122,7 @@ def test_steps_count_once(starts: int, updates: int, tmp_path: Path) -> None:
     for name, learner in training.learners.items():
         model, buffer = learner.model, buffer_of(training, name)
         assert (model.num_timesteps, buffer.pos, model._n_updates) == (40, 20, updates)
-        neutral = training.env.neutral_action[name].astype(np.float32)
+        neutral = training.env.neutral_action[name][0].astype(np.float32)
         assert (buffer.actions[:10] == neutral).all() and (buffer.actions[10:20] != neutral).all()
     assert training.run is not None
     assert training.run.metrics()["env_steps"] == [8, 16, 24, 32, 40]
@@ -161,7 +161,7 @@ def test_resumed_run_gets_the_rest(stop: int, tmp_path: Path, ctrl_c_after: Any)
         trained(asked, directory=tmp_path / "run", report=ctrl_c_after(COPIES * stop))
     training = resume(tmp_path / "run")
     for name in AGENTS:
-        buffer, neutral = buffer_of(training, name), training.env.neutral_action[name].astype(np.float32)
+        buffer, neutral = buffer_of(training, name), training.env.neutral_action[name][0].astype(np.float32)
         by_controller = (buffer.actions[: buffer.pos] == neutral).all(axis=(1, 2))
         assert training.learners[name].model.num_timesteps == 40
         assert by_controller.tolist() == [True] * 10 + [False] * 10
@@ -305,7 +305,7 @@ def test_current_observations_are_those_last_returned() -> None:
     env = VectorEnv("net_zero", num_envs=2, horizon=2)
     with pytest.raises(ControlError, match=r"call reset\(\) first"):
         env.observations()
-    actions = {agent: np.full((2, len(neutral)), 0.5) for agent, neutral in env.neutral_action.items()}
+    actions = {agent: np.full_like(neutral, 0.5) for agent, neutral in env.neutral_action.items()}
     seen, snapshot = env.reset(0), env.snapshot()
     for _ in range(3):
         for agent, value in env.observations().items():

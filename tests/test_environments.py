@@ -161,7 +161,7 @@ def test_difference_reward_by_hand(circularity: str) -> None:
     env.reset(1)
     imagined.reset(1)
     rng = np.random.default_rng(0)
-    neutral = env.stack({a: np.tile(n, (2, 1)) for a, n in env.neutral_action.items()})
+    neutral = env.stack(env.neutral_action)
     for _ in range(3):
         actions = rng.uniform(-1, 1, (len(env.agents), 2))
         here = env.snapshot()
@@ -215,7 +215,7 @@ def test_copies_restart_by_themselves() -> None:
     )
     env.reset(0)
     alone.reset(0)
-    neutral = {agent: np.tile(action, (2, 1)) for agent, action in env.neutral_action.items()}
+    neutral = env.neutral_action
     for step in range(1, 8):
         observations, _, terminations, truncations, infos = env.step(neutral)
         expected = alone.advance(alone.stack(neutral)).observation
@@ -324,7 +324,7 @@ def test_random_control_does_not_copy_the_start_state() -> None:
     controller = Random()
     controller.start(env, 7)
     drawn = np.array([action[0, 0] for action in controller.act(observations).values()]) / 2 + 0.5
-    nodes = [node for node in env.network.nodes if node.initial[0] < node.initial[1]]
-    low, high = np.array([node.initial for node in nodes]).T
-    stock = env.physical.stock[[env.network.node_index[node.id] for node in nodes], 0]
-    assert not np.isclose((stock - low) / (high - low), drawn[: len(nodes)], rtol=1e-6).any()
+    low, high = env.network.initial
+    drawn_from = np.flatnonzero(low < high)
+    place = ((env.physical.stock[:-1, 0] - low) / np.maximum(high - low, 1e-9))[drawn_from]
+    assert not np.isclose(place, drawn[: len(drawn_from)], rtol=1e-6).any()

@@ -71,7 +71,7 @@ def test_overdrawn_donor_is_emptied(rate: float) -> None:
         arcs.append(Arc(id="leak", donor="a", recipient="c", rate=rate))
     network = small({"a": 10.0, "b": 0.0, "c": 0.0}, arcs)
     dynamics = Dynamics(network)
-    transition = dynamics.advance(start(network), NO_STATES, dynamics.neutral[:, None])
+    transition = dynamics.advance(start(network), NO_STATES, dynamics.neutral[:, :1])
     stock = transition.stock[:-1, 0]
     assert 0 <= stock[0] <= 1e-10
     assert stock.sum() == pytest.approx(10.0, rel=1e-14)

@@ -103,7 +103,7 @@ def test_joint_learner_is_paid_circularity() -> None:
     """With the team reward a joint learner's reward is λ itself."""
     env = vector_env("copper_net", num_envs=3, reward="circularity")
     env.reset(seed=0)
-    _, rewards, _, _, infos = env.step({agent: np.tile(n, (3, 1)) for agent, n in env.neutral_action.items()})
+    _, rewards, _, _, infos = env.step(env.neutral_action)
     paid = AllAtOnce(env, env.agents).score(rewards)
     np.testing.assert_allclose(paid, infos["mine"]["circularity"], rtol=1e-14)
 

@@ -40,8 +40,8 @@ def test_published_spread_is_that_of_starts_within_a_unit() -> None:
     random = np.random.default_rng(0)
     env.reset(seed=0)
     around = {
-        node.id: node.initial[0] + random.uniform(-1.0, 1.0, env.num_envs)
-        for node in network.nodes
+        node.id: low + random.uniform(-1.0, 1.0, env.num_envs)
+        for node, low in zip(network.stores, network.initial[0], strict=True)
         if node.id in network.observation.nodes
     }
     env.reset(seed=0, options={"initial_state": around})

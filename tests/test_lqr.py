@@ -14,6 +14,7 @@ from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Networ
 from cirl_marl.controllers import LQR, LinearSystem
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network import Floats
+from cirl_marl.network.series import Series
 
 MEASURED = ("urban_air",)
 
@@ -233,7 +234,7 @@ def chain(**changes: Any) -> Network:
     """Return source → a → b → sink with a controlled a → b and proportional others."""
     control = Control(kind=ControlKind.FLOW, low=0.0, neutral=1.0, high=10.0)
     arcs = {
-        "in": Arc(id="in", donor="source", recipient="a", law=Law.EXOGENOUS, flow=(2.0,)),
+        "in": Arc(id="in", donor="source", recipient="a", law=Law.EXOGENOUS, flow=2.0),
         "move": Arc(id="move", donor="a", recipient="b", law=Law.CONTROLLED, control=control),
         "out": Arc(id="out", donor="b", recipient="sink", law=Law.DONOR, rate=0.5),
     }
@@ -290,12 +291,14 @@ def test_store_without_outflow_of_its_own() -> None:
         (lambda: started(state_weight=np.triu(np.ones((4, 4)))), "symmetric"),
         (lambda: started(input_weight=[0.0]), "input_weight must be .* positive definite"),
         (
-            lambda: LinearSystem.of(chain(**{"in": replace(chain().arcs[0], flow=(1.0, 2.0), times=(0.0, 3.0))})),
-            "a time series drives 'in'",
+            lambda: LinearSystem.of(
+                chain(**{"in": replace(chain().arcs[0], flow=Series(times=(0.0, 3.0), values=(1.0, 2.0)))})
+            ),
+            "numbers change in time: in",
         ),
         (
             lambda: LinearSystem.of(
-                chain(out=replace(chain().arcs[2], law=Law.EXOGENOUS, rate=0.0, flow=(3.0,))),
+                chain(out=replace(chain().arcs[2], law=Law.EXOGENOUS, rate=0.0, flow=3.0)),
                 set_points={"a": 10.0, "b": 4.0},
             ).equilibrium(),
             "no equilibrium",

@@ -131,7 +131,7 @@ def test_keeps_the_service_from_random_starts(name: str, horizon: int | None) ->
     assert off < 2e-3
     assert off < open_loop
     best = envelope(name, starts, solves=3, min_service=demanded, horizon=24, degree=1)
-    proved = best.at(starts, run.episode_service)
+    proved = best.at(starts, run.episode_levels)
     gap = (proved - run.episode_circularity) / np.abs(proved)
     assert (gap >= 0).all() and (gap < 0.03).all(), gap
 

@@ -147,7 +147,7 @@ def episodes(scenario: str) -> dict[str, Episode]:
         outcome = env.advance(actions)
         returns += outcome.reward
     state = env.physical
-    columns = state.circularity / horizon, outcome.circularity, state.service / horizon, returns.T, outcome.flow.T
+    columns = state.circularity / horizon, outcome.circularity, state.service[0] / horizon, returns.T, outcome.flow.T
     return {name: Episode(*each) for name, each in zip(POLICIES, zip(*columns, strict=True), strict=True)}
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_networks import constant
 
 from cirl_marl import (
     Arc,
@@ -30,11 +31,18 @@ from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import write_network
+from cirl_marl.network.series import Series
+
+
+def steps(*times: float) -> Series:
+    """Return a series of the numbers 1, 2 and so on."""
+    return Series(times=times, values=tuple(float(i + 1) for i in range(len(times))))
+
 
 A, B = Node(id="a", initial=(10.0, 10.0)), Node(id="b")
 LINK = Arc(id="k", donor="a", recipient="b", rate=0.1)
 DELAYED = Arc(id="k", donor="a", recipient="b", law=Law.BATCH, delay=1.0, batches=((0.0, 1.0),))
-FED = Arc(id="k", donor="a", recipient="b", law=Law.EXOGENOUS, flow=(1.0,))
+FED = Arc(id="k", donor="a", recipient="b", law=Law.EXOGENOUS, flow=1.0)
 ORDER = Arc(id="k", donor="a", recipient="b", law=Law.CONTROLLED)
 BACKWARD = Control(kind=ControlKind.FLOW, low=-5.0, neutral=0.0, high=5.0)
 VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
@@ -51,7 +59,7 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
             "low -5 kg/day would reverse the flow",
         ),
         ({"nodes": (replace(A, control=replace(VALVE, neutral=3.0)), B)}, "neutral <= high .*, got 0, 3, 2$"),
-        ({"arcs": (replace(LINK, times=(0.0, 5.0), flow=(1.0, 0.0)),)}, "times = .* law 'donor' takes rate"),
+        ({"arcs": (replace(LINK, flow=steps(0.0, 5.0)),)}, "flow = .* law 'donor' takes rate"),
         ({"arcs": (replace(DELAYED, delay=1e-7),)}, "delay 1e-07 is not a whole number"),
         ({"arcs": (DELAYED,), "episode": Episode(control_interval=0.0)}, "control_interval 0.0 must be positive"),
         ({"episode": Episode(control_interval=math.nan, solver="rk4", solver_step=1.0)}, "control_interval nan"),
@@ -69,12 +77,26 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
             {"arcs": (replace(DELAYED, delay=86400.0),)},
             "delay 86400 day is 86400 control intervals.*wrong unit",
         ),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0, 3.0)),)}, "series has 0 times and 3 values: a constant flow has one"),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0,)),)}, "series has 1 times and 2 values: one for each"),
-        ({"arcs": (replace(FED, flow=()),)}, r"flow \(\) must be finite"),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.nan)),)}, r"times \(0.0, nan\) must start at 0"),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(0.0, math.inf)),)}, r"times \(0.0, inf\) must .* be finite"),
-        ({"arcs": (replace(FED, flow=(1.0, 2.0), times=(math.nan, 1.0)),)}, r"times \(nan, 1.0\) must start at 0"),
+        (
+            {"arcs": (replace(FED, flow=Series(times=(0.0,), values=(1.0, 2.0), origin="x.csv, t")),)},
+            r"arc 'k': flow: series has 1 times and 2 values: one for each \(x.csv, t\)$",
+        ),
+        ({"arcs": (replace(FED, flow=Series(times=(), values=())),)}, "series has 0 times and 0 values"),
+        ({"arcs": (replace(FED, flow=steps(0.0, math.nan)),)}, "times must increase and be finite, but nan follows 0"),
+        ({"arcs": (replace(FED, flow=steps(0.0, math.inf)),)}, "times must increase and be finite, but inf follows 0"),
+        ({"arcs": (replace(FED, flow=steps(0.0, 2.0, 1.0)),)}, "times must increase and be finite, but 1 follows 2"),
+        ({"arcs": (replace(FED, flow=steps(math.nan)),)}, "times and values must be finite"),
+        ({"arcs": (replace(FED, flow=steps(0.5)),)}, "series begins at 0.5, after the episode does"),
+        (
+            {"arcs": (replace(FED, flow=replace(steps(0.0, 5.0), interpolation="linear")),)},
+            "arc 'k': flow: series ends at 5, but the episode at 50",
+        ),
+        ({"arcs": (replace(FED, flow=replace(steps(0.0), until=49.0)),)}, "series ends at 49, but the episode at 50"),
+        ({"arcs": (replace(LINK, rate=Series(times=(0.0, 1.0), values=(1.0, -2.0))),)}, "rate -2.0 must be finite and"),
+        (
+            {"nodes": (replace(A, control=replace(VALVE, neutral=steps(0.0, 1.0, 3.0))), B), "arcs": (LINK,)},
+            "low <= neutral <= high and low < high, got .* in interval 3",
+        ),
         ({"services": (OWED, OWED)}, "service 's': the id is used twice$"),
         ({"nodes": (A, B, B)}, "node 'b': the id is used twice$"),
         ({"arcs": (replace(LINK, id="b"),)}, "node and arc 'b': the id is used twice; nodes and arcs share one set"),
@@ -115,14 +137,18 @@ def test_networks_that_cannot_be_simulated(changes: dict[str, Any], said: str) -
         (A, {"initial": 5.0}, "node 'a': initial must be (low, high), got 5.0; write (5.0, 5.0)"),
         (A, {"initial": (1.0, 2.0, 3.0)}, "node 'a': initial must be (low, high), got (1.0, 2.0, 3.0)"),
         (A, {"initial": ("1", "2")}, "node 'a': initial must be (low, high), got ('1', '2')"),
-        (A, {"initial": None}, "node 'a': initial must be (low, high), got None"),
         (A, {"inner": (4.0, 6.0)}, "one pair for each inner state, got (4.0, 6.0); write ((4.0, 6.0),)"),
         (A, {"inner": 4.0}, "node 'a': inner must be ((low, high), …), one pair for each inner state, got 4.0"),
         (A, {"set_point": (4.0, 6.0)}, "node 'a': set_point must be a number, got (4.0, 6.0)"),
         (DELAYED, {"batches": (0.0, 1.0)}, "batches must be ((time, mass), …), got (0.0, 1.0); write ((0.0, 1.0),)"),
         (DELAYED, {"batches": ((0.0, 1.0), (2.0,))}, "batches must be ((time, mass), …), got ((0.0, 1.0), (2.0,))"),
-        (FED, {"flow": 1.0}, "arc 'k': flow must be (value, …), got 1.0; write (1.0,)"),
-        (FED, {"times": 0.0}, "arc 'k': times must be (time, …), got 0.0; write (0.0,)"),
+        (FED, {"flow": (1.0, 2.0)}, "arc 'k': flow must be a number, got (1.0, 2.0)"),
+        (steps(0.0), {"times": 0.0}, "series: times must be (time, …), got 0.0; write (0.0,)"),
+        (
+            LINK,
+            {"delay": steps(0.0)},
+            "interpolation='step', until=None, origin='')",
+        ),
         (LINK, {"rate": None}, "arc 'k': rate must be a number, got None"),
         (VALVE, {"low": (0.0, 2.0)}, "control: low must be a number, got (0.0, 2.0)"),
     ],
@@ -138,7 +164,7 @@ def test_numbers_may_come_from_arrays() -> None:
     """Lists and arrays of numbers are numbers too."""
     given: list[Any] = [[1, 2], np.array([1.0, 2.0]), (np.float32(1.0), np.int64(2))]
     for initial in given:
-        assert tuple(replace(A, initial=initial).initial) == (1, 2)
+        assert tuple(replace(A, initial=initial).initial) == (1, 2)  # type: ignore[arg-type]
 
 
 TRUCK: dict[str, Any] = {
@@ -178,7 +204,7 @@ def test_what_a_station_releases_fits_its_arcs() -> None:
     sorted_, unsorted = (next(arc for arc in network.arcs if arc.port == port) for port in ("sorted", "unsorted"))
     for changed, said in (
         (replace(unsorted, port="sorted"), "port 'sorted' of 'sorter' has the arc .* already"),
-        (replace(unsorted, rate=1.5 * unsorted.rate), "150 kg a unit, but 'sorter' releases units of 100 kg"),
+        (replace(unsorted, rate=1.5 * constant(unsorted.rate)), "150 kg a unit, but 'sorter' releases units of 100 kg"),
     ):
         with pytest.raises(NetworkError, match=said):
             replace(network, arcs=tuple(changed if arc is unsorted else arc for arc in network.arcs))

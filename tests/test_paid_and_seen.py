@@ -45,8 +45,8 @@ def test_who_is_neutral_makes_no_difference(circularity: str, network: Network, 
     env = VectorEnv(network, num_envs=2, reward="difference", circularity=circularity)
     env.reset(seed)
     rng = np.random.default_rng(seed)
-    neutral = np.concatenate(list(env.neutral_action.values()))[:, None]
     for _ in range(network.episode.horizon):
+        neutral = env.stack(env.neutral_action)
         idle = rng.random(len(neutral)) < 0.5
         outcome = env.advance(np.where(idle[:, None], neutral, rng.uniform(-1, 1, (len(neutral), 2))))
         size = np.abs(outcome.circularity) + np.abs(outcome.circularity_mean) + np.abs(env.physical.stock).sum(axis=0)

@@ -43,7 +43,7 @@ class Played:
         start: stocks at the start.
         intervals: what happened.
         circularity: λ̄ in the simulator.
-        service: mean service level in the simulator.
+        levels: mean level of each service in the simulator, shape (services,).
     """
 
     network: Network
@@ -51,7 +51,12 @@ class Played:
     start: Floats
     intervals: list[Interval]
     circularity: float
-    service: float
+    levels: Floats
+
+    @property
+    def service(self) -> float:
+        """Mean level of the services; 1 without any."""
+        return float(self.levels.mean()) if self.levels.size else 1.0
 
     @property
     def cut(self) -> bool:
@@ -111,7 +116,7 @@ def play(
     env.reset(seed=0)
     start = env.physical.stock[: len(network.stores), 0].copy()
     held: list[Controls] = []
-    circularity = service = 0.0
+    circularity = 0.0
     for step in range(network.episode.horizon):
         action = rng.uniform(-1, 1, len(env.agents))
         if style != "inside":
@@ -124,24 +129,24 @@ def play(
         held.append(values)
         outcome = env.advance(action[:, None])
         circularity += float(outcome.circularity_mean[0]) / network.episode.horizon
-        service += float(outcome.service_level[0]) / network.episode.horizon
     happened = list(intervals(network, start, held, env.dynamics.substeps))
     mass, delta = start.sum(), network.objective.reference_interval
     end = env.physical.stock[: len(network.stores), 0]
     np.testing.assert_allclose(happened[-1].pieces[-1].end, end, rtol=1e-9, atol=1e-11 * mass)
     size = delta * max(float(each.flow.sum()) for each in happened)
     assert abs(circularity - np.mean([each.circularity for each in happened])) <= 1e-10 * size + 1e-12 * mass
-    if network.services:
-        assert service == pytest.approx(np.mean([each.levels for each in happened]), abs=1e-6)
-    return Played(network, env.agents, start, happened, circularity, service)
+    levels = env.physical.service[:, 0] / network.episode.horizon
+    np.testing.assert_allclose(levels, np.mean([each.levels for each in happened], axis=0), atol=1e-6)
+    return Played(network, env.agents, start, happened, circularity, levels)
 
 
 def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
     """Return v of an episode: for each piece X_i, F_i, Z_i and the stocks at its end; levels, imbalance, valves."""
     network = layout.network
     names = [node.id for node in network.nodes]
-    entering = np.array([[arc.recipient == node.id for arc in network.arcs] for node in network.nodes])
-    entering = entering[len(network.stores) :].T.astype(float).reshape(len(network.arcs), -1)
+    entering = np.zeros((len(network.arcs), len(network.nodes)))
+    entering[np.arange(len(network.arcs)), network.recipients] = 1.0
+    entering = entering[:, len(network.stores) :]
     found: list[Floats] = []
     for each in happened:
         valve = np.array([valve_of(network, name, each.controls) for name in names])
@@ -183,8 +188,13 @@ def assert_holds(played: Played, degree: int, weight: float | None = None, piece
     programs = Programs(Admissible.of(network, played.agents or None), degree, weight, pieces=pieces)
     layout, mass = programs.layout, float(played.start.sum())
     v = variables(layout, played.intervals)
-    problem = programs.program(played.start, None if weight is not None else played.service * (1 - 1e-12))
+    problem = programs.program(played.start, played.levels)
     assert_satisfies(problem, v, mass)
+    for s in range(len(network.services)):  # each row holds its own service, and is met by no less than its level
+        above = np.where(np.arange(len(played.levels)) == s, played.levels + 1e-5, 0.0)
+        missed = programs.program(played.start, above)
+        short = missed.under @ v - missed.under_to
+        assert np.flatnonzero(short[len(short) - len(above) :] > 5e-6).tolist() == [s]
     objective = played.circularity
     if weight is not None:
         objective = objective / network.objective.circularity_scale + weight * played.service
@@ -192,7 +202,8 @@ def assert_holds(played: Played, degree: int, weight: float | None = None, piece
     assert abs(found - objective) <= 1e-9 * float(np.abs(problem.cost) @ np.abs(v)) + 1e-6 * (weight or 0.0)
     half = steps // 2
     if half:
-        later = programs.program(played.intervals[half - 1].pieces[-1].end, None, range(half, steps))
+        levels = np.mean([each.levels for each in played.intervals[half:]], axis=0)
+        later = programs.program(played.intervals[half - 1].pieces[-1].end, levels, range(half, steps))
         assert_satisfies(later, v[half * layout.size :], mass)
 
 
@@ -428,7 +439,7 @@ def test_the_most_that_is_delivered() -> None:
     """
     network = works().with_options(episode={"control_interval": 0.4, "horizon": 1})
     start = network.initial[1].copy()
-    lowest = {each: control_of(network, each).low for each in network.controllable}
+    lowest = {each: mean_of(network, control_of(network, each).low, 0) for each in network.controllable}
     (happened,) = intervals(network, start, [{**lowest, "supply": 60.0}], 1)
     ordered = [network.arc_index["supply"], network.arc_index["demand"]]
     z = 1.2 * 0.1 * 0.4

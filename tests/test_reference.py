@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 from paper_classes import trajectory
 from scipy.integrate import solve_ivp
+from small_networks import constant
 
 from cirl_marl import CirlError, Law, VectorEnv, load_network, parallel_env, single_agent_env
 from cirl_marl.dynamics.motion import Dynamics
@@ -69,8 +70,8 @@ def test_euler_of_the_networks_is_first_order(name: str) -> None:
     dynamics = Dynamics(network)
     control = network.compartments[agent].control
     assert control is not None
-    held = dynamics.neutral[:, None].copy()
-    held[network.control_rows[agent]] = 0.25 * control.low + 0.75 * control.high
+    held = dynamics.neutral[:, :1].copy()
+    held[network.control_rows[agent]] = 0.25 * constant(control.low) + 0.75 * constant(control.high)
     rate = dynamics.rate(held)
 
     def slope(_: float, stock: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -145,7 +146,7 @@ def test_eigenvalues(name: str, eigenvalues: list[float]) -> None:
     network = load_network(PAPER[name][0], scenario="paper")
     dynamics = Dynamics(network)
     sets_flow = np.isin(network.controllable, [arc.id for arc in network.arcs if arc.law is Law.CONTROLLED])
-    rate = dynamics.rate(np.where(sets_flow, 0.0, dynamics.neutral)[:, None])
+    rate = dynamics.rate(np.where(sets_flow, 0.0, dynamics.neutral[:, 0])[:, None])
     unit = np.eye(len(network.nodes) + 1)
     matrix = dynamics.incidence(dynamics.flow(unit, np.repeat(rate, unit.shape[1], axis=1)))[:-1, :-1]
     order = [network.node_index[node] for node in network.observation.nodes]

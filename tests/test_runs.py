@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_networks import constant
 from stable_baselines3.common.vec_env import VecNormalize
 
 import cirl_marl
@@ -97,7 +98,9 @@ def test_directories_without_a_run_are_named(tmp_path: Path) -> None:
 def test_run_directory_describes_what_was_trained(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """A network changed in Python, whatever part of it, is kept as it was trained, not as its file says."""
     network = cirl_marl.load_network("copper_net")
-    arcs = tuple(replace(arc, rate=2 * arc.rate) if arc.id == "use_to_landfill" else arc for arc in network.arcs)
+    arcs = tuple(
+        replace(arc, rate=2 * constant(arc.rate)) if arc.id == "use_to_landfill" else arc for arc in network.arcs
+    )
     changed = replace(network, arcs=arcs).with_options(objective={"circularity_weight": 0.9})
     train(changed, ppo_recipe, agents=["mine"], directory=tmp_path / "changed", horizon=5)
     kept = RunDirectory(tmp_path / "changed").make_env(1).network

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_networks import constant
 
 from cirl_marl.controllers import Constant, Neutral, Random
 from cirl_marl.controllers.rollout import first_seed, rollout
@@ -26,7 +27,7 @@ def test_neutral_plan_holds_the_neutral_controls() -> None:
         control = env.network.compartments[agent].control
         assert control is not None
         column = {"rate": "valve factor (1)", "flow": "flow ordered (kt/day)"}[control.kind.value]
-        np.testing.assert_allclose(table[f"{agent}: {column}"], control.neutral)
+        np.testing.assert_allclose(table[f"{agent}: {column}"], constant(control.neutral))
     np.testing.assert_array_equal(table["mean circularity (kt)"], found.rollout.circularity_mean[0])
 
 
@@ -39,7 +40,7 @@ def test_orders_have_the_unit_of_a_flow() -> None:
     found = schedule(env, Constant({agent: 1.0}))
     unit = f"{env.network.mass_unit}/{env.network.time_unit}"
     column = found.columns[found.header.index(f"{agent}: flow ordered ({unit})")]
-    np.testing.assert_allclose(column, control.high)
+    np.testing.assert_allclose(column, constant(control.high))
 
 
 def test_inputs_of_models_are_named() -> None:

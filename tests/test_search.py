@@ -70,7 +70,7 @@ def test_demanded_service_is_charged() -> None:
     assert len(best) == 21 * 20 + 1  # intervals of the candidates and of each iteration
     assert shares == sorted(shares) and shares[-1] == 1.0 and best[0] == -np.inf
     assert best == sorted(best)
-    missing = max(0.0, 0.9 - found.service)
+    missing = np.maximum(0.0, 0.9 - found.levels).sum()
     assert best[-1] == pytest.approx(found.circularity / 1420.0 - SHORTFALL_PRICE * missing)
     assert missing < 1e-3
 
@@ -142,7 +142,7 @@ def test_actions_are_cut_to_their_bounds_and_deviations_with_them() -> None:
     env = VectorEnv(network, num_envs=1)
     env.reset(seed=EVALUATION_SEEDS)
     copies = Population(network, None, starting_states(env), 2)
-    neutral = np.concatenate(list(env.neutral_action.values()))
+    neutral = np.concatenate([each[0] for each in env.neutral_action.values()])
     added = np.zeros((1, 2, 2, copies.entries))
     added[0, 1, 0, 0], added[0, 1, 1, 0] = -0.1, 5.0
     run = copies.run([Neutral()], np.zeros((1, 2), dtype=int), added)

@@ -52,7 +52,7 @@ def test_more_carbon_dioxide_is_warmer() -> None:
     """The published sign: more of it in the air, less radiation leaves."""
     env = VectorEnv(load_network("carbo_net", scenario="temperature"), num_envs=2, horizon=20)
     env.reset(seed=0, options={"initial_state": {"urban_air": np.array([830.0, 1000.0])}})
-    neutral = env.stack({agent: np.tile(action, (2, 1)) for agent, action in env.neutral_action.items()})
+    neutral = env.stack(env.neutral_action)
     for _ in range(20):
         env.advance(neutral)
     cold, warm = env.physical.inner[0]

@@ -13,7 +13,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from cirl_marl.definitions.reading import DEFAULT
 from cirl_marl.errors import CirlError
+from cirl_marl.network import Network
 
 app = typer.Typer(
     help="Material networks whose compartments learn to raise circularity.",
@@ -28,10 +30,16 @@ NetworkName = Annotated[str, typer.Argument(metavar="NETWORK", help="Name in the
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a training run.")]
 Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]
+StartSeed = Annotated[
+    int | None,
+    typer.Option(
+        "--seed", min=0, help="Start as the first episode of this evaluation; default: the middle of all ranges."
+    ),
+]
 EpisodeCount = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
 MinService = Annotated[
     float | None,
-    typer.Option(min=0.0, max=1.0, help="Mean service level that mpc and optimum plan for; default: all there is."),
+    typer.Option(min=0.0, max=1.0, help="Mean level of each service, for mpc and optimum; default: all there is."),
 ]
 
 
@@ -48,6 +56,12 @@ def listed(text: str) -> list[str]:
 def say(line: str) -> None:
     """Print a line as it is, whatever its length."""
     console.print(line.replace("[", r"\["), soft_wrap=True, highlight=False)
+
+
+def stem(network: Network, *more: str) -> str:
+    """Return the stem of a file about a network, so that no scenario takes the place of another."""
+    scenario = [] if network.scenario_name == DEFAULT else [network.scenario_name]
+    return "_".join([network.name, *scenario, *more])
 
 
 def folder_for(path: Path, option: str) -> Path:

@@ -69,7 +69,8 @@ def pareto(
     episodes: EpisodeCount = 16,
     scenario: Scenario = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK.")
+        Path | None,
+        typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK[_SCENARIO]."),
     ] = None,
 ) -> None:
     """Draw service against circularity: what is possible, what plans achieve, what learners reach.
@@ -80,7 +81,9 @@ def pareto(
     from cirl_marl.evaluation.sweep import pareto as swept
     from cirl_marl.report.sweep import write_sweep
 
-    folder = common.folder_for(out or Path("runs") / f"pareto-{load_network(network).name}", "--out")
+    folder = common.folder_for(
+        out or Path("runs") / f"pareto-{common.stem(load_network(network, scenario=scenario))}", "--out"
+    )
     asked: dict[str, Any] = {"points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
     try:
         with shares() as progress:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cirl_marl.cli.common import EpisodeCount, RunPath, Scenario, Seed, app, console, listed, say, shares, training_bar
+from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.controllers.shortages import shortages
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
+from cirl_marl.network import Network
 from cirl_marl.network.elements import OBSERVE, REWARDS
 
 if TYPE_CHECKING:
@@ -76,9 +80,10 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     from cirl_marl.report.tables import evaluation_table, local_returns_table
 
     with shares() as progress:
-        figures, _, _ = evaluate_run(RunDirectory(run), episodes=episodes, seed=seed, progress=progress)
+        figures, rollouts, env = evaluate_run(RunDirectory(run), episodes=episodes, seed=seed, progress=progress)
     console.print(evaluation_table(figures))
     console.print(local_returns_table(figures))
+    _say_shortages(rollouts, env.network)
     if "no_bound" in figures:
         say(f"gap to bound: {figures['no_bound']}")
 
@@ -179,6 +184,13 @@ def _kept(directory: Path) -> str:
     return f"what was learnt in the first {status['joint_steps'] * run.config.envs:,} steps is saved. {go_on}"
 
 
+def _say_shortages(rollouts: Mapping[str, Rollout], network: Network) -> None:
+    """Say under which control scheduled flows were less than was asked for, as means over the episodes."""
+    for name, run in rollouts.items():
+        for short in shortages(run, network):
+            say(f"{name}: {short.said}")
+
+
 def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:
     from cirl_marl.learners.run import RunDirectory
     from cirl_marl.report.run import draw_run, evaluate_run
@@ -188,6 +200,7 @@ def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:
     with shares() as progress:
         figures, rollouts, env = evaluate_run(run, episodes=episodes, seed=seed, bounds=False, progress=progress)
     console.print(evaluation_table(figures))
+    _say_shortages(rollouts, env.network)
     for path in draw_run(run, rollouts, env):
         say(f"picture: {path}")
     if not run.metrics()["env_steps"]:

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
 
-from cirl_marl.cli.common import MinService, NetworkName, Scenario, Seed, app, bar, console, errors, plain, say
+from cirl_marl.cli.common import (
+    MinService,
+    NetworkName,
+    Scenario,
+    StartSeed,
+    app,
+    bar,
+    console,
+    errors,
+    plain,
+    say,
+    stem,
+)
 from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Watched
-from cirl_marl.controllers.rollout import Rollout, interval_ends, rollout
+from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, rollout
+from cirl_marl.controllers.shortages import shortages
 from cirl_marl.definitions.catalogue import load_network, networks, recipes
-from cirl_marl.definitions.reading import DEFAULT, Definition
+from cirl_marl.definitions.reading import Definition
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.figures import time_window
 from cirl_marl.network import Network
+from cirl_marl.network.series import extremes
 from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
 
 if TYPE_CHECKING:
@@ -38,7 +51,10 @@ def list_networks() -> None:
 def show(
     network: NetworkName,
     scenario: Scenario = None,
-    picture: Annotated[Path | None, typer.Option(help="Where to draw it; default: NETWORK.png here.")] = None,
+    seed: StartSeed = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Where to draw it; default: NETWORK[_SCENARIO].png here.")
+    ] = None,
 ) -> None:
     """Show the compartments, flows and circularity of a network at its start state, and draw it."""
     from cirl_marl.drawing.digraph import save_network
@@ -46,20 +62,21 @@ def show(
 
     found = load_network(network, scenario=scenario)
     env = VectorEnv(found, num_envs=1)
-    middle = {node.id: sum(node.initial) / 2 for node in found.nodes}
-    env.reset(seed=0, options={"initial_state": middle})
+    begun = beginning(env, seed)
+    begun.reset(env)
     stock, flow = env.physical.stock[env.rows.nodes, 0], env.physical.flow[:, 0]
     console.print(nodes_table(found, stock))
     console.print(arcs_table(found, flow))
     for service in found.services:
-        ends = [f"at least {service.low:g}"] if service.low > 0 else []
-        ends += [] if np.isinf(service.high) else [f"at most {service.high:g}"]
+        ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
+        ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
         console.print(
             f"service '{service.id}': {service.measure or service.quantity} of {service.provider} {' and '.join(ends)}"
         )
     circularity = float(found.circularity(flow))
     console.print(f"λ of the start state: {circularity:.5g} {found.mass_unit}")
-    path = picture or Path(f"{found.name}.png")
+    say(f"start: {begun.said}")
+    path = picture or Path(f"{stem(found)}.png")
     if path.suffix != ".png":
         raise CirlError(f"--picture {path}: needs the name of a .png file")
     save_network(path, found, stock, flow, title=found.title, circularity=circularity)
@@ -159,40 +176,26 @@ def simulate(
         ),
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Control intervals; default: the horizon.")] = None,
-    seed: Seed = 0,
+    seed: StartSeed = None,
     scenario: Scenario = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
 ) -> None:
-    """Simulate a network under a controller without learning; write a CSV and a picture."""
-    from cirl_marl.report.curves import save_trajectory
+    """Simulate a network under a controller without learning; write a CSV and a picture.
+
+    Flows, and λ beside them in the picture, are means over each interval; the CSV has λ at its end as well.
+    """
+    from cirl_marl.report.trajectory import write_trajectory
 
     controller = named_controller(control, held=_held(control, set_ or []))
     env = VectorEnv(network, num_envs=1, scenario=scenario, horizon=steps)
-    found = env.network
+    found, begun = env.network, beginning(env, seed)
     with bar("simulating") as progress:
         watched = Watched(controller, progress)
-        run = rollout(env, watched, seed=seed, progress=watched.acted)
-    folder = out or Path()
-    folder.mkdir(parents=True, exist_ok=True)
-    name = _called(found, control)
-    time = interval_ends(found)
-    env.reset(seed=seed)  # to where the episode began
-    began = env.physical
-    _write_csv(folder / f"{name}.csv", env, time, run)
-    save_trajectory(
-        folder / f"{name}.png",
-        found,
-        time,
-        run.stock.T,
-        run.flow.T,
-        run.circularity[0],
-        start=np.concatenate([began.stock[env.rows.nodes, 0], env.dynamics.batches.loads(began.stock)[:, 0]]),
-        load=run.load.T,
-        service=run.service[0] if found.services else None,
-        title=f"{found.title or found.name}, {control} control",
-    )
-    _say_figures(run, found)
-    console.print(f"wrote {folder / name}.csv and {folder / name}.png")
+        run = rollout(env, watched, seed=begun.seed, start=begun.given, progress=watched.acted)
+    title = f"{found.title or found.name}, {control} control"
+    written = write_trajectory(out or Path(), stem(found, control), env, begun, run, title)
+    _say_figures(run, found, begun)
+    say(f"wrote {' and '.join(map(str, written))}")
 
 
 @app.command()
@@ -208,9 +211,7 @@ def plan(
         typer.Option(help="CSV file to write; default: plan_NETWORK[_SCENARIO]_CONTROL or plan_RUN."),
     ] = None,
     scenario: Scenario = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Start as the first episode of this evaluation; default: mid-range.")
-    ] = None,
+    seed: StartSeed = None,
     min_service: MinService = None,
 ) -> None:
     """Write what a policy or controller does in one episode: its actions in physical units over time, as CSV.
@@ -223,23 +224,17 @@ def plan(
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     env, controller = _actor(source, control, scenario, min_service)
-    who = Path(source).resolve().name if control is None else _called(env.network, control)
+    who = Path(source).resolve().name if control is None else stem(env.network, control)
     path = Path(f"plan_{who}.csv") if out is None else out
     with bar("planning") as progress:
         watched = Watched(controller, progress)
         found = schedule(env, watched, seed=seed, progress=watched.acted)
     path.parent.mkdir(parents=True, exist_ok=True)
     found.write(path)
-    _say_figures(found.rollout, env.network)
+    _say_figures(found.rollout, env.network, found.begun)
     if controller.note:
         say(controller.note)
     say(f"wrote {path}")
-
-
-def _called(network: Network, control: str) -> str:
-    """Return the stem of a file of ``control`` in a network, so that no scenario takes the place of another."""
-    scenario = [] if network.scenario_name == DEFAULT else [network.scenario_name]
-    return "_".join([network.name, *scenario, control])
 
 
 def _actor(
@@ -260,7 +255,9 @@ def _actor(
     return run.make_env(1), Trained(run)
 
 
-def _say_figures(run: Rollout, network: Network) -> None:
+def _say_figures(run: Rollout, network: Network, begun: Beginning) -> None:
+    """Say where an episode began, what came of it, and which flows were less than was asked for."""
+    say(f"start: {begun.said}")
     figures = [
         f"λ̄ = {float(run.episode_circularity[0]):.5g} {network.mass_unit}",
         f"service level {float(run.episode_service[0]):.4f}",
@@ -268,6 +265,8 @@ def _say_figures(run: Rollout, network: Network) -> None:
     if network.objective.criticality is not None:
         figures.append(f"time-window circularity {float(time_window(network, run)[0]):.5g} {network.mass_unit}")
     console.print(", ".join(figures))
+    for short in shortages(run, network):
+        say(short.said)
 
 
 def _held(control: str, settings: list[str]) -> dict[str, float]:
@@ -282,27 +281,3 @@ def _held(control: str, settings: list[str]) -> dict[str, float]:
         except ValueError:
             raise CirlError(f"--set {setting}: needs AGENT=VALUE with a number in [-1, 1]") from None
     return held
-
-
-def _write_csv(path: Path, env: VectorEnv, time: np.ndarray, run: Rollout) -> None:
-    """Write the state in which ``env`` is, from which ``run`` began, and a row for the end of each interval."""
-    from cirl_marl.records.files import write_atomically
-
-    network, physics = env.network, env.dynamics.inner
-    header = [f"time ({network.time_unit})", f"circularity ({network.mass_unit})", "service level"]
-    header += [f"stock of {node.id} ({network.mass_unit})" for node in network.nodes]
-    header += [f"flow of {arc.id} ({network.mass_unit}/{network.time_unit})" for arc in network.arcs]
-    header += [f"mass on {line.id} ({network.mass_unit})" for line in env.dynamics.batches.lines]
-    header += [physics.names[row] for row in physics.visible]
-    start = env.physical
-    held = [*start.stock[env.rows.nodes, 0].tolist(), *[""] * len(network.arcs)]
-    held += [*env.dynamics.batches.loads(start.stock)[:, 0].tolist(), *start.inner[physics.visible, 0].tolist()]
-
-    columns = (time, run.circularity[0], run.service[0], *run.stock.T, *run.flow.T, *run.load.T, *run.inner.T)
-
-    def write(target: Path) -> None:
-        with target.open("w", newline="") as file:
-            rows = zip(*(column.tolist() for column in columns), strict=True)
-            csv.writer(file).writerows([header, [0.0, "", "", *held], *rows])
-
-    write_atomically(path, write)

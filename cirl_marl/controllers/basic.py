@@ -59,16 +59,16 @@ class Constant(Controller):
                 raise ControlError(f"constant control: {unknown('agent', agent, env.agents)}")
             if not -1.0 <= value <= 1.0:
                 raise ControlError(f"constant control of '{agent}' is {value}; it must lie in [-1, 1]")
+        self._env = env
         self._actions = {
-            agent: np.tile(np.full_like(neutral, self._wanted.get(agent, neutral)), (env.num_envs, 1))
-            for agent, neutral in env.neutral_action.items()
+            a: np.full_like(n, self._wanted[a]) for a, n in env.neutral_action.items() if a in self._wanted
         }
         for action in self._actions.values():
             action.flags.writeable = False
 
     def act(self, observations: Arrays) -> Arrays:
-        """Return the fixed actions; their arrays are read-only."""
-        return self._actions
+        """Return the fixed actions, whose arrays are read-only, and neutral ones of the coming interval."""
+        return {**self._env.neutral_action, **self._actions}
 
 
 class Neutral(Constant):
@@ -84,13 +84,13 @@ class Random(Controller):
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Seed the draws."""
-        self._entries, self._batch = {a: len(neutral) for a, neutral in env.neutral_action.items()}, env.num_envs
+        self._shapes = {agent: neutral.shape for agent, neutral in env.neutral_action.items()}
         self._random = np.random.default_rng([seed, 1])  # not the numbers that the start states are drawn from
 
     def act(self, observations: Arrays) -> Arrays:
         """Return fresh random actions."""
         del observations
-        return {agent: self._random.uniform(-1.0, 1.0, (self._batch, n)) for agent, n in self._entries.items()}
+        return {agent: self._random.uniform(-1.0, 1.0, shape) for agent, shape in self._shapes.items()}
 
 
 class Watched(Controller):

@@ -65,15 +65,23 @@ class LinearSystem:
         if problems := list(_nonlinear(network, inputs)):
             problem = f"is no linear system: {'; '.join(problems)}. {_remedy(network)}"
             raise CirlError(f"'{network.name}' ({network.scenario_name}) {problem}")
-        controls = np.repeat(laws.neutral[:, None], 1 + len(acting), axis=1)
+        controls = np.repeat(laws.neutral[:, :1], 1 + len(acting), axis=1)
         controls[acting] = np.eye(1 + len(acting))[1:]
         rate, units = laws.rate(controls), np.eye(laws.rows.masses)  # no input, then one unit of each
-        A, c = np.split(laws.incidence(laws.flow(units, np.repeat(rate[:, :1], len(units), axis=1)))[:-1], [-1], axis=1)
-        B = laws.incidence(laws.flow(units[:, [-1] * len(acting)], rate[:, 1:] - rate[:, :1]))[:-1]
+        routes = laws.routing.routes(rate[:, :1])
+
+        def gain(masses: Floats, rate: Floats) -> Floats:
+            flow = laws.flow(masses, rate)
+            if routes is not None:
+                laws.routing.pass_on(flow, routes)
+            return laws.incidence(flow)[:-1]
+
+        A, c = np.split(gain(units, np.repeat(rate[:, :1], len(units), axis=1)), [-1], axis=1)
+        B = gain(units[:, [-1] * len(acting)], rate[:, 1:] - rate[:, :1])
         targets = _targets(network, set_points)
-        wanted = np.array([node.id in targets for node in network.nodes], dtype=bool)
-        held = np.array([node.role is Role.NONRENEWABLE_RESERVOIR for node in network.nodes], dtype=bool) & ~wanted
-        c = c[:, 0] + A[:, held] @ np.array([sum(node.initial) / 2 for node in network.nodes])[held]
+        wanted = np.array([node.id in targets for node in network.stores], dtype=bool)
+        held = np.array([node.role is Role.NONRENEWABLE_RESERVOIR for node in network.stores], dtype=bool) & ~wanted
+        c = c[:, 0] + A[:, held] @ network.initial.mean(axis=0)[held]
         rows = np.flatnonzero((A.any(axis=0) | wanted) & ~held)
         if not B[rows].any():
             raise CirlError(f"network '{network.name}': {list(inputs)} move no stock that drives a flow or is tracked")
@@ -87,8 +95,8 @@ class LinearSystem:
             c=c[rows],
             set_points=np.array([targets.get(node.id, np.nan) for node in nodes]),
             scale=np.array([each.scale for each in (*nodes, *flows)]),
-            bounds=np.stack([laws.control_low[acting], laws.control_high[acting]]),
-            neutral=laws.neutral[acting],
+            bounds=np.stack([laws.control_low[acting, 0], laws.control_high[acting, 0]]),
+            neutral=laws.neutral[acting, 0],
         )
 
     def equilibrium(self) -> tuple[Floats, Floats]:
@@ -213,8 +221,6 @@ class LQR(Controller):
         stocks, self._feed = system.equilibrium()
         self.system, self.gain, self._env, self._goal = system, gain, env, C @ stocks
         self._rows = [env.network.node_index[node] for node in outputs]
-        self._controls = [c for a in system.inputs if (c := env.network.compartments[a].control) is not None]
-        self._idle = {a: np.tile(n, (env.num_envs, 1)) for a, n in env.neutral_action.items() if a not in agents}
 
     def demand(self) -> Floats:
         """Return u = u_e − K (y − y_e) at the present stocks, before clipping, shape (inputs, B), mass/time."""
@@ -223,19 +229,25 @@ class LQR(Controller):
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the actions that set the demanded flows, clipped to the bounds of the controls."""
-        demand = zip(self.system.inputs, self._controls, self.demand(), strict=True)
-        return self._idle | {agent: control.action(flow)[:, None] for agent, control, flow in demand}
+        demand = zip(self.system.inputs, self.demand(), strict=True)
+        return self._env.neutral_action | {agent: self._env.normalised(agent, flow[None]) for agent, flow in demand}
 
 
 def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:
-    refused = {ControlKind.RATE: "rate controls multiply flows (bilinear)", ControlKind.INPUT: "inputs set no flows"}
+    refused = {
+        ControlKind.RATE: "rate controls multiply flows (bilinear)",
+        ControlKind.SHARE: "shares multiply flows (bilinear)",
+        ControlKind.INPUT: "inputs set no flows",
+    }
     for kind, reason in refused.items():
         if acting := [a for a in agents if (control := network.compartments[a].control) and control.kind is kind]:
             yield f"{reason}: {', '.join(acting)}"
     reasons = {Law.COMPARTMENT: "inner physics drives", Law.BATCH: "batches move along"}
     for arc in network.arcs:
-        if reason := reasons.get(arc.law, "a time series drives" if arc.times else ""):
+        if reason := reasons.get(arc.law, ""):
             yield f"{reason} '{arc.id}'"
+    if network.changing:
+        yield f"numbers change in time: {', '.join(network.changing)}"
 
 
 def _remedy(network: Network) -> str:

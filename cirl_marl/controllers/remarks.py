@@ -7,11 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from cirl_marl.controllers.basic import Constant, Neutral
+from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.controllers.shortages import shortages
+from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.elements import Compartment, ControlKind, Law, Role
+from cirl_marl.network.elements import ControlKind, Law, Role
 from cirl_marl.network.model import Releasing
+from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.units import factor
 from cirl_marl.network.validate_settings import is_whole
 
@@ -27,7 +32,7 @@ SHORT = 20
 
 def remarks(network: Network) -> Iterator[str]:
     """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse."""
-    for look in (_apart, _without_effect, _departures, _starved, _aimless, _unpaid, _coarse):
+    for look in (_apart, _without_effect, _shares, _departures, _free, _starved, _aimless, _unpaid, _coarse):
         yield from look(network)
 
 
@@ -51,14 +56,38 @@ def _without_effect(network: Network) -> Iterator[str]:
             yield f"arc '{arc.id}': pollutant = false says nothing here, as '{arc.recipient}' is no environment"
 
 
+def _shares(network: Network) -> Iterator[str]:
+    """Yield valves that are easily taken for shares: on one arc of a donor whose other proportional flows have none.
+
+    A valve v on a flow whose share is s at v = 1 makes it the share v·s/(1 + (v − 1)·s), not v·s. Where every flow has
+    a valve, they set what passes, and no share is meant.
+    """
+    for node in network.nodes:
+        split = {arc.id: arc for arc in network.arcs if arc.donor == node.id and arc.law is Law.DONOR}
+        rates = {arc.id: float(network.held(arc.rate)[0]) for arc in split.values()}
+        valves = [(arc, arc.control) for arc in split.values() if arc.control is not None]
+        for arc, control in valves if len(valves) < sum(rate > 0 for rate in rates.values()) else ():
+            share = rates[arc.id] / sum(rates.values())
+            ends = [
+                (v * share / (1 + (v - 1) * share), v, end)
+                for v, end in ((extremes(control.low)[0], "lowest"), (extremes(control.high)[1], "highest"))
+            ]
+            passed, valve, end = max(ends, key=lambda found: abs(found[1] * share - found[0]))
+            if abs(valve * share - passed) > COARSE:
+                part = f"{passed:.0%} of what leaves '{node.id}' in proportion to its stock"
+                taken = f"not {valve * share:.0%}: {valve:.3g} × {share:.0%}"
+                remedy = 'law = "share" with control.kind = "share" sets a share itself'
+                yield f"arc '{arc.id}': at its {end} its valve lets through {part}, {taken}; {remedy}"
+
+
 def _departures(network: Network) -> Iterator[str]:
     """Yield series and batches that begin after the episode, and batches that a station cannot finish."""
     interval, horizon = network.episode.control_interval, network.episode.horizon
     end = f"an episode ends at {horizon * interval:g} {network.time_unit}"
     for arc in network.arcs:
-        late = [time for time in arc.times if time >= horizon * interval]
-        if late:
-            yield f"arc '{arc.id}': series: {end}, so that what begins at {late[0]:g} {network.time_unit} never comes"
+        times = arc.flow.times if isinstance(arc.flow, Series) else ()
+        if len(times) > 1 and times[1] >= horizon * interval:
+            yield f"arc '{arc.id}': series: {end}, so that what begins at {times[1]:g} {network.time_unit} never comes"
         recipient = network.nodes[network.node_index[arc.recipient]]
         batch_kg = recipient.model.batch_kg if isinstance(recipient.model, Releasing) else None
         for time, mass in arc.batches:
@@ -102,46 +131,54 @@ def _states(network: Network, action: float | None, intervals: int) -> Floats:
     state, rows = env.physical, []
     with np.errstate(all="ignore"):
         for step in range(min(network.episode.horizon, intervals)):
-            after = env.dynamics.advance(state.stock, state.inner, controls[:, None], np.array([step]))
+            after = env.dynamics.advance(state.stock, state.inner, controls[:, [step]], np.array([step]))
             state = replace(state, stock=after.stock, inner=after.inner)
             whole = env.rows.start_of(after.stock, after.inner)
             rows.append(np.concatenate([whole[:, 0], after.stock[env.rows.batches, 0]]))
     return np.array(rows)
 
 
+def _free(network: Network) -> Iterator[str]:
+    """Yield nodes of the technosphere that give what never came in, other than by physics of their own."""
+    fed, giving = ({getattr(arc, end) for arc in network.arcs} for end in ("recipient", "donor"))
+    for node, most in zip(network.stores, network.initial[1], strict=True):
+        given = node.id in giving - fed and most > 0 and node.model is None
+        if given and node.role is Role.TECHNOSPHERE:
+            meant = "if it stands for mining or for imports of primary material, its role is nonrenewable_reservoir"
+            yield f"node '{node.id}': nothing enters it, and what it delivers counts nothing in λ; {meant}"
+
+
 def _starved(network: Network) -> Iterator[str]:
-    """Yield exogenous flows that their donors cannot feed under neutral control."""
-    ordered = {k: arc for k, arc in enumerate(network.arcs) if arc.law is Law.EXOGENOUS and any(arc.flow)}
-    if not ordered:
+    """Yield scheduled flows that run short: under neutral control, and from sources whose controls are at the highest.
+
+    A source is a donor that nothing enters. That agents can empty others is no fault of the network.
+    """
+    scheduled = {arc.id: arc.donor for arc in network.arcs if LAWS[arc.law].scheduled}
+    if not scheduled:
         return
-    env, interval = VectorEnv(network, num_envs=1), network.episode.control_interval
-    env.reset(seed=0)
-    neutral = {agent: action[None] for agent, action in env.neutral_action.items()}
-    valves = {k: _valve(arc) * _valve(network.nodes[network.node_index[arc.donor]]) for k, arc in ordered.items()}
-    short: dict[int, float] = {}
-    for step in range(min(network.episode.horizon, INTERVALS)):
+    fed = {arc.recipient for arc in network.arcs}
+    sources = {id_ for arc, donor in scheduled.items() if donor not in fed for id_ in (arc, donor)}
+    highest = Constant({agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)})
+    env, said = VectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS)), set[str]()
+    begun = beginning(env)
+    for control, controller, looked_at in (("neutral", Neutral(), set(scheduled)), ("the highest", highest, sources)):
         try:
-            env.advance(env.stack(neutral))
+            run = rollout(env, controller, seed=begun.seed, start=begun.given)
         except CirlError as error:
             yield str(error)
             return
-        for k, arc in ordered.items():
-            first = max(0, int(np.searchsorted(arc.times, step * interval, side="right")) - 1)
-            last = max(first, int(np.searchsorted(arc.times, (step + 1) * interval)) - 1)
-            if env.physical.flow[k, 0] < (1 - COARSE) * valves[k] * min(arc.flow[first : last + 1]):
-                short.setdefault(k, step * interval)
-    for k, time in short.items():
-        arc = ordered[k]
-        since = (
-            f"from {time:g} {network.time_unit} on; give it a larger initial stock if it stands for the world outside"
-        )
-        yield f"arc '{arc.id}': under neutral control '{arc.donor}' holds too little for its flow {since}"
+        for short in shortages(run, env.network):
+            arc, since = short.arc, f"from {short.begins:g} {network.time_unit} on"
+            if arc.id in looked_at - said:
+                said.add(arc.id)
+                little = f"under {control} control '{arc.donor}' holds too little for its flow {since}"
+                yield f"arc '{arc.id}': {little}; give it a larger initial stock if it stands for the world outside"
 
 
-def _valve(compartment: Compartment) -> float:
-    """Return by what neutral control multiplies the flows that a compartment scales."""
-    control = compartment.control
-    return control.neutral if control is not None and control.kind is ControlKind.RATE else 1.0
+def _scales(network: Network, id_: str) -> bool:
+    """Whether the control of a compartment sets or scales flows."""
+    control = network.compartments[id_].control
+    return control is not None and control.kind is not ControlKind.INPUT
 
 
 def _aimless(network: Network) -> Iterator[str]:

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Controller
+from cirl_marl.controllers.basic import Arrays, Controller
+from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
@@ -17,8 +18,25 @@ from cirl_marl.network.declared import itemised
 EVALUATION_SEEDS = 2**31
 """First seed of evaluations; training draws its seeds below it, so no evaluated episode was trained on."""
 
+ROUNDING = 1e-9
+"""Share of a scheduled flow by which what is realised may differ from it without being less."""
+
 SEED_SPACING = 1_000_000
 """Distance between the first seeds of two evaluations with different ``seed``, so that they share no episode."""
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """Where a single episode begins."""
+
+    seed: Annotated[int, "seed of what is drawn"]
+    given: Annotated[Mapping[str, float], "stocks and inner states that are not drawn"]
+    said: Annotated[str, "both in words"]
+
+    def reset(self, env: VectorEnv) -> Arrays:
+        """Begin an episode in ``env`` here, and return the observations."""
+        return env.reset(seed=self.seed, options={"initial_state": self.given})
 
 
 @itemised
@@ -28,14 +46,16 @@ class Rollout:
 
     circularity: Annotated[Floats, "λ at the end of each interval, shape (B, steps), mass"]
     circularity_mean: Annotated[Floats, "mean of λ over each interval, shape (B, steps), mass"]
-    service: Annotated[Floats, "service level, shape (B, steps)"]
+    service: Annotated[Floats, "mean level of the services, shape (B, steps)"]
+    levels: Annotated[Floats, "level of each service, shape (B, services, steps)"]
     local_returns: Annotated[Floats, "sum of the local rewards of each agent, shape (agents, B)"]
     returns: Annotated[Floats, "sum of the rewards of each agent, shape (agents, B)"]
-    stock: Annotated[Floats, "stocks after each interval in the first copy, shape (steps, nodes), mass"]
+    stock: Annotated[Floats, "stocks after each interval in the first copy, shape (steps, stores), mass"]
     flow: Annotated[Floats, "mean flows of each interval in the first copy, shape (steps, arcs), mass/time"]
     load: Annotated[Floats, "masses that batch arcs hold, likewise, shape (steps, batch arcs), mass"]
     inner: Annotated[Floats, "inner states that an agent may see, likewise, shape (steps, states)"]
-    final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (nodes,), mass"]
+    unmet: Annotated[Floats, "what scheduled flows lacked, mean over copies, shape (steps, scheduled arcs), mass"]
+    final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (stores,), mass"]
     mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
 
     @property
@@ -46,9 +66,21 @@ class Rollout:
 
     @property
     def episode_service(self) -> Floats:
-        """Mean service level of each episode, shape (B,)."""
+        """Mean of the services' levels in each episode, shape (B,)."""
         mean: Floats = self.service.mean(axis=1)
         return mean
+
+    @property
+    def episode_levels(self) -> Floats:
+        """Mean level of each service in each episode, shape (B, services)."""
+        mean: Floats = self.levels.mean(axis=2)
+        return mean
+
+    @property
+    def least_service(self) -> Floats:
+        """Mean level of the service that lacks most in each episode, shape (B,); 1 without services."""
+        least: Floats = self.episode_levels.min(axis=1, initial=1.0)
+        return least
 
 
 def rollout(
@@ -68,14 +100,23 @@ def rollout(
     controller.start(env, seed)
     steps, rows, batches, physics = env.network.episode.horizon, env.rows, env.dynamics.batches, env.dynamics.inner
     circularity, mean, service = np.empty((3, env.num_envs, steps))
+    levels = np.empty((env.num_envs, len(env.network.services), steps))
     local, returns = np.zeros((2, len(env.agents), env.num_envs))
-    stock, flow = np.empty((steps, len(env.network.nodes))), np.empty((steps, len(env.network.arcs)))
+    stock, flow = np.empty((steps, len(env.network.stores))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
+    orders, actuators = np.flatnonzero(env.dynamics.scheduled), Actuators(env.dynamics, env.agents, env.num_envs)
+    unmet = np.zeros((steps, len(orders)))
     for t in range(steps):
-        outcome = env.advance(env.stack(controller.act(observations)))
+        actions = env.stack(controller.act(observations))
+        outcome = env.advance(actions)
+        if len(orders):
+            when = np.full(env.num_envs, t)
+            asked = env.dynamics.rate(actuators.controls(actions, when), when)[orders]
+            short = asked - outcome.flow[orders]
+            unmet[t] = np.where(short > ROUNDING * np.abs(asked), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
-        service[:, t] = outcome.service_level
+        service[:, t], levels[:, :, t] = outcome.service_level, outcome.levels.T
         local += outcome.local
         returns += outcome.reward
         stock[t], flow[t] = env.physical.stock[rows.nodes, 0], outcome.flow[:, 0]
@@ -84,8 +125,26 @@ def rollout(
         observations = env.by_agent(outcome.observation)
         if progress is not None:
             progress(t + 1)
+    unmet *= env.network.episode.control_interval
     final = env.physical.stock[rows.nodes].mean(axis=1)
-    return Rollout(circularity, mean, service, local, returns, stock, flow, load, inner, final, total_flow / steps)
+    flows = total_flow / steps
+    return Rollout(circularity, mean, service, levels, local, returns, stock, flow, load, inner, unmet, final, flows)
+
+
+def beginning(env: VectorEnv, seed: int | None = None) -> Beginning:
+    """Return where the single episode begins that ``cirl show``, ``simulate`` and ``plan`` are about.
+
+    That is the middle of all initial ranges, with inner states that models draw themselves as the first evaluation
+    draws them; or, with a ``seed``, the first start of the evaluation of that seed.
+    """
+    if seed is not None:
+        return Beginning(first_seed(seed), {}, f"the first episode of evaluation {seed}")
+    middle = dict(zip(env.rows.start_names, env.network.initial.mean(axis=0).tolist(), strict=False))
+    inner = env.dynamics.inner
+    rows = zip(inner.ranged.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
+    middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}
+    drawn = "" if len(inner.ranged) == len(inner.names) else "; what models draw themselves as in evaluation 0"
+    return Beginning(first_seed(0), middle, f"the middle of all initial ranges{drawn}")
 
 
 def interval_ends(network: Network) -> Floats:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.controllers.rollout import EVALUATION_SEEDS, Rollout, first_seed, interval_ends, rollout
+from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, interval_ends, rollout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
@@ -20,11 +20,12 @@ from cirl_marl.records.files import write_atomically, write_table
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """One episode: the network, a header with units, columns of shape (columns, steps), and the rollout."""
+    """One episode: the network, a header with units, columns of shape (columns, steps), its start, and the rollout."""
 
     network: Network
     header: tuple[str, ...]
     columns: Floats
+    begun: Beginning
     rollout: Rollout
 
     def write(self, path: Path) -> None:
@@ -60,9 +61,7 @@ def schedule(
     Columns are when the interval begins and ends, the value of every control in it, the mass that an agent with a valve
     lets through, λ at its end and its mean over it, and the service level.
 
-    It begins at the first start of the evaluation ``seed``; None takes the middle of all initial ranges, with inner
-    states that models draw themselves as the first evaluation draws them. ``progress`` is called with the number of
-    intervals done.
+    It begins at ``beginning(env, seed)``. ``progress`` is called with the number of intervals done.
 
     Raises:
         CirlError: if the controller does not fit the network, nobody acts, or there are several copies.
@@ -70,15 +69,10 @@ def schedule(
     network = env.network
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
-    middle = {node.id: sum(node.initial) / 2 for node in network.nodes}
-    inner = env.dynamics.inner
-    rows = zip(inner.ranged.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
-    middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}
-    recorded = _Recorded(controller, env)
-    first = EVALUATION_SEEDS if seed is None else first_seed(seed)
-    run = rollout(env, recorded, seed=first, start=middle if seed is None else None, progress=progress)
+    recorded, begun = _Recorded(controller, env), beginning(env, seed)
+    run = rollout(env, recorded, seed=begun.seed, start=begun.given, progress=progress)
     actuators = Actuators(env.dynamics, env.agents, len(recorded.actions))
-    values = actuators.controls(np.array(recorded.actions).T)[actuators.acting]
+    values = actuators.controls(np.array(recorded.actions).T, np.arange(len(recorded.actions)))[actuators.acting]
     ends = interval_ends(network)
     columns = [
         (f"from ({network.time_unit})", ends - network.episode.control_interval),
@@ -90,7 +84,7 @@ def schedule(
         ("service level (1)", run.service[0]),
     ]
     header, found = zip(*columns, strict=True)
-    return Schedule(network, header, np.array(found), run)
+    return Schedule(network, header, np.array(found), begun, run)
 
 
 def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
@@ -103,6 +97,8 @@ def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
             yield f"{agent}: flow ordered ({network.mass_unit}/{network.time_unit})"
         elif control.kind is ControlKind.RATE:
             yield f"{agent}: valve factor (1)"
+        elif control.kind is ControlKind.SHARE:
+            yield f"{agent}: share (1)"
         elif compartment.model is not None:
             yield from (f"{agent}: {name}" for name in compartment.model.input_names)  # they end in their unit
 

@@ -12,7 +12,7 @@ from cirl_marl.controllers.basic import Arrays, Constant, Controller
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
-from cirl_marl.network.elements import Control, ControlKind
+from cirl_marl.network.elements import ControlKind
 from cirl_marl.network.model import CompartmentModel
 
 Seen = dict[str, Floats]
@@ -119,12 +119,12 @@ class Scripted(Controller):
         """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral."""
         self._constant = Constant(constant)
         self._held = frozenset(constant or ())
-        self._scripts: dict[str, tuple[Script, CompartmentModel, dict[str, int], Control]] = {}
+        self._scripts: dict[str, tuple[Script, CompartmentModel, dict[str, int]]] = {}
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Find the script of each agent and what it reads; those held constant are refused as by ``Constant``."""
         self._constant.start(env, seed)
-        self._scripts = {}
+        self._scripts, self._env = {}, env
         for agent in env.agents:
             compartment = env.network.compartments[agent]
             model, control = compartment.model, compartment.control
@@ -133,7 +133,7 @@ class Scripted(Controller):
             if script := SCRIPTS.get(model.robot.kind):
                 places = {name: i for i, name in enumerate(env.layout.names[agent]) if name.startswith(f"{agent}.")}
                 columns = {name.removeprefix(f"{agent}."): i for name, i in places.items()}
-                self._scripts[agent] = script, model, columns, control
+                self._scripts[agent] = script, model, columns
 
     @property
     def scripted(self) -> tuple[str, ...]:
@@ -143,11 +143,11 @@ class Scripted(Controller):
     def act(self, observations: Arrays) -> Arrays:
         """Return each agent's action; a ``ControlError`` names a state that its script needs and it does not see."""
         actions = dict(self._constant.act(observations))
-        for agent, (script, model, columns, control) in self._scripts.items():
+        for agent, (script, model, columns) in self._scripts.items():
             seen = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}
             try:
                 inputs = script(seen, model)
             except KeyError as missing:
                 raise ControlError(f"scripted control of '{agent}' needs to see its state {missing}") from None
-            actions[agent] = control.action(inputs).T
+            actions[agent] = self._env.normalised(agent, inputs)
         return actions

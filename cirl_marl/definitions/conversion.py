@@ -13,8 +13,8 @@ from cirl_marl.network.declared import Declared, Numbers, Quantity, declarations
 from cirl_marl.network.elements import TAKEN, Arc, Control, ControlKind, Law, Node
 from cirl_marl.network.units import factor
 
-GIVEN = ("rate", "flow", "series", "batches")
-"""Keys of which a law needs one, if it takes any of them: an exogenous flow or its series, a rate or batches."""
+GIVEN = ("rate", "flow", "batches")
+"""Keys of which a law needs one, if it takes any of them: an exogenous flow a rate or batches."""
 
 HINTS = {
     "rate": "a rate, 1/time, is the flow divided by the stock of its donor (law 'recipient': of its recipient); "
@@ -93,8 +93,6 @@ class Converter:
             return given.low * scale, given.high * scale
         if isinstance(given, Batches):
             return self._batches(given, where)
-        if isinstance(declared, Numbers):
-            return (self._value(given, declared.of, where),)
         return tuple(given) if isinstance(given, list) else given
 
     def _compartment(self, made: type[Node] | type[Arc], id_: str, table: Any, where: str) -> Any:
@@ -103,7 +101,6 @@ class Converter:
         known |= {"model": known.get("model"), "control": self._control(table.control, known.get("model"), where)}
         if made is Arc:
             self._check_law(table, where)
-            known |= self._series(table, where)
         if table.scale is None:
             scale = declarations(made)["scale"]
             assert isinstance(scale, Quantity)
@@ -113,19 +110,10 @@ class Converter:
     def _check_law(self, arc: Any, where: str) -> None:
         """Note an arc that lacks what its law needs, or gives what only others take."""
         given = [key for key in GIVEN if getattr(arc, key) is not None]
-        needed = [key for key in GIVEN if {"series": "times"}.get(key, key) in TAKEN[Law(arc.law)]]
+        needed = [key for key in GIVEN if key in TAKEN[Law(arc.law)]]
         if len(given) != min(1, len(needed)) or not set(given) <= set(needed):
             asked = " or ".join(needed) or f"none of {', '.join(GIVEN)}"
             self.mistakes.append(f"{where}: law '{arc.law}' needs {asked}, got {given or 'none'}")
-
-    def _series(self, arc: Any, where: str) -> dict[str, Any]:
-        """Return flow and times of an exogenous series."""
-        if arc.series is None:
-            return {}
-        unit = self._factor(arc.series.unit, "flow", f"{where}.series")
-        clock = self._factor(arc.series.time_unit, "time", f"{where}.series.time_unit")
-        values, times = arc.series.values, arc.series.times
-        return {"flow": tuple(value * unit for value in values), "times": tuple(time * clock for time in times)}
 
     def _batches(self, table: Batches, where: str) -> tuple[tuple[float, float], ...]:
         if len(table.times) != len(table.masses):

@@ -26,7 +26,6 @@ PARTS: dict[str, tuple[Any, str]] = {
     "service": (schema.ServiceTable, "`[services.NAME]`"),
     "quantity": (schema.QuantityTable, "Every number with a unit"),
     "range": (schema.Range, "`initial` of a node"),
-    "series": (schema.Series, "`series` of an arc"),
     "batches": (schema.Batches, "`batches` of an arc"),
 }
 

@@ -28,8 +28,6 @@ Source = Annotated[str, Field(min_length=1, description="where the number comes 
 Identifier = Annotated[str, Field(pattern=IDENTIFIER)]
 IN_MODEL = ("inner", "reward_scale")
 """Fields of compartments that stand in the table of their model."""
-ELSEWHERE = (*IN_MODEL, "times")
-"""Fields with numbers that stand in the table of another field."""
 
 
 class Table(BaseModel):
@@ -51,16 +49,6 @@ class Range(Table):
 
     low: Number
     high: Number
-    unit: str
-    source: Source
-
-
-class Series(Table):
-    """A step function of time: ``values[i]`` holds from ``times[i]`` on."""
-
-    times: list[Number] = Field(description="starts of the steps, beginning with 0")
-    time_unit: str
-    values: list[Number]
     unit: str
     source: Source
 
@@ -103,7 +91,7 @@ class ModelTable(Table):
 def table_of(made: type[Any], **more: Any) -> Any:
     """Return the table of a part: a key for each declared field, with ``more`` that Python has otherwise."""
     told, hints = declarations(made), get_type_hints(made)
-    unspelt = [n for n, each in told.items() if isinstance(each, Numbers) and not each.spelled and n not in ELSEWHERE]
+    unspelt = [n for n, each in told.items() if isinstance(each, Numbers) and not each.spelled and n not in IN_MODEL]
     if unspelt:
         raise TypeError(f"{made.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
     spelled = {name: _spelled(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
@@ -130,7 +118,7 @@ def _spelled(declared: Declared, hint: Any) -> Any:
     if isinstance(declared, Word):
         return declared.of if isinstance(declared.of, type) else Literal[declared.of]
     if isinstance(declared, Numbers):
-        tables = {"range": Range, "batches": Batches, "flow": QuantityTable, "amount": Number}
+        tables = {"range": Range, "batches": Batches, "amount": Number}
         return tables[declared.spelled] if declared.spelled else None
     if isinstance(declared, Nested):
         return ControlTable if declared.of == "control" else ModelTable
@@ -142,9 +130,7 @@ def _spelled(declared: Declared, hint: Any) -> Any:
 TITLE: Any = (str, "")
 ControlTable = table_of(Control)
 NodeTable = table_of(Node, title=TITLE)
-ArcTable = table_of(
-    Arc, title=TITLE, series=(Series | None, Field(None, description="time series of the exogenous law"))
-)
+ArcTable = table_of(Arc, title=TITLE)
 ServiceTable = table_of(Service, title=TITLE)
 EpisodeTable = table_of(Episode)
 ObjectiveTable = table_of(Objective)

@@ -117,10 +117,7 @@ class _Writer:
             times, masses = ([float(pair[column]) for pair in value] for column in (0, 1))
             units = {"time_unit": time, "unit": unit, "source": SOURCE}
             return {key: {"times": times, "masses": masses, **units}}
-        if declared.spelled == "flow" and part.times:
-            columns = {"times": list(map(float, part.times)), "values": list(map(float, part.flow))}
-            return {"series": {**columns, "time_unit": time, "unit": self._units["flow"], "source": SOURCE}}
-        return {key: self._quantity(value[0], declared.of)} if declared.spelled == "flow" else {}
+        return {}
 
     def _control(self, part: Compartment) -> dict[str, Any]:
         control = part.control

@@ -118,7 +118,7 @@ def save_before_after(
     Args:
         path: file to write; its folder is made.
         network: the network.
-        before: stocks, shape (nodes,), and flows, shape (arcs,).
+        before: stocks, shape (stores,), and flows, shape (arcs,).
         after: the same, later or under other control.
         labels: headings of the two.
         circularity: λ of the two, mass; see ``draw_network``.

@@ -40,7 +40,8 @@ def draw_network(
 ) -> None:
     """Draw the digraph with its stocks and flows.
 
-    A box is filled to stock / (stock + scale), half at the node's reference stock. The width of an arrow is
+    A box is filled to stock / (stock + scale), half at the node's reference stock; one with a dashed edge stores
+    nothing, and is filled likewise by what passes through it. The width of an arrow is
     proportional to its flow. Arrows that lower the circularity are vermilion, those that raise it green; those of
     parallel arcs bear their names.
     Networks of more than 60 nodes or 200 arcs are drawn without labels.
@@ -48,7 +49,7 @@ def draw_network(
     Args:
         axes: where to draw; what they show is cleared.
         network: the network.
-        stock: stocks, shape (nodes,), mass.
+        stock: stocks, shape (stores,), mass.
         flow: flows, shape (arcs,), mass/time.
         title: heading.
         circularity: λ, mass, which is written below it; None takes that of ``flow``, and writes none where batches
@@ -60,7 +61,8 @@ def draw_network(
     Raises:
         CirlError: if an array has the wrong shape.
     """
-    stock, flow = shaped("stock", stock, (len(network.nodes),)), shaped("flow", flow, (len(network.arcs),))
+    stock, flow = shaped("stock", stock, (len(network.stores),)), shaped("flow", flow, (len(network.arcs),))
+    held = np.concatenate([stock, network.throughput(flow)])
     reference = largest_flow(flow) if reference_flow is None else reference_flow
     share = np.clip(np.nan_to_num(np.abs(flow)) / max(reference, 1e-12), 0, BROADEST)
     layout = arrangement_of(network, axes.bbox.width / axes.bbox.height)
@@ -68,10 +70,10 @@ def draw_network(
     axes.set_axis_off()
     em = _frame(axes, layout, legend)
     if layout.routes is None:
-        _draw_dots(axes, network, layout, stock, share, em)
+        _draw_dots(axes, network, layout, held, share, em)
     else:
         _draw_arrows(axes, network, layout.routes, flow, share, em)
-        _draw_boxes(axes, network, layout, stock, em)
+        _draw_boxes(axes, network, layout, held, em)
     if circularity is None and all(arc.law is not Law.BATCH for arc in network.arcs):
         with np.errstate(invalid="ignore"):  # flows that overflowed are shown as they are
             circularity = float(network.circularity(flow))
@@ -148,19 +150,23 @@ def _arrow(curve: Floats, width: float) -> Floats:
     return np.concatenate([sides[0], [neck + across * flare, tip, neck - across * flare], sides[1][::-1]])
 
 
-def _draw_boxes(axes: Axes, network: Network, layout: Arrangement, stock: Floats, em: float) -> None:
+def _draw_boxes(axes: Axes, network: Network, layout: Arrangement, held: Floats, em: float) -> None:
     width, height = layout.box
-    for node, (x, y), amount, name in zip(network.nodes, layout.positions, stock, layout.names, strict=True):
+    units = {True: network.mass_unit, False: f"{network.mass_unit}/{network.time_unit}"}
+    for node, (x, y), amount, name in zip(network.nodes, layout.positions, held, layout.names, strict=True):
         corner, colour = (x - width / 2, y - height / 2), ROLE_COLOURS[node.role]
         look = "round,pad=0,rounding_size=0.5"
         axes.add_patch(FancyBboxPatch(corner, width, height, look, fc=_tint(colour, 0.25), ec="none", zorder=3))
         level = Rectangle(corner, width, height * _fill(amount, node.scale), fc=colour, ec="none", zorder=3.1)
-        edge = FancyBboxPatch(corner, width, height, look, fc="none", ec=_darker(colour), lw=0.1 * em, zorder=3.2)
+        line_style = "solid" if node.stores else "dashed"
+        edge = FancyBboxPatch(
+            corner, width, height, look, fc="none", ec=_darker(colour), lw=0.1 * em, ls=line_style, zorder=3.2
+        )
         axes.add_patch(level)
         axes.add_patch(edge)
         level.set_clip_path(edge)
         top = y + 0.6 * len(name)
-        for line, text in enumerate((*name, f"{number(amount)} {network.mass_unit}")):
+        for line, text in enumerate((*name, f"{number(amount)} {units[node.stores]}")):
             bold = "bold" if line < len(name) else "normal"
             axes.text(x, top - 1.2 * line, text, color=INK, fontsize=0.95 * em, fontweight=bold, ha="center",
                       va="center", zorder=4)  # fmt: skip
@@ -181,8 +187,8 @@ def _darker(colour: str) -> str:
     return "#" + "".join(f"{int(colour[i : i + 2], 16) * 6 // 10:02x}" for i in (1, 3, 5))
 
 
-def _draw_dots(axes: Axes, network: Network, layout: Arrangement, stock: Floats, share: Floats, em: float) -> None:
-    """Draw a large network: dots whose area shows the stock, bent lines whose width shows the flow."""
+def _draw_dots(axes: Axes, network: Network, layout: Arrangement, held: Floats, share: Floats, em: float) -> None:
+    """Draw a large network: dots whose area shows the stock or throughput, bent lines whose width shows the flow."""
     ends = layout.positions[network.donors], layout.positions[network.recipients]
     # Arcs that count towards λ come last, on top of the others.
     colours, order = _colours(network), np.argsort(np.abs(network.sustainability), kind="stable")
@@ -190,7 +196,7 @@ def _draw_dots(axes: Axes, network: Network, layout: Arrangement, stock: Floats,
     thickest = min(2.5, 40 / math.sqrt(len(network.arcs)))
     inks, widths = [colours[k] for k in order], np.clip(thickest * share[order], 0.15, None)
     axes.add_collection(LineCollection(list(lines[order]), colors=inks, linewidths=widths, alpha=0.6), autolim=False)
-    fill = np.array([_fill(amount, node.scale) for amount, node in zip(stock, network.nodes, strict=True)])
+    fill = np.array([_fill(amount, node.scale) for amount, node in zip(held, network.nodes, strict=True)])
     area = (0.6 * em * layout.box[1]) ** 2 * (0.15 + 0.85 * fill)
     faces = [ROLE_COLOURS[node.role] for node in network.nodes]
     edges = [_darker(face) for face in faces]

@@ -13,6 +13,7 @@ import numpy as np
 from cirl_marl.dynamics.batches import BatchTransport
 from cirl_marl.dynamics.inner import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.dynamics.routing import Eliminated
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declared import itemised
@@ -71,10 +72,8 @@ class Dynamics(FlowLaws):
         episode = network.episode
         self.physical = episode.solver != "euler"
         self._exact = episode.solver == "exact"
-        driven = self.driver < rows.nodes.stop  # by a stock
-        turnover = np.bincount(self.driver[driven], self.max_rate[driven], rows.nodes.stop).astype(float)
-        fastest = float(turnover.max(initial=0.0))
-        self._check_turnover(turnover)
+        fastest = float(self.turnover.max(initial=0.0))
+        self._check_turnover(self.turnover)
         if self._exact:
             self.substeps = max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
         else:
@@ -84,27 +83,27 @@ class Dynamics(FlowLaws):
         self.terms = self._series_terms() if self._exact else 0
         self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
         shape = (rows.masses, len(network.arcs))
-        self._outgoing = RowSum(network.donors, np.arange(shape[1]), 1.0, shape)
+        self._outgoing = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._pulls = Law.RECIPIENT in laws
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
-        self._timed = [arc.id for arc in network.arcs if arc.times or arc.law is Law.BATCH]
+        self._timed = (*self.timed, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
         self._compile_orders()
 
     def _series_terms(self) -> int:
         """Smallest K ≥ 2 for which the first neglected term of the mean, ‖|A|^K‖₁·h^K/(K + 1)!, is ≤ TRUNCATION.
 
         A, entry by entry, is largest in absolute value with every control at its upper bound, so that bound serves all.
+        What is split, or enters a node that stores nothing, is taken to go where it drives most.
         """
-        donors, recipients = self.network.donors, self.network.recipients
-        nodes = self.rows.nodes.stop
-        driven = np.flatnonzero(self.driver < nodes)
-        reach, term, k = np.ones(nodes), 1.0, 0
+        stores, donors = self.rows.nodes.stop, self.network.donors[self.driven]
+        reach, term, k = np.ones(stores), 1.0, 0
         while term > TRUNCATION or k < 2:
             k += 1
-            moved = self.max_rate[driven] * (reach[donors[driven]] + reach[recipients[driven]]) * self.substep
-            reach = np.bincount(self.driver[driven], weights=moved, minlength=nodes) / (k + 1)
+            ends = np.append(reach, reach.max(initial=0.0))[self.driven_to]
+            moved = self.driven_rate * (reach[donors] + ends) * self.substep
+            reach = np.bincount(self.driver[self.driven], weights=moved, minlength=stores) / (k + 1)
             term = float(reach.max(initial=0.0))
         return k
 
@@ -135,7 +134,8 @@ class Dynamics(FlowLaws):
         self._order_donors, order_slot = np.unique(network.donors[self._order_arcs], return_inverse=True)
         self._order_slot: Integers = order_slot
         slot = {int(node): i for i, node in enumerate(self._order_donors)}
-        exits = [k for k, d in enumerate(network.donors) if int(d) in slot and network.arcs[k].law is Law.DONOR]
+        proportional = self.driver == network.donors
+        exits = [k for k, d in enumerate(network.donors) if int(d) in slot and proportional[k]]
         exit_slot = [len(slot) + slot[int(network.donors[k])] for k in exits]
         rows, columns = [*order_slot, *exit_slot], [*self._order_arcs, *exits]
         self._orders_and_exits = RowSum(rows, columns, 1.0, (2 * len(slot), len(network.arcs)))
@@ -156,6 +156,7 @@ class Dynamics(FlowLaws):
                 f"time series and batches depend on it, those of arc '{self._timed[0]}' for one"
             )
         rate = realised = self.rate(controls, step)
+        routes = self.routing.routes(rate)
         sent = None
         if self.batches.lines and step is not None:
             stock = stock.copy()
@@ -165,9 +166,9 @@ class Dynamics(FlowLaws):
         for _ in range(self.substeps):
             realised = self._limit_orders(stock, rate) if self.physical else rate
             if self._exact:
-                stock, moved, realised = self._settle(stock, realised, partial(self._moved_exactly, stock))
+                stock, moved, realised = self._settle(stock, realised, partial(self._moved_exactly, stock, routes))
             else:
-                stock, inner, moved, realised = self._explicit_step(stock, inner, realised, controls)
+                stock, inner, moved, realised = self._explicit_step(stock, inner, realised, routes, controls)
             total = moved if total is None else total + moved
         assert total is not None
         batched = None
@@ -177,7 +178,7 @@ class Dynamics(FlowLaws):
             total[self.batches.arcs] = delivered
             batched = np.stack([sent, counted])
         self._check_finite(stock, inner)
-        return Transition(stock, inner, total, self.flow_at(stock, inner, controls, realised), batched)
+        return Transition(stock, inner, total, self._flow_at(stock, inner, controls, realised, routes), batched)
 
     def _check_finite(self, stock: Floats, inner: Floats) -> None:
         if np.isfinite(stock).all() and np.isfinite(inner).all():
@@ -196,23 +197,33 @@ class Dynamics(FlowLaws):
         rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp))
         if self.physical:
             rate = self._limit_orders(stock, rate)
-        flow = self.flow_at(stock, inner, controls, rate)
+        routes = self.routing.routes(rate)
+        flow = self._flow_at(stock, inner, controls, rate, routes)
         if not self._heedless:
             return flow
         out = self._outgoing(flow) * self.substep
+        out[self.rows.unit] = 0.0
         share = np.divide(stock, out, out=np.ones_like(out), where=out > stock)
-        return flow * share.take(self.network.donors, axis=0)
+        flow *= share.take(self.rows.donors, axis=0)
+        if routes is not None:
+            self.routing.pass_on(flow, routes)
+        return flow
 
-    def flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats) -> Floats:
-        """Return the instantaneous flows r ∘ y[driver], shape (arcs, B), mass/time."""
-        return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate))
+    def _flow_at(
+        self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Eliminated | None
+    ) -> Floats:
+        return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate), routes)
 
-    def _forward(self, flow: Floats) -> Floats:
-        """Stop, in place, flows that a model or the stage of a solver would reverse."""
-        return np.maximum(flow, 0.0, out=flow) if self.physical and not self._exact else flow
+    def _forward(self, flow: Floats, routes: Eliminated | None) -> Floats:
+        """Stop, in place, flows that a model or the stage of a solver would reverse, and pass on what is left."""
+        if self.physical and not self._exact:
+            np.maximum(flow, 0.0, out=flow)
+        if routes is not None:
+            self.routing.pass_on(flow, routes)
+        return flow
 
     def _explicit_step(
-        self, stock: Floats, inner: Floats, rate: Floats, controls: Floats
+        self, stock: Floats, inner: Floats, rate: Floats, routes: Eliminated | None, controls: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Take one Runge-Kutta step of stocks and inner states together; models with a step of their own go ahead."""
         h = self.substep
@@ -227,9 +238,10 @@ class Dynamics(FlowLaws):
             for node, weight in zip(nodes, weights, strict=True):
                 stage = self.incidence.add_to(stock.copy(), flow * (node * h)) if node else stock
                 stage_inner = inner + slope * (node * h) if node else inner
-                flow = self._forward(self.flow(self.inner.extend(stage, stage_inner, controls, means), rate))
+                flow = self.flow(self.inner.extend(stage, stage_inner, controls, means), rate)
                 if settled is not None:
                     np.copyto(flow, settled, where=~np.isnan(settled))
+                flow = self._forward(flow, routes)
                 slope = self.inner.derivative(stage_inner, controls, stage)
                 moved += flow * (weight * h)
                 np.add(change, slope * (weight * h), out=change)
@@ -242,7 +254,9 @@ class Dynamics(FlowLaws):
             after = self.incidence.add_to(stock.copy(), moved)
         return after, self.inner.moved(ahead, change), moved, rate
 
-    def _moved_exactly(self, stock: Floats, rate: Floats, settled: Floats | None = None) -> Floats:
+    def _moved_exactly(
+        self, stock: Floats, routes: Eliminated | None, rate: Floats, settled: Floats | None = None
+    ) -> Floats:
         """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep.
 
         Flows given in ``settled``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
@@ -253,6 +267,8 @@ class Dynamics(FlowLaws):
             moved *= rate
             if settled is not None:
                 np.copyto(moved, settled, where=~np.isnan(settled))
+            if routes is not None:
+                self.routing.pass_on(moved, routes)
             if incidence is not None:
                 mean[...] = stock
                 incidence.add_to(mean, moved)
@@ -300,8 +316,8 @@ class Dynamics(FlowLaws):
             out = self._outgoing(moved)
             short = (after < 0) & (out > 0)
             share = np.divide(held, out, out=np.ones_like(out), where=short & (out > held))
-            share = share.take(self.network.donors, axis=0)
-            cut = short.take(self.network.donors, axis=0)
+            share = share.take(self.rows.donors, axis=0)
+            cut = short.take(self.rows.donors, axis=0)
             settled[cut] = (moved * share)[cut] / self.substep
             rate = rate * share
             moved = passing(rate, settled)

@@ -1,7 +1,8 @@
 """Which row is what in the arrays of a network's motion; nobody else computes row numbers.
 
-Masses are kept as one array: the stocks of the nodes, the masses of batch arcs, then the *unit row*, which is 1 and
-drives scheduled flows; the outputs of models follow it where flows are computed. Inner states are a second array.
+Masses are kept as one array: the stocks of the nodes that have one, the masses of batch arcs, then the *unit row*,
+which is 1 and drives scheduled flows; the outputs of models follow it where flows are computed. Inner states are a
+second array.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Law, Role
 from cirl_marl.network.rowsum import spans
+from cirl_marl.network.series import extremes
 
 
 @itemised
@@ -51,19 +53,21 @@ class Rows:
         unit: the unit row; the rows before it hold all the mass there is.
         masses: number of rows of the masses, the unit row included.
         batch_names: ``arc.row`` of each batch row.
-        mass_names: nodes, batch rows and the unit.
+        mass_names: stocks, batch rows and the unit.
         lines: the batch arcs, in their order among the arcs.
         aboard: row of what the vehicle of an arc carries, by the arc's id.
         owners: compartments with a model, in network order.
         states: rows of each owner's inner states.
         state_names: ``compartment.state`` of each inner state.
-        start_names: nodes, then inner states: what an episode starts from, and plans and snapshots are compared by.
+        start_names: nodes with a stock, then inner states: what an episode starts from, and plans and snapshots are
+            compared by.
         outputs: row of each owner's output, past the unit row.
+        donors: row of each arc's donor, the unit row for one that stores nothing, shape (arcs,).
     """
 
     def __init__(self, network: Network) -> None:
         """Lay out the rows of ``network``."""
-        nodes = len(network.nodes)
+        nodes = len(network.stores)
         names: list[str] = []
         self.lines = tuple(
             _line(network, k, nodes, names) for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH
@@ -72,21 +76,23 @@ class Rows:
         self.nodes, self.batches = slice(0, nodes), slice(nodes, nodes + len(names))
         self.unit = self.batches.stop
         self.masses = self.unit + 1
-        self.mass_names = (*(f"stock of node '{node.id}'" for node in network.nodes), *names, "unit")
+        self.mass_names = (*(f"stock of node '{node.id}'" for node in network.stores), *names, "unit")
         self.aboard = {line.id: line.first for line in self.lines if not line.slots}
         models = {c.id: c.model for c in network.compartments.values() if c.model is not None}
         self.owners = tuple(models)
         self.state_names = tuple(f"{owner}.{name}" for owner, model in models.items() for name in model.state_names)
-        self.start_names = (*network.node_index, *self.state_names)
+        self.start_names = (*(node.id for node in network.stores), *self.state_names)
         self.states = dict(zip(models, spans(len(model.state_names) for model in models.values()), strict=True))
         self.outputs = {owner: self.masses + i for i, owner in enumerate(self.owners)}
+        # a node without stock has no row: what is asked of its row is asked of the unit row, which is never short
+        self.donors = np.where(network.donors < nodes, network.donors, self.unit)
 
     def start_of(self, masses: Floats, inner: Floats) -> Floats:
         """Return stocks and inner states in one array, the rows of ``start_names``, shape (rows, B)."""
         return np.concatenate([masses[self.nodes], inner])
 
     def split(self, start: Floats) -> tuple[Floats, Floats]:
-        """Return the stocks, shape (nodes, B), and the inner states of what ``start_of`` returned."""
+        """Return the stocks, shape (stores, B), and the inner states of what ``start_of`` returned."""
         return start[self.nodes], np.ascontiguousarray(start[self.nodes.stop :])
 
 
@@ -104,7 +110,7 @@ def _line(network: Network, k: int, nodes: int, names: list[str]) -> Line:
         id=arc.id,
         by=arc.by,
         port=arc.port,
-        unit=arc.rate,
+        unit=extremes(arc.rate)[0],
         donor=network.node_index[arc.donor],
         recipient=network.node_index[arc.recipient],
         collecting=start,

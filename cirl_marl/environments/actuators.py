@@ -40,17 +40,26 @@ class Actuators:
         self._all_act = self.acting.tolist() == list(range(len(laws.neutral)))
         self._neutral = laws.neutral
         low, high = laws.control_low[self.acting], laws.control_high[self.acting]
+        bounds = (low, (high + low) / 2, (high - low) / 2, high)
+        self._varying = any(bool((each != each[:, :1]).any()) for each in (*bounds, laws.neutral))
         # one value per copy: NumPy takes equal shapes about twice as fast as it broadcasts a column
-        self._low, self._middle, self._half, self._high = (
-            np.repeat(each[:, None], num_envs, axis=1) for each in (low, (high + low) / 2, (high - low) / 2, high)
-        )
+        first = np.zeros(num_envs, dtype=np.intp)
+        self._bounds = bounds if self._varying else tuple(each.take(first, axis=1) for each in bounds)
 
-    @property
-    def neutral_action(self) -> dict[str, Floats]:
-        """Normalised action of each agent that leaves it neutral, shape (entries,) each."""
-        neutral = (self._neutral[self.acting] - self._middle[:, 0]) / self._half[:, 0]
+    def neutral_action(self, step: Integers) -> dict[str, Floats]:
+        """Normalised action of each agent that leaves it neutral, shape (B, entries) each, in an interval of each."""
+        _, middle, half, _ = self._held(step)
+        distance = self._neutral.take(step, axis=1)[self.acting] - middle
+        neutral = np.divide(distance, half, out=np.zeros_like(distance), where=half > 0)
         np.clip(neutral, -1.0, 1.0, out=neutral)  # rounding may lead beyond a bound
-        return {agent: neutral[entries] for agent, entries in self.entries.items()}
+        return self.unstack(neutral)
+
+    def normalised(self, agent: str, values: Floats, step: Integers) -> Floats:
+        """Return the actions that come closest to physical values of an agent's control, shape (its entries, B)."""
+        _, middle, half, _ = (each[self.entries[agent]] for each in self._held(step))
+        actions = np.divide(values - middle, half, out=np.zeros_like(values), where=half > 0)
+        clipped: Floats = np.clip(actions, -1.0, 1.0)
+        return clipped
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
@@ -75,19 +84,27 @@ class Actuators:
         """Split stacked actions, shape (entries, B), into agent → (B, entries of its action)."""
         return {agent: actions[entries].T for agent, entries in self.entries.items()}
 
-    def controls(self, actions: Floats) -> Floats:
-        """Map stacked actions, (entries, B), to physical values of every control, (controls, B), or refuse them."""
+    def controls(self, actions: Floats, step: Integers) -> Floats:
+        """Map stacked actions, (entries, B), to physical values of every control, (controls, B), or refuse them.
+
+        ``step``, shape (B,), is the index of the control interval in each copy.
+        """
         if not (actions.max(initial=0.0) <= BOUND and actions.min(initial=0.0) >= -BOUND):
             raise ControlError(self._wrong_values(actions))
-        acting = actions * self._half
-        acting += self._middle
-        np.maximum(acting, self._low, out=acting)  # with bounds that are arrays, clip is slower
-        np.minimum(acting, self._high, out=acting)
+        low, middle, half, high = self._held(step)
+        acting = actions * half
+        acting += middle
+        np.maximum(acting, low, out=acting)  # with bounds that are arrays, clip is slower
+        np.minimum(acting, high, out=acting)
         if self._all_act:
             return acting
-        controls = np.repeat(self._neutral[:, None], actions.shape[1], axis=1)
+        controls: Floats = self._neutral.take(step, axis=1)
         controls[self.acting] = acting
         return controls
+
+    def _held(self, step: Integers) -> Sequence[Floats]:
+        """Return low, middle, half of the range and high of the acting controls, shape (entries, B) each."""
+        return tuple(each.take(step, axis=1) for each in self._bounds) if self._varying else self._bounds
 
     def _wrong_agents(self, actions: Mapping[str, object]) -> str:
         for agent in actions:

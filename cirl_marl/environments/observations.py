@@ -18,9 +18,9 @@ from cirl_marl.network.rowsum import spans
 class Signals:
     """Rows of the signal table: quantities, time, service levels, set-points of nodes and arcs.
 
-    The quantities are stocks, flows, inner states, measures and masses on the way along batch arcs. Stocks, flows,
-    masses on the way and set-points are divided by the scale of their compartment (what a batch arc delivers in a
-    control interval too), time by the horizon.
+    The quantities are stocks, throughputs of nodes without stock, flows, inner states, measures and masses on the way
+    along batch arcs. All but inner states and measures, and the set-points, are divided by the scale of their
+    compartment (what a batch arc delivers in a control interval too), time by the horizon.
 
     Attributes:
         quantities: number of quantities.
@@ -30,10 +30,11 @@ class Signals:
 
     def __init__(self, dynamics: Dynamics) -> None:
         """Lay out the signals of a network."""
-        network, inner, nodes = dynamics.network, dynamics.inner, dynamics.rows.nodes.stop
+        network, inner, nodes = dynamics.network, dynamics.inner, len(dynamics.network.nodes)
         arcs, lines, services = len(network.arcs), len(dynamics.batches.lines), len(network.services)
         parts = spans((nodes, arcs, len(inner.names), len(inner.measure_names), lines, 1, services, nodes + arcs))
         self.nodes, self.flows, self.states, self.measures, self.loads, time, self.levels, self.set_points = parts
+        self.passing = slice(dynamics.rows.nodes.stop, nodes)
         self.quantities, self.time, self.rows = self.loads.stop, time.start, self.set_points.stop
         self.inside = self.quantities > self.flows.stop  # whether there are quantities besides stocks and flows
 
@@ -164,7 +165,7 @@ class ObservationLayout:
 
     def _signal_names(self, states: Sequence[str]) -> Iterator[str]:
         network = self._network
-        yield from (f"stock of {node.id}" for node in network.nodes)
+        yield from (f"{'stock' if node.stores else 'throughput'} of {node.id}" for node in network.nodes)
         yield from (f"flow of {arc.id}" for arc in network.arcs)
         yield from states
         yield from (f"mass on {arc}" for arc in self._load)
@@ -181,12 +182,16 @@ class ObservationLayout:
         known = signals.flows.stop
         low[:known], high[:known] = -np.inf, np.inf
         if dynamics.physical:
-            mass = sum(node.initial[1] for node in network.nodes)
+            mass = network.initial[1].sum()
             drive = np.where(dynamics.driver == dynamics.rows.unit, 1.0, mass)
             drive[dynamics.driver > dynamics.rows.unit] = np.inf
             flows = drive * dynamics.max_rate
             flows[dynamics.batches.arcs] = mass
-            limits = np.concatenate([np.full(signals.nodes.stop, mass), flows]) / scales
+            through = dynamics.routing.most(flows)
+            flows[dynamics.routing.arcs] = (
+                through.take(dynamics.routing.donors) * dynamics.max_rate[dynamics.routing.arcs]
+            )
+            limits = np.concatenate([np.full(signals.passing.start, mass), through, flows]) / scales
             low[:known], high[:known] = 0.0, limits * (1 + 1e-6) + 1e-6
         low[known : signals.quantities], high[known : signals.quantities] = -np.inf, np.inf
         low[signals.loads] = 0.0

@@ -78,7 +78,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         self.observation_names = self.batch.observation_names
         self.action_spaces = dict(self.batch.action_spaces)
         self.state_names = self.batch.state_names
-        self._entries = sum(len(neutral) for neutral in self.batch.neutral_action.values())
+        self._entries = sum(neutral.shape[1] for neutral in self.batch.neutral_action.values())
         self.state_space = Box(-np.inf, np.inf, (len(self.state_names) + 1,), np.float64)
         self.render_mode = render_mode
         self._canvas: Any = None
@@ -93,8 +93,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
     @property
     def neutral_action(self) -> dict[str, NDArray[np.float32]]:
-        """The action of each agent that leaves it neutral."""
-        return {agent: action.astype(np.float32) for agent, action in self.batch.neutral_action.items()}
+        """The action of each agent that leaves it neutral in the coming interval."""
+        return {agent: action[0].astype(np.float32) for agent, action in self.batch.neutral_action.items()}
 
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[_Seen, Infos]:
         """Start an episode; ``options={"initial_state": {node: stock}}`` starts it from a given state."""
@@ -153,7 +153,10 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         return {agent: seen[0] for agent, seen in observation.items()}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``."""
+        """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``.
+
+        Flows are means over the last step, and λ is that of these flows, with what has moved in batches up to its end.
+        """
         if self.render_mode is None:
             raise CirlError(f"render() needs render_mode, one of {', '.join(RENDER_MODES)}, when it is made")
         from cirl_marl.drawing.digraph import Canvas

@@ -103,7 +103,7 @@ class Credit:
         imagined = np.tile(controls, (1, count))
         for i, agent in enumerate(agents):
             rows = dynamics.network.control_rows[agent]
-            imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows, None]
+            imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows].take(state.step, axis=1)
         transition = dynamics.advance(
             np.tile(state.stock, (1, count)), np.tile(state.inner, (1, count)), imagined, np.tile(state.step, count)
         )

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from cirl_marl.environments.observations import ObservationLayout
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.rowsum import RowSum
+from cirl_marl.network.series import Series
 
 
 class Scoring:
     """Scores stocks and mean flows.
 
-    The local reward of compartment c with quantity q (stock of a node, mean flow of an arc) is::
+    The local reward of compartment c with quantity q (stock or throughput of a node, mean flow of an arc) is::
 
         r_c = −((q − set_point)/scale)² − Σ_s weight_s · shortfall_s,    s over the services that c owes
 
@@ -36,11 +37,12 @@ class Scoring:
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         services = network.services
         self._measure = _measurement(network, layout)
-        self._low = np.array([s.low for s in services]).reshape(-1, 1)
-        self._high = np.array([s.high for s in services]).reshape(-1, 1)
+        bands = [np.array([network.held(getattr(s, end)) for s in services]) for end in ("low", "high")]
+        self._low, self._high = (each.reshape(len(services), network.episode.horizon) for each in bands)
+        self._varying = any(isinstance(band, Series) for s in services for band in (s.low, s.high))
+        if not self._varying:
+            self._low, self._high = self._low[:, :1], self._high[:, :1]
         self._bounded = bool(np.isfinite(self._high).any())
-        self._no_least = np.flatnonzero(self._low[:, 0] == 0.0)
-        self._low[self._no_least] = 1.0
         modelled = [position[c.id] for c in compartments if c.model is not None]
         count = len(compartments)
         terms = count + len(services) + len(modelled)
@@ -58,13 +60,15 @@ class Scoring:
         self._weighted_shortfall = RowSum([0] * len(services), every, [s.weight for s in services], shape)
         self._sum_of_levels = RowSum([0] * len(services), every, 1.0, shape)
 
-    def levels(self, quantities: Floats) -> Floats:
-        """Return the level of each service in [0, 1], shape (services, B)."""
+    def levels(self, quantities: Floats, step: Integers) -> Floats:
+        """Return the level of each service in [0, 1], shape (services, B), in the interval ``step`` of each copy."""
         measured = self._measure(quantities)
-        level: Floats = measured / self._low
-        level[self._no_least] = 1.0
+        low, high = self._low, self._high
+        if self._varying:
+            low, high = low.take(step, axis=1), high.take(step, axis=1)
+        level: Floats = np.divide(measured, low, out=np.ones_like(measured), where=low > 0)
         if self._bounded:
-            np.divide(self._high, measured, out=level, where=measured > self._high)
+            np.divide(high, measured, out=level, where=measured > high)
         np.minimum(level, 1.0, out=level)
         return np.maximum(level, 0.0, out=level)
 

@@ -38,8 +38,8 @@ class Starts:
         self._physical, self._nodes, self._inner = dynamics.physical, dynamics.rows.nodes, inner
         self._ranged = np.concatenate([np.arange(nodes), nodes + inner.ranged])
         self._own = np.setdiff1d(np.arange(len(self.names)), self._ranged)
-        self._low = np.concatenate([[node.initial[0] for node in network.nodes], inner.low])
-        self._width = np.concatenate([[node.initial[1] for node in network.nodes], inner.high]) - self._low
+        self._low = np.concatenate([network.initial[0], inner.low])
+        self._width = np.concatenate([network.initial[1], inner.high]) - self._low
 
     def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
         """Return the state in which every copy starts, shape (rows, B); see ``VectorEnv.reset``."""

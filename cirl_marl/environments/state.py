@@ -26,7 +26,7 @@ class State:
     step: Annotated[Integers, "control intervals done, shape (B,)"]
     batched: Annotated[Floats, "m_fb of this episode, in two parts as in ``Network.circularity``, shape (2, B), mass"]
     circularity: Annotated[Floats, "sum over the episode of the interval means of λ, shape (B,), mass"]
-    service: Annotated[Floats, "sum over the episode of the service level, shape (B,)"]
+    service: Annotated[Floats, "sum over the episode of the level of each service, shape (services, B)"]
 
     def copied(self) -> State:
         """Return the state with arrays of its own."""
@@ -67,7 +67,8 @@ class Outcome:
     local: Annotated[Floats, "local rewards, shape (agents, B)"]
     circularity: Annotated[Floats, "λ at the end of the interval, shape (B,), mass"]
     circularity_mean: Annotated[Floats, "mean of λ over the interval, shape (B,), mass"]
-    service_level: Annotated[Floats, "shape (B,)"]
+    levels: Annotated[Floats, "level of each service, shape (services, B)"]
+    service_level: Annotated[Floats, "their mean, shape (B,); 1 without services"]
     flow: Annotated[Floats, "mean flows, shape (arcs, B), mass/time"]
     truncated: Annotated[NDArray[np.bool_], "time limit reached, shape (B,)"]
     success: Annotated[Mapping[str, NDArray[np.bool_]], "whether the task of a compartment's model is done, shape (B,)"]

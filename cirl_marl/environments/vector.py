@@ -111,8 +111,15 @@ class VectorEnv:
 
     @property
     def neutral_action(self) -> dict[str, Floats]:
-        """Normalised action of each agent that leaves it neutral, shape (entries,) each."""
-        return self._actuators.neutral_action
+        """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each."""
+        return self._actuators.neutral_action(self._coming())
+
+    def normalised(self, agent: str, values: Floats) -> Floats:
+        """Return the action that comes closest to physical values of an agent's control in the coming interval.
+
+        Values have shape (entries of its action, num_envs), actions (num_envs, entries).
+        """
+        return self._actuators.normalised(agent, values, self._coming()).T
 
     @property
     def physical(self) -> State:
@@ -181,29 +188,30 @@ class VectorEnv:
         horizon = self.network.episode.horizon
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
-        controls = self._actuators.controls(actions)
+        controls = self._actuators.controls(actions, state.step)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step)
         quantities, flow = self._measured(transition, controls)
-        levels = self.scoring.levels(quantities)
+        levels = self.scoring.levels(quantities, state.step)
         service = self.scoring.service_level(levels)
         terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
         local = self.scoring.local(terms)
         circularity, mean, batched = self._credit.circularity(state, transition, flow)
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
-        measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + service)
+        measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + levels)
         self._state = State(transition.stock, transition.inner, flow, measures, step, batched, *totals)
         observation = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
-        return Outcome(observation, reward, local, circularity, mean, service, flow, step >= horizon, success)
+        return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)
 
     def local_rewards(self) -> dict[str, Floats]:
         """Return the local reward that the current state gives each compartment, acting or not, shape (B,)."""
         state = self.physical
-        neutral = np.repeat(self.dynamics.neutral[:, None], self.num_envs, axis=1)
+        done = np.maximum(state.step - 1, 0)  # the interval that the state is scored in
         quantities = self._quantities(state)
-        inner = self.dynamics.inner.rewards(state.inner, state.inner, neutral)
-        rewards = self.scoring.local_of_all(self.scoring.terms(quantities, self.scoring.levels(quantities), inner))
+        inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral.take(done, axis=1))
+        levels = self.scoring.levels(quantities, done)
+        rewards = self.scoring.local_of_all(self.scoring.terms(quantities, levels, inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
 
     def state(self) -> Floats:
@@ -240,9 +248,10 @@ class VectorEnv:
         state, ended = self.physical, outcome.truncated
         steps = np.maximum(state.step, 1)
         final, whole = self.by_agent(outcome.observation), self.state()
+        service = self.scoring.service_level(state.service / steps)
         for agent, info in infos.items():
             info |= {"final_observation": final[agent], "final_state": whole, "_final_observation": ended}
-            info |= {"episode_circularity": state.circularity / steps, "episode_service_level": state.service / steps}
+            info |= {"episode_circularity": state.circularity / steps, "episode_service_level": service}
 
     def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in the copies that ended and return the observation of all."""
@@ -254,14 +263,20 @@ class VectorEnv:
         self._state = old.renewed(ended, self._fresh(drawn))
         return self._observe(self._state)
 
+    def _coming(self) -> Integers:
+        """Return the index of the coming interval in each copy, shape (num_envs,); at the end that of the last."""
+        step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
+        return np.minimum(step, self.network.episode.horizon - 1)
+
     def _fresh(self, drawn: Floats) -> State:
         """State at the start of an episode; flows and measures are those that neutral control would give."""
         dynamics, batch = self.dynamics, drawn.shape[1]
         stocks, inner = self.rows.split(drawn)
-        stock, step, zeros = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp), np.zeros(batch)
-        neutral = np.repeat(dynamics.neutral[:, None], batch, axis=1)
+        stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
+        neutral = dynamics.neutral.take(step, axis=1)
         flow, measures = dynamics.start_flow(stock, inner, neutral), dynamics.inner.measures(inner, neutral)
-        return State(stock, inner, flow, measures, step, np.zeros((2, batch)), zeros, zeros)
+        sums = (np.zeros(shape) for shape in ((2, batch), (batch,), (len(self.network.services), batch)))
+        return State(stock, inner, flow, measures, step, *sums)
 
     def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
         """Return all quantities in one array, and the mean flows, which are read-only."""
@@ -270,6 +285,8 @@ class VectorEnv:
         flow = quantities[signals.flows]
         np.divide(transition.moved, self.network.episode.control_interval, out=flow)
         quantities[self.rows.nodes] = transition.stock[self.rows.nodes]
+        if signals.passing.start < signals.passing.stop:
+            quantities[signals.passing] = self.network.throughput(flow)
         if signals.inside:
             quantities[signals.states] = transition.inner
             quantities[signals.measures] = dynamics.inner.measures(transition.inner, controls)
@@ -279,12 +296,14 @@ class VectorEnv:
 
     def _quantities(self, state: State) -> Floats:
         loads = self.dynamics.batches.loads(state.stock)
-        return np.concatenate([state.stock[self.rows.nodes], state.flow, state.inner, state.measures, loads])
+        through = self.network.throughput(state.flow)
+        return np.concatenate([state.stock[self.rows.nodes], through, state.flow, state.inner, state.measures, loads])
 
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
-        return self.layout.observe(quantities, time, self.scoring.levels(quantities))
+        levels = self.scoring.levels(quantities, np.maximum(state.step - 1, 0))
+        return self.layout.observe(quantities, time, levels)
 
 
 def _share(weight: float) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
@@ -37,8 +38,8 @@ class Entry:
 
     Attributes:
         gain: circularity gain over neutral control from the same start, shape (episodes,).
-        bound: what no λ̄ of an episode from the same start with at least the same mean service level exceeds, shape
-            (episodes,), mass; None if nothing is proved.
+        bound: what no λ̄ of an episode from the same start with at least the same mean level of each service exceeds,
+            shape (episodes,), mass; None if nothing is proved.
     """
 
     name: str
@@ -56,7 +57,7 @@ class Entry:
 
     @property
     def service(self) -> Floats:
-        """Mean service level of each episode, shape (episodes,)."""
+        """Mean of the services' levels in each episode, shape (episodes,)."""
         return self.rollout.episode_service
 
     @property
@@ -127,7 +128,7 @@ def compare(
     scenario: str | None = None,
     episodes: int = 64,
     seed: int = 0,
-    min_service: float | None = None,
+    min_service: ArrayLike | None = None,
     bounds: bool = True,
     progress: ProgressReport = lambda what, share: None,
 ) -> Comparison:
@@ -143,7 +144,8 @@ def compare(
         scenario: of ``network``; None is the default.
         episodes: at least 2.
         seed: different seeds share no episode.
-        min_service: mean service level that ``mpc`` and ``optimum`` plan for; None: as much as can be had.
+        min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
+            None: as much as can be had.
         bounds: whether to hold the episodes against the best possible.
         progress: called with what is being done and the share of all that is done.
 
@@ -195,7 +197,7 @@ def _measured(
     """Return the yardstick of all rows, and the bounds of the episodes of each rollout."""
     services: dict[str, list[Floats]] = {}
     for name, run in zip(names, rollouts, strict=True):
-        services.setdefault(name, []).append(run.episode_service)
+        services.setdefault(name, []).append(run.episode_levels)
     delivered = [np.mean(each, axis=0) for each in services.values()]
     try:
         measure = yardstick(
@@ -203,7 +205,7 @@ def _measured(
         )
         proved: list[Floats | None] = []
         for run in rollouts:
-            proved.append(measure.at(starts, run.episode_service))
+            proved.append(measure.at(starts, run.episode_levels))
             progress(SOLVING + (1 - SOLVING) * len(proved) / len(rollouts))
         return measure, proved
     except NoCertificate as missing:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+from numpy.typing import ArrayLike
+
 from cirl_marl.controllers.basic import Controller
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError
@@ -30,7 +32,7 @@ class Contender:
 
 
 def contenders(
-    runs: Sequence[RunDirectory], controllers: Sequence[str], network: Network | None, min_service: float | None
+    runs: Sequence[RunDirectory], controllers: Sequence[str], network: Network | None, min_service: ArrayLike | None
 ) -> tuple[list[Contender], VectorEnv]:
     """Return everyone who is compared, and a copy of the environment that they share.
 
@@ -128,7 +130,7 @@ def _policy(run: RunDirectory) -> Controller:
     return Trained(run)
 
 
-def _untrained(name: str, env: Callable[[int], VectorEnv], min_service: float | None) -> Contender:
+def _untrained(name: str, env: Callable[[int], VectorEnv], min_service: ArrayLike | None) -> Contender:
     demanded = min_service if name in ("mpc", "optimum") else None
     controller = partial(named_controller, name, min_service=demanded)
     controller()  # an unknown name fails before anything is computed

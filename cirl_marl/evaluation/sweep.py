@@ -21,6 +21,7 @@ from cirl_marl.evaluation.yardsticks import FRONT
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
+from cirl_marl.optimum.maximise import highest_service
 from cirl_marl.optimum.mpc import SERVICE_FIRST
 
 WEIGHED = ("mixed", "mixed_difference", "team")
@@ -29,10 +30,11 @@ WEIGHED = ("mixed", "mixed_difference", "team")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """A point in the plane of mean service level and λ̄: a ``bound``, ``plan``, ``trained`` or ``neutral``.
+    """A point in the plane of service and λ̄: a ``bound``, ``plan``, ``trained`` or ``neutral``.
 
-    Of a bound, the service is the least that is demanded, and λ̄ the highest with this service or more. ``weight`` is
-    the circularity weight, and ``seed`` the training seed, of what was trained.
+    The service is the mean level of the service that lacks most. Of a bound, it is demanded of every service, and λ̄ is
+    the highest with this level or more. ``weight`` is the circularity weight, and ``seed`` the training seed, of what
+    was trained.
     """
 
     kind: str
@@ -49,7 +51,7 @@ class Sweep:
     Attributes:
         recipe: what was trained; None for nothing.
         reason: why there is no bound; empty if there is.
-        front: service levels and what the multipliers of all bounds prove there, shape (levels, 2).
+        front: levels of every service and what the multipliers of all bounds prove there, shape (levels, 2).
     """
 
     network: Network
@@ -78,9 +80,10 @@ def pareto(
 ) -> Sweep:
     """Sweep the weight between circularity and service.
 
-    The bound and its plans start in the middle of all initial ranges and demand a mean service level from what the
-    highest circularity leaves to the most there can be. Learners are trained with circularity weights from 0 to 1, in
-    ``directory/runs``; a finished run there is not repeated, an interrupted one goes on.
+    The bound and its plans start in the middle of all initial ranges. They demand the same mean level of every service,
+    from the least that the highest circularity leaves one to the most that all can have at once. Learners are trained
+    with circularity weights from 0 to 1, in ``directory/runs``; a finished run there is not repeated, an interrupted
+    one goes on.
 
     Args:
         network: catalogue name, definition file, or network.
@@ -190,17 +193,18 @@ def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[
     found: list[Point] = []
     bounds: list[Bound] = []
     progress("bounds and plans", 0.0)
-    least, most = (bound(network, service_weight=weight).service for weight in (1 / SERVICE_FIRST, SERVICE_FIRST))
+    least = float(bound(network, service_weight=1 / SERVICE_FIRST).levels.min(initial=1.0))
+    most = highest_service(network)
     for place, level in enumerate(_levels(least, most, points)):
         solved = bound(network, min_service=level, near=bounds[-1] if bounds else None)
         bounds.append(solved)
         found.append(Point(kind="bound", service=level, circularity=solved.objective))
         episode = achieved(improved(solved, progress=part_of(progress, "bounds and plans", place / points, 1 / points)))
-        service, circularity = float(episode.episode_service[0]), float(episode.episode_circularity[0])
+        service, circularity = float(episode.least_service[0]), float(episode.episode_circularity[0])
         found.append(Point(kind="plan", service=service, circularity=circularity))
         progress("bounds and plans", (place + 1) / points)
     levels = np.linspace(least, most, FRONT)
-    return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels)], axis=1)
+    return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels[:, None])], axis=1)
 
 
 def _levels(least: float, most: float, points: int) -> list[float]:
@@ -214,7 +218,7 @@ def _learnt(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
     for entry in compare(runs, ["neutral"], episodes=episodes, bounds=False).entries:
         yield Point(
             kind="neutral" if entry.run is None else "trained",
-            service=float(entry.service.mean()),
+            service=float(entry.rollout.least_service.mean()),
             circularity=float(entry.circularity.mean()),
             weight=None if entry.run is None else entry.run.config.options["circularity_weight"],
             seed=entry.seed,

@@ -1,8 +1,8 @@
-"""How good each episode could have been: bounds on λ̄ for its own start and the service that it delivered.
+"""How good each episode could have been: bounds on λ̄ for its own start and the services that it delivered.
 
-An episode is held against the best λ̄ of those that deliver at least as much, so that none looks good by starving the
-service. For each row of a comparison two programs are solved, at the mean start and where that one proves least; their
-multipliers prove a bound for every other start and service, so that no episode needs a program of its own.
+An episode is held against the best λ̄ of those that deliver at least as much of each, so that none looks good by
+starving a service. For each row of a comparison two programs are solved, at the mean start and where that one proves
+least; their multipliers prove a bound for every other start and service, so that no episode needs a program of its own.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Yardstick:
 
     Attributes:
         envelope: proves them; None if nothing is proved.
-        front: service levels and bounds on λ̄ at the mean start, shape (points, 2), by service.
+        front: levels demanded of every service and bounds on λ̄ at the mean start, shape (points, 2), by level.
         reason: why nothing is proved; empty if something is, or nothing was asked for.
     """
 
@@ -39,9 +39,12 @@ class Yardstick:
     front: Floats
     reason: str = ""
 
-    def at(self, starts: Floats, service: Floats) -> Floats | None:
-        """Return the bounds of episodes from ``starts``, shape (episodes, nodes), with the mean levels ``service``."""
-        return None if self.envelope is None else self.envelope.at(starts, np.clip(service, 0.0, 1.0))
+    def at(self, starts: Floats, levels: Floats) -> Floats | None:
+        """Return the bounds of episodes from ``starts``, shape (episodes, nodes), with the mean ``levels`` of services.
+
+        These are of shape (episodes, services).
+        """
+        return None if self.envelope is None else self.envelope.at(starts, np.clip(levels, 0.0, 1.0))
 
 
 def yardstick(
@@ -52,7 +55,7 @@ def yardstick(
     *,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Yardstick:
-    """Solve the programs for ``services``, the mean service levels, shape (episodes,), that each row delivered.
+    """Solve the programs for ``services``, the mean levels, shape (episodes, services), that each row delivered.
 
     ``starts`` are of shape (episodes, nodes), mass; ``progress`` is called with the share that is done.
 
@@ -60,7 +63,7 @@ def yardstick(
         NoCertificate: if the network has flows for which nothing is proved.
         CirlError: if the solver fails.
     """
-    members: dict[int, tuple[Bound, ...]] = {}
+    members: dict[tuple[int, ...], tuple[Bound, ...]] = {}
     near: Bound | None = None
     for row, service in enumerate(services):
 
@@ -69,7 +72,7 @@ def yardstick(
 
         tell(0)
         demanded = np.maximum(np.floor((service - MARGIN) / STEP) * STEP, 0.0)
-        level = round(float(demanded.mean()) / STEP)
+        level = tuple(np.rint(demanded.mean(axis=0) / STEP).astype(int).tolist())
         if level not in members:
             found = envelope(
                 network, starts, solves=SOLVES, min_service=demanded, agents=agents or None, near=near, progress=tell
@@ -77,5 +80,6 @@ def yardstick(
             members[level] = found.members
             near = found.members[0]
     everyone = Envelope(tuple(each for level in sorted(members) for each in members[level]))
-    levels = STEP * np.linspace(min(members), max(members), FRONT)
-    return Yardstick(everyone, np.stack([levels, everyone.at(starts.mean(axis=0), levels)], axis=1))
+    least = [min(level, default=1.0 / STEP) for level in members]
+    levels = STEP * np.linspace(min(least), max(least), FRONT)
+    return Yardstick(everyone, np.stack([levels, everyone.at(starts.mean(axis=0), levels[:, None])], axis=1))

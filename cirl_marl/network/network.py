@@ -24,6 +24,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.network.declared import declarations
 from cirl_marl.network.elements import SINKS, Compartment, Law, Node, Role, Service
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
@@ -172,6 +173,13 @@ class Network(Parts):
     def agents(self) -> tuple[str, ...]:
         """Compartments that act by default."""
         return self.acting or self.controllable
+
+    @cached_property
+    def changing(self) -> tuple[str, ...]:
+        """Compartments of which a number, or a bound of the control, changes in time."""
+        parts = [(c.id, part) for c in self.compartments.values() for part in (c, c.control) if part is not None]
+        found = (i for i, p in parts if any(isinstance(getattr(p, name), Series) for name in declarations(type(p))))
+        return tuple(dict.fromkeys(found))
 
     @cached_property
     def sustainability(self) -> Floats:

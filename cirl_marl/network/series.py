@@ -36,6 +36,11 @@ class Series(Checked, Changing):
     ] = None
     origin: Annotated[str, Declared("where it was read from, for messages")] = ""
 
+    def __format__(self, spec: str) -> str:
+        """Say its lowest and its highest value."""
+        low, high = extremes(self)
+        return f"{low:{spec}} … {high:{spec}}"
+
     @property
     def end(self) -> float:
         """Time up to which it is known."""
@@ -86,8 +91,3 @@ Value = float | Series
 def extremes(value: Value) -> tuple[float, float]:
     """Return the lowest and the highest value."""
     return (min(value.values), max(value.values)) if isinstance(value, Series) else (value, value)
-
-
-def varies(value: object) -> bool:
-    """Whether a value changes in time."""
-    return isinstance(value, Series)

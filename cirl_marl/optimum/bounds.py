@@ -43,8 +43,9 @@ class Bound:
         objective: the bound, proved by ``verify()``: of λ̄ (mass), or of λ̄/scale + w·service with a service weight.
         value: the bound on λ̄, or with a service weight λ̄ of the plan, mass.
         service: mean service level of the plan.
+        levels: mean level of each service under the plan, shape (services,).
         service_weight: w; None if the objective is λ̄.
-        min_service: mean service level demanded; None for none.
+        min_service: mean level demanded of each service, shape (services,); None for none.
         degree: degree of the test polynomials.
         circularity: mean of λ over each interval under the plan, shape (steps,), mass.
         stock: planned stocks at the start and after each interval, shape (steps + 1, stores), mass.
@@ -62,8 +63,9 @@ class Bound:
     objective: float
     value: float
     service: float
+    levels: Floats
     service_weight: float | None
-    min_service: float | None
+    min_service: Floats | None
     degree: int
     circularity: Floats
     stock: Floats
@@ -76,8 +78,10 @@ class Bound:
 
     def __str__(self) -> str:
         """Say what is proved, in one line."""
-        mass, demand = self.network.mass_unit, f", service level at least {self.min_service:g}"
-        what = f"λ̄ ≤ {self.objective:.6g} {mass}{'' if self.min_service is None else demand}"
+        mass, demand = self.network.mass_unit, ""
+        if self.min_service is not None and self.network.services:
+            demand = f", service level at least {said_levels(self.network, self.min_service)}"
+        what = f"λ̄ ≤ {self.objective:.6g} {mass}{demand}"
         if self.service_weight is not None:
             what = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
         return (
@@ -97,7 +101,8 @@ class Bound:
 
         Args:
             initial: stocks at the start, shape (..., stores), mass; None is the bound's own.
-            min_service: demanded mean levels in [0, 1], shape (...); None is the bound's own.
+            min_service: demanded mean levels in [0, 1], of each service, shape (..., services), or one for all of them,
+                a number or shape (..., 1); None is the bound's own.
 
         Returns:
             Bounds of the objective, in the broadcast shape (...).
@@ -138,16 +143,16 @@ class Envelope:
         if starts.shape[-1:] != (nodes,):
             raise CirlError(f"initial has shape {starts.shape}, expected (..., {nodes})")
         demanded = _demanded(first, min_service)
-        shape = np.broadcast_shapes(starts.shape[:-1], demanded.shape)
-        starts = np.broadcast_to(starts, (*shape, nodes)).reshape(-1, nodes)
-        demanded = np.broadcast_to(demanded, shape).ravel()
+        shape = np.broadcast_shapes(starts.shape[:-1], () if demanded is None else demanded.shape[:-1])
         programs = Programs(Admissible.of(first.network, first.agents or None), first.degree, first.service_weight)
-        found = np.empty(len(starts))
-        for i, (start, level) in enumerate(zip(starts, demanded.tolist(), strict=True)):
-            check_stocks(first.network, start)
-            problem = programs.program(start, None if first.min_service is None else level)
+        starts = np.broadcast_to(starts, (*shape, nodes))
+        levels = None if demanded is None else np.broadcast_to(demanded, (*shape, demanded.shape[-1]))
+        found = np.empty(shape)
+        for i in np.ndindex(shape):
+            check_stocks(first.network, starts[i])
+            problem = programs.program(starts[i], None if levels is None else levels[i])
             found[i] = min(proved(problem, each.certificate) for each in self.members)
-        return found.reshape(shape)
+        return found
 
 
 def check_stocks(network: Network, stocks: Floats) -> None:
@@ -161,23 +166,44 @@ def check_stocks(network: Network, stocks: Floats) -> None:
             raise CirlError(f"initial: the stock of '{node.id}' is {stock}; it must be finite and not negative")
 
 
-def check_service(level: float) -> None:
-    """Refuse a mean service level outside [0, 1].
+def check_service(min_service: ArrayLike) -> None:
+    """Refuse mean service levels outside [0, 1].
 
     Raises:
-        CirlError: naming the level.
+        CirlError: naming the first of them.
     """
-    if not 0 <= level <= 1:
-        raise CirlError(f"min_service {level!r} must lie in [0, 1]")
+    for level in np.ravel(min_service).tolist():
+        if not 0 <= level <= 1:
+            raise CirlError(f"min_service {level!r} must lie in [0, 1]")
 
 
-def _demanded(bound: Bound, min_service: ArrayLike | None) -> Floats:
-    """Return the demanded levels; NaN if there is none."""
+def demanded_levels(network: Network, min_service: ArrayLike, episodes: tuple[int, ...] = ()) -> Floats:
+    """Return the demanded mean level of each service, shape (*episodes, services); a number is for every service.
+
+    Raises:
+        CirlError: for a shape that cannot be broadcast to it.
+    """
+    shape = (*episodes, len(network.services))
+    try:
+        return np.broadcast_to(np.asarray(min_service, dtype=float), shape)
+    except ValueError:
+        ids = ", ".join(service.id for service in network.services) or "none"
+        message = f"min_service has shape {np.shape(min_service)}, expected {shape}: a level for each service ({ids})"
+        raise CirlError(message) from None
+
+
+def said_levels(network: Network, levels: Floats) -> str:
+    """Say levels of the services, shape (services,): a single number if they are all the same."""
+    if len(set(levels.tolist())) == 1:
+        return f"{levels[0]:g}"
+    return ", ".join(f"{level:g} of '{service.id}'" for level, service in zip(levels, network.services, strict=True))
+
+
+def _demanded(bound: Bound, min_service: ArrayLike | None) -> Floats | None:
+    """Return the demanded levels, shape (..., services); None if there are none."""
     if min_service is None:
-        return np.asarray(np.nan if bound.min_service is None else bound.min_service)
+        return bound.min_service
     if bound.min_service is None:
         raise CirlError("min_service: this bound demands no service; solve it with min_service")
-    demanded = np.asarray(min_service, dtype=float)
-    for level in demanded.ravel().tolist():
-        check_service(level)
-    return demanded
+    check_service(min_service)
+    return demanded_levels(bound.network, min_service, np.shape(min_service)[:-1])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from numpy.typing import ArrayLike
+
 from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.optimum.admissible import NoCertificate
@@ -28,7 +30,7 @@ class Optimum(Planner):
 
     ahead = 0.99
 
-    def __init__(self, *, min_service: float | None = None, service_weight: float | None = None) -> None:
+    def __init__(self, *, min_service: ArrayLike | None = None, service_weight: float | None = None) -> None:
         """Choose the objective; see ``bound``."""
         self._min_service, self._service_weight = min_service, service_weight
         self.plans: list[Bound] | list[Incumbent] = []

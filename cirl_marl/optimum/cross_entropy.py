@@ -27,13 +27,14 @@ from cirl_marl.controllers.scripted import Scripted
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.optimum.bounds import demanded_levels
 from cirl_marl.optimum.gaussians import Gaussians, stages
 from cirl_marl.optimum.maximise import DEGREE, check_options
 from cirl_marl.optimum.population import Episodes, Population, named, starting_states
 
 SHORTFALL_PRICE = 10.0
-"""What a mean service level that is short of ``min_service`` by 1 costs, against λ̄/circularity_scale. The penalty is
-exact where more service costs less than that; a steeper one lets the draws hug the demanded level and stall there."""
+"""What a service whose mean level is short of ``min_service`` by 1 costs, against λ̄/circularity_scale. The penalty is
+exact where more of it costs less than that; a steeper one lets the draws hug the demanded level and stall there."""
 KNOTS = 16
 """Stretches of an episode with deviations of their own, unless another number is asked for."""
 
@@ -52,6 +53,7 @@ class Incumbent:
         actions: normalised actions, shape (steps, entries).
         circularity: λ̄ that the plan achieves in the simulator, mass.
         service: mean service level that it achieves.
+        levels: mean level of each service, shape (services,).
         candidates: λ̄ and mean service level of each controller that the search could begin with.
         origin: the candidate that it began with.
         evaluations: episodes simulated from this start, those of the candidates included.
@@ -63,6 +65,7 @@ class Incumbent:
     actions: Floats
     circularity: float
     service: float
+    levels: Floats
     candidates: Mapping[str, tuple[float, float]]
     origin: str
     evaluations: int
@@ -80,7 +83,7 @@ def search(
     initial: Mapping[str, float] | ArrayLike | None = None,
     *,
     service_weight: float | None = None,
-    min_service: float | None = None,
+    min_service: ArrayLike | None = None,
     agents: Sequence[str] | None = None,
     scenario: str | None = None,
     horizon: int | None = None,
@@ -94,15 +97,15 @@ def search(
     """Look for the actions that do best over one episode, for any network; nothing is proved about the result.
 
     The merit of an episode is λ̄/circularity_scale; with ``service_weight`` w, λ̄/circularity_scale + w·(mean service
-    level); with ``min_service`` s, λ̄/circularity_scale − SHORTFALL_PRICE·max(0, s − mean service level): a plan may
-    miss s if no better one was found, and its ``service`` tells.
+    level); with ``min_service`` s, λ̄/circularity_scale − SHORTFALL_PRICE·Σ max(0, s − mean level), over the services: a
+    plan may miss s if no better one was found, and its ``levels`` tell.
 
     Args:
         network: catalogue name, path of a definition file, or a network.
         initial: node → stock and ``compartment.state`` → inner state, the rest as in the first episode of evaluations;
             or all of them, shape (rows,). None: the first episode of evaluations, ``rollout``'s.
         service_weight: w ≥ 0; excludes ``min_service``.
-        min_service: s in [0, 1].
+        min_service: s in [0, 1], for every service, or one for each, shape (services,).
         agents: who acts; None is the network's own choice.
         scenario: scenario of the definition; None is the default.
         horizon: decisions per episode; None takes the definition's.
@@ -144,7 +147,7 @@ def search_each(
     initial: Floats,
     *,
     service_weight: float | None = None,
-    min_service: float | None = None,
+    min_service: ArrayLike | None = None,
     agents: Sequence[str] | None = None,
     candidates: Mapping[str, Controller] | None = None,
     knots: int = KNOTS,
@@ -165,7 +168,8 @@ def search_each(
             raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
     if knots > network.episode.horizon:
         raise CirlError(f"knots: {knots} are more than the {network.episode.horizon} decisions of an episode")
-    merit = _Merit(network.objective.circularity_scale, service_weight, min_service)
+    demanded = None if min_service is None else demanded_levels(network, min_service)
+    merit = _Merit(network.objective.circularity_scale, service_weight, demanded)
     starts = np.asarray(initial, dtype=float)
     copies = Population(network, agents, starts, population)
     known = standard_candidates(copies.agents) if candidates is None else dict(candidates)
@@ -203,6 +207,7 @@ def search_each(
             actions=best.actions[i],
             circularity=float(best.circularity[i]),
             service=float(best.service[i]),
+            levels=best.levels[i],
             candidates=dict(
                 zip(known, zip(first.circularity[i].tolist(), first.service[i].tolist(), strict=True), strict=True)
             ),
@@ -226,7 +231,7 @@ class _Merit:
 
     scale: float
     service_weight: float | None
-    min_service: float | None
+    min_service: Floats | None
 
     def of(self, episodes: Episodes) -> Floats:
         """Return the merit of each episode, shape (starts, copies)."""
@@ -234,7 +239,8 @@ class _Merit:
         if self.service_weight is not None:
             merit = merit + self.service_weight * episodes.service
         if self.min_service is not None:
-            merit = merit - SHORTFALL_PRICE * np.maximum(0.0, self.min_service - episodes.service)
+            lack = np.maximum(0.0, self.min_service[:, None, None] - episodes.levels)
+            merit = merit - SHORTFALL_PRICE * lack.sum(axis=0)
         return merit
 
 
@@ -247,6 +253,7 @@ class _Best:
         merit: shape (starts,).
         circularity: λ̄, shape (starts,), mass.
         service: mean service level, shape (starts,).
+        levels: of each service, shape (starts, services).
         actions: shape (starts, steps, entries).
     """
 
@@ -254,6 +261,7 @@ class _Best:
     merit: Floats
     circularity: Floats
     service: Floats
+    levels: Floats
     actions: Floats
 
     @classmethod
@@ -261,7 +269,8 @@ class _Best:
         """Return the first of the best ``episodes``, of ``merit`` (starts, copies)."""
         copy, start = merit.argmax(axis=1), np.arange(len(merit))
         actions = np.stack([episodes.actions[:, :, i, c] for i, c in zip(start, copy, strict=True)])
-        return cls(copy, merit[start, copy], episodes.circularity[start, copy], episodes.service[start, copy], actions)
+        figures = episodes.circularity[start, copy], episodes.service[start, copy], episodes.levels[:, start, copy].T
+        return cls(copy, merit[start, copy], *figures, actions)
 
     def or_better(self, other: _Best) -> _Best:
         """Return the better of the two from each start, these if they are equal."""
@@ -271,5 +280,6 @@ class _Best:
             np.where(better, other.merit, self.merit),
             np.where(better, other.circularity, self.circularity),
             np.where(better, other.service, self.service),
+            np.where(better[:, None], other.levels, self.levels),
             np.where(better[:, None, None], other.actions, self.actions),
         )

@@ -26,7 +26,7 @@ from cirl_marl.optimum.solver import best_values
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
 PENALTY = 3.0
-"""Price of missing service in the merit, times the price that the bound puts on it."""
+"""Price of what a service lacks in the merit, times the price that the bound puts on it."""
 TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions."""
 
@@ -34,28 +34,29 @@ TRUST, SMALLEST = 0.25, 1e-5
 def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None] = lambda share: None) -> Bound:
     """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
 
-    The merit is the objective of the bound; service below ``min_service`` is charged PENALTY times what the bound says
-    it costs to provide. Local optimality is all that is sought; ``bound.gap`` says how much better any plan could be.
+    The merit is the objective of the bound; what each service lacks of ``min_service`` is charged PENALTY times what
+    the bound says it costs to provide. Local optimality is all that is sought; ``bound.gap`` says how much better any
+    plan could be.
 
     Args:
         bound: with the actions to start from.
         rounds: most linear programs to solve.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
-    price = _price(bound)
+    prices = _prices(bound)
     best, run = bound, achieved(bound)
-    merit, trust = _merit(bound, run, price), TRUST
+    merit, trust = _merit(bound, run, prices), TRUST
     for done in range(rounds):
         if trust < SMALLEST:
             break
-        step = _step(best, run, price, trust)
+        step = _step(best, run, prices, trust)
         progress((done + 1) / rounds)
         if step is None:  # a smaller region is another program
             trust /= 4
             continue
         candidate = replace(best, actions=np.clip(best.actions + step, -1.0, 1.0))
         tried = achieved(candidate)
-        gained = _merit(bound, tried, price) - merit
+        gained = _merit(bound, tried, prices) - merit
         if gained > 0:
             best, run, merit, trust = candidate, tried, merit + gained, min(1.0, 2 * trust)
         else:
@@ -64,20 +65,28 @@ def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None
     return best
 
 
-def _price(bound: Bound) -> float:
-    """Merit of one unit of service: the weight, or the price that covers what the certificate asks for it."""
-    if bound.service_weight is not None:
-        return bound.service_weight
-    if bound.min_service is None or not bound.network.services:
-        return 0.0
-    return PENALTY * max(float(-bound.certificate.under[-1]), bound.network.objective.circularity_scale)
+def _prices(bound: Bound) -> Floats:
+    """Return what the merit charges for a unit that each service lacks, which covers what the certificate asks for it.
+
+    Shape (services,); 0 if nothing is demanded.
+    """
+    services = len(bound.network.services)
+    if bound.min_service is None:
+        return np.zeros(services)
+    charged = -bound.certificate.under[len(bound.certificate.under) - services :]
+    return PENALTY * np.maximum(charged, bound.network.objective.circularity_scale)
 
 
-def _merit(bound: Bound, run: Rollout, price: float) -> float:
-    circularity, service = float(run.episode_circularity[0]), float(run.episode_service[0])
+def _merit(bound: Bound, run: Rollout, prices: Floats) -> float:
+    circularity = float(run.episode_circularity[0])
     if bound.service_weight is not None:
-        return circularity / bound.network.objective.circularity_scale + price * service
-    return circularity - price * max(0.0, (bound.min_service or 0.0) - service)
+        scale = bound.network.objective.circularity_scale
+        return circularity / scale + bound.service_weight * float(run.episode_service[0])
+    return circularity - float(prices @ np.maximum(0.0, _demanded(bound) - run.episode_levels[0]))
+
+
+def _demanded(bound: Bound) -> Floats:
+    return np.zeros(len(bound.network.services)) if bound.min_service is None else bound.min_service
 
 
 def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
@@ -106,12 +115,12 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     return slopes[:, :, :nodes], slopes[:, :, nodes:]
 
 
-def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | None:
+def _step(bound: Bound, run: Rollout, prices: Floats, trust: float) -> Floats | None:
     """Return the best change of the actions within the trust region to first order, shape (steps, entries).
 
     None if HiGHS finds none.
 
-    Variables of an interval: δx', δf̄, δa, the levels, the imbalance; after the last, missing service.
+    Variables of an interval: δx', δf̄, δa, the levels, the imbalance; after the last, what each service lacks.
     """
     network = bound.network
     steps, entries = bound.actions.shape
@@ -137,20 +146,10 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | No
     rows[:, np.arange(services), level + np.arange(services)] = low.T
     rows[:, services:, :outputs], rows[:, services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0
     limits = np.concatenate([realised @ measure.T, -(realised @ imbalances)[:, None] * [1.0, -1.0]], axis=1)
-    cost = _cost(bound, size, level, price)
-    missing = np.zeros((1, steps * size + 1))
-    if services:
-        share = np.zeros(size)
-        share[level:imbalance] = -1.0 / (steps * services)
-        missing[0, :-1], missing[0, -1] = np.tile(share, steps), -1.0
-    under = sparse.vstack(
-        [
-            sparse.hstack([_diagonal(rows, rows.shape[1:]), sparse.csr_array((rows.shape[0] * rows.shape[1], 1))]),
-            missing,
-        ],
-        format="csr",
-    )
-    demanded = (bound.min_service or 0.0) if services and bound.service_weight is None else 0.0
+    # mean level + lack ≥ demanded level
+    means = sparse.kron(np.full((1, steps), -1.0 / steps), sparse.eye_array(services, size, k=level))
+    per_interval = _diagonal(rows, rows.shape[1:])
+    under = sparse.block_array([[per_interval, None], [means, -sparse.eye_array(services)]], format="csr")
     bounds = np.tile(np.array([-np.inf, np.inf]), (steps, size, 1))
     bounds[:, :nodes, 0] = -run.stock
     bounds[:, outputs:level] = np.stack(
@@ -158,13 +157,13 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | No
     )
     bounds[:, level:imbalance] = [0.0, 1.0]
     bounds[:, imbalance, 0] = 0.0
-    low, high = np.concatenate([bounds.reshape(-1, 2), [[0.0, np.inf]]]).T
+    low, high = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services, 1))]).T
     problem = LinearProgram(
-        cost=np.append(np.tile(cost, steps), price if demanded else 0.0),
-        equal=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, 1))], format="csr"),
+        cost=np.append(np.tile(_cost(bound, size, level), steps), prices),
+        equal=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, services))], format="csr"),
         equal_to=np.zeros(steps * outputs),
         under=under,
-        under_to=np.append(limits.ravel(), -demanded),
+        under_to=np.append(limits.ravel(), -_demanded(bound)),
         low=low,
         high=high,
     )
@@ -173,8 +172,8 @@ def _step(bound: Bound, run: Rollout, price: float, trust: float) -> Floats | No
     largest = np.maximum(np.abs(realised).max(axis=0), [part.scale for part in parts])
     net = max(float(np.abs(realised @ imbalances).max()), network.objective.circularity_scale)
     sizes = np.concatenate([largest, np.ones(entries + services), [net]])
-    found = best_values(problem, np.append(np.tile(sizes, steps), 1.0))
-    return None if found is None else found[:-1].reshape(steps, size)[:, outputs:level]
+    found = best_values(problem, np.append(np.tile(sizes, steps), np.ones(services)))
+    return None if found is None else found[: steps * size].reshape(steps, size)[:, outputs:level]
 
 
 def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:
@@ -194,7 +193,7 @@ def _measures(bound: Bound) -> tuple[Floats, Floats]:
     return measure, np.concatenate([np.zeros(nodes), -network.circularity_weights[1]])
 
 
-def _cost(bound: Bound, size: int, level: int, price: float) -> Floats:
+def _cost(bound: Bound, size: int, level: int) -> Floats:
     """Return the cost of the variables of one interval: minus the share in λ̄, or in the weighted objective."""
     network, steps = bound.network, len(bound.actions)
     nodes, services = len(network.stores), len(network.services)
@@ -206,5 +205,5 @@ def _cost(bound: Bound, size: int, level: int, price: float) -> Floats:
     cost[nodes : nodes + len(counted)] = -counted / steps
     if bound.service_weight is not None:
         cost /= network.objective.circularity_scale
-        cost[level : level + services] = -price / (steps * max(services, 1))
+        cost[level : level + services] = -bound.service_weight / (steps * max(services, 1))
     return cost

@@ -18,6 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy import sparse
 
 from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import VectorEnv
@@ -25,12 +27,13 @@ from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats
 from cirl_marl.optimum.actions import normalised_actions
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.bounds import demanded_levels
 from cirl_marl.optimum.maximise import check_options
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis, Infeasible, Solution, Unsolved, solve
 
 SERVICE_FIRST = 1000.0
-"""Weight of the mean service level, against λ̄/circularity_scale, where the demanded level is out of reach."""
+"""Weight of the mean service level, against λ̄/circularity_scale, where a demanded level is out of reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +68,10 @@ class _Plan:
         return None if basis is None else basis.without_first(self.problem, intervals.start - self.intervals.start)
 
     def levels(self) -> Floats:
-        """Return the planned mean service level of each interval, shape (intervals,)."""
+        """Return the planned level of each service in each interval, shape (intervals, services)."""
         assert self.problem is not None and self.solution is not None
         layout = self.problem.layout
-        levels = self.solution.plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
-        return levels.mean(axis=1) if levels.size else np.ones(len(levels))
+        return self.solution.plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
 
     def prices(self) -> Floats:
         """Return what the rows of the next interval charge for the stocks at the end of each, shape (intervals, nodes).
@@ -97,9 +99,9 @@ class MPC(Planner):
     """Plans again and again from the current stocks; each copy has its own plan.
 
     The objective is λ̄ of the episode; with ``service_weight`` w, λ̄/circularity_scale + w·service. With ``min_service``
-    the mean level over the whole episode is held at the demanded level or above: what the past intervals lacked the
-    planned ones have to make up for. If that is out of reach, w = SERVICE_FIRST takes the place of the demand in that
-    plan, which then comes as close as it can.
+    the mean level of each service over the whole episode is held at the demanded level or above: what the past
+    intervals lacked the planned ones have to make up for. If that is out of reach for one of them, w = SERVICE_FIRST
+    takes the place of the demand in that plan. It then comes as close as it can: no service counts beyond its demand.
     """
 
     ahead = 0.1  # a first plan takes longer than the later ones, which start from it
@@ -108,7 +110,7 @@ class MPC(Planner):
         self,
         *,
         horizon: int | None = None,
-        min_service: float | None = None,
+        min_service: ArrayLike | None = None,
         service_weight: float | None = None,
         degree: int = 1,
         replan: int = 4,
@@ -117,7 +119,8 @@ class MPC(Planner):
 
         Args:
             horizon: decisions that a plan looks ahead; None looks to the end of the episode.
-            min_service: mean service level demanded, in [0, 1]; excludes ``service_weight``.
+            min_service: mean level demanded, in [0, 1], of every service, or of each, shape (services,); excludes
+                ``service_weight``.
             service_weight: w ≥ 0.
             degree: degree of the test polynomials; see ``bound``.
             replan: decisions carried out of each plan.
@@ -139,8 +142,10 @@ class MPC(Planner):
 
         Raises:
             NoCertificate: for a network whose flows are not linear laws; see ``bound``.
+            CirlError: for another number of demanded levels than services.
         """
         network = env.network
+        self._levels = None if self._demanded is None else demanded_levels(network, self._demanded)
         self.note = ""
         self._env = env
         self._admissible = Admissible.of(network, env.agents or None)
@@ -186,7 +191,7 @@ class MPC(Planner):
     def _solved(self, copy: int, rest: range, window: range, last: _Plan | None) -> _Plan:
         """Plan the ``window`` of what is left of the episode, the ``rest``."""
         state, steps = self._env.physical, self._env.network.episode.horizon
-        missing = None if self._demanded is None else self._demanded * steps - float(state.service[copy])
+        missing = None if self._levels is None else self._levels * steps - state.service[:, copy]
         if len(window) == len(rest):
             return self._plan(copy, window, missing, last.basis(window) if last else None)
         if last is None:
@@ -196,7 +201,7 @@ class MPC(Planner):
         outlook = self._outlooks[copy]
         after = window.stop - outlook.intervals.start
         if missing is not None:
-            missing -= float(outlook.levels()[after:].sum())
+            missing -= outlook.levels()[after:].sum(axis=0)
         return self._plan(copy, window, missing, last.basis(window) if last else None, outlook.prices()[after - 1])
 
     def _older(self, copy: int, window: range, last: _Plan | None) -> _Plan:
@@ -217,7 +222,7 @@ class MPC(Planner):
         self,
         copy: int,
         intervals: range,
-        missing: float | None,
+        missing: Floats | None,
         basis: Basis | None,
         prices: Floats | None = None,
         certified: bool = False,
@@ -227,13 +232,14 @@ class MPC(Planner):
         Args:
             copy: whose stocks they start from.
             intervals: to be planned.
-            missing: least sum of the service levels of all intervals; None if nothing is demanded.
+            missing: least sum of the levels of each service over all intervals, shape (services,); None if nothing is
+                demanded.
             basis: from which the solver starts.
             prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
             certified: whether the multipliers must be good.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
-        demanded = None if missing is None else max(0.0, missing / len(intervals))
+        demanded = None if missing is None else np.maximum(0.0, missing / len(intervals))
         unit = 1.0
         what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
@@ -244,14 +250,14 @@ class MPC(Planner):
                 raise
             unit = self._env.network.objective.circularity_scale
             prices = None if prices is None else prices / unit
-            problem = self._priced(self._urgent, stock, intervals, 0.0, prices)
+            problem = _capped(self._priced(self._urgent, stock, intervals, demanded, prices))
             solution = solve(problem, basis, what=what, certified=certified)
         planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
         actions = self._actions(problem, intervals, planned)
         return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)
 
     def _priced(
-        self, programs: Programs, stock: Floats, intervals: range, demanded: float | None, prices: Floats | None
+        self, programs: Programs, stock: Floats, intervals: range, demanded: Floats | None, prices: Floats | None
     ) -> Program:
         """Return the program of some intervals with the objective of the episode, plus what the last stocks cost."""
         problem = programs.program(stock, demanded, intervals)
@@ -260,3 +266,14 @@ class MPC(Planner):
         if prices is not None:
             cost[-1, layout.end(-1) : layout.level] += prices
         return replace(problem, cost=cost.ravel())
+
+
+def _capped(problem: Program) -> Program:
+    """Return the program in which the mean level of each service counts up to what is demanded, and is not held there.
+
+    A level is a variable of at most q/low, so that a service may be better than what is counted of it.
+    """
+    under, services = problem.under, len(problem.layout.network.services)
+    held = np.arange(len(problem.under_to)) >= len(problem.under_to) - services
+    sign = np.where(held, -1.0, 1.0)
+    return replace(problem, under=sparse.csr_array(sparse.diags_array(sign) @ under), under_to=problem.under_to * sign)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from numpy.typing import ArrayLike
+
 from cirl_marl.controllers.basic import Constant, Controller, Neutral, Random
 from cirl_marl.controllers.lqr import LQR
 from cirl_marl.controllers.scripted import Scripted
@@ -15,14 +17,15 @@ CONTROLLERS = ("neutral", "constant", "random", "scripted", "lqr", "mpc", "optim
 
 
 def named_controller(
-    name: str, *, held: Mapping[str, float] | None = None, min_service: float | None = None
+    name: str, *, held: Mapping[str, float] | None = None, min_service: ArrayLike | None = None
 ) -> Controller:
     """Return a controller, not yet started.
 
     Args:
         name: one of CONTROLLERS.
         held: agent → constant value in [−1, 1], of a constant or scripted controller.
-        min_service: mean service level that ``mpc`` and ``optimum`` plan for; None: as much as can be had.
+        min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
+            None: as much as can be had.
 
     Raises:
         CirlError: for an unknown name, or options that the controller does not take.
@@ -45,13 +48,13 @@ def named_controller(
     return makers[name]()
 
 
-def _mpc(min_service: float | None) -> Controller:
+def _mpc(min_service: ArrayLike | None) -> Controller:
     from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
 
     return MPC(min_service=min_service, service_weight=SERVICE_FIRST if min_service is None else None)
 
 
-def _optimum(min_service: float | None) -> Controller:
+def _optimum(min_service: ArrayLike | None) -> Controller:
     from cirl_marl.optimum.controller import Optimum
     from cirl_marl.optimum.mpc import SERVICE_FIRST
 

@@ -21,6 +21,7 @@ class Episodes:
     Attributes:
         circularity: λ̄, shape (starts, copies), mass.
         service: mean service level, shape (starts, copies).
+        levels: mean level of each service, shape (services, starts, copies).
         actions: normalised actions, shape (steps, entries, starts, copies).
         deviation: mean between knots of what actions, once clipped, had beyond the controller's, shape
             (starts, copies, knots, entries).
@@ -28,6 +29,7 @@ class Episodes:
 
     circularity: Floats
     service: Floats
+    levels: Floats
     actions: Floats
     deviation: Floats
 
@@ -97,9 +99,11 @@ class Population:
             progress((t + 1) / steps)
         realised /= counts[:, None, None]
         state = env.physical
+        levels = state.service / steps
         return Episodes(
             (state.circularity / steps).reshape(shape),
-            (state.service / steps).reshape(shape),
+            env.scoring.service_level(levels).reshape(shape),
+            levels.reshape(-1, *shape),
             actions.reshape(*actions.shape[:2], *shape),
             np.moveaxis(realised, 2, 0).reshape(deviation.shape),
         )

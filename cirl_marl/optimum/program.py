@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import sparse
 
 from cirl_marl.network import Floats, Integers
@@ -21,7 +22,6 @@ from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.rows import Chained, Rows
 from cirl_marl.optimum.scheduled import deliveries, openings, orders
 from cirl_marl.optimum.shared import followers, passing
-
 
 PIECES = 12
 """Most pieces of an interval; where the simulator has more substeps, they are merged."""
@@ -113,12 +113,13 @@ class Programs:
             self._under.add(kind, linked_under, under)
         self._weights, self._constant = objective(layout, service_weight)
 
-    def program(self, initial: Floats, min_service: float | None = None, intervals: range | None = None) -> Program:
-        """Return the program from ``initial``, shape (stores,), with at least the mean service level ``min_service``.
+    def program(self, initial: Floats, min_service: ArrayLike | None = None, intervals: range | None = None) -> Program:
+        """Return the program from ``initial``, shape (stores,), that gives each service the mean level demanded of it.
 
         Args:
             initial: stocks at the start, mass.
-            min_service: None if nothing is demanded.
+            min_service: least mean level of every service, or of each, shape (services,), to which the last rows of G
+                hold it; None if nothing is demanded.
             intervals: of the episode, one after the other; None is all of them.
 
         Raises:
@@ -134,11 +135,11 @@ class Programs:
         under, under_to = self._under.over(kinds, initial, cut)
         opened, opened_to = openings(self.admissible, reached, layout, when)
         blocks, limits = [under, opened], [under_to, opened_to]
-        if min_service is not None and network.services:
-            level = np.zeros(layout.size)
-            level[layout.level : layout.imbalance] = -1.0 / (len(network.services) * steps)
-            blocks.append(sparse.csr_array(np.tile(level, steps)[None]))
-            limits.append(np.array([-min_service]))
+        if min_service is not None:
+            services = len(network.services)
+            levels = sparse.eye_array(services, layout.size, k=layout.level)
+            blocks.append(sparse.kron(np.full((1, steps), -1.0 / steps), levels, format="csr"))
+            limits.append(-np.broadcast_to(min_service, services))
         low, high = _box(self.admissible, reached, layout, when)
         return Program(
             layout=layout,

@@ -46,7 +46,9 @@ def comparison_notes(comparison: Comparison) -> list[str]:
     if any(row.few for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
     if comparison.yardstick.envelope is not None:
-        notes.append("bound: no episode from the same start with at least the same service has a higher λ̄")
+        notes.append(
+            "bound: no episode from the same start with at least the same level of each service has a higher λ̄"
+        )
     elif comparison.yardstick.reason:
         notes.append(f"gap to bound: {comparison.yardstick.reason}")
         if any(row.name == "optimum" for row in comparison.rows):
@@ -66,7 +68,11 @@ def _aggregate(found: Aggregate | None, form: str) -> str:
 def save_comparison(path: str | Path, comparison: Comparison) -> Path:
     """Save where each policy and controller of a comparison is, training seed by training seed."""
     series = [
-        PointSeries(row.name, *np.array([[each.service.mean(), each.circularity.mean()] for each in row.entries]).T)
+        PointSeries(
+            row.name,
+            np.array([each.rollout.least_service.mean() for each in row.entries]),
+            np.array([each.circularity.mean() for each in row.entries]),
+        )
         for row in comparison.rows
     ]
     title = f"{comparison.network.title or comparison.network.name}: {comparison.episodes} episodes"

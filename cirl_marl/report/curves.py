@@ -30,7 +30,7 @@ MARKERS = "osD^vP*X"
 
 @dataclass(frozen=True, slots=True)
 class PointSeries:
-    """Points of one kind in the plane of mean service level and λ̄, mass, shape (points,) each; ``joined`` by a line."""
+    """Points of one kind in the plane of service level and λ̄, mass, shape (points,) each; ``joined`` by a line."""
 
     name: str
     service: Floats
@@ -41,13 +41,13 @@ class PointSeries:
 def save_circularity(
     path: str | Path, network: Network, time: Floats, runs: Mapping[str, Floats], services: Mapping[str, Floats]
 ) -> Path:
-    """Save λ(t) and, below it, the service level of several controls as a PNG and return its path.
+    """Save λ over time and, below it, the service level of several controls as a PNG and return its path.
 
     Lines are means over episodes; bands are the 95 % confidence intervals of the means (Student's t), where
     there are at least two episodes.
 
-    ``runs`` are λ, mass, and ``services`` service levels by control, of shape (episodes, steps), ``time`` (steps,);
-    other shapes raise a ``CirlError``.
+    ``runs`` are means of λ over the intervals, mass, and ``services`` service levels by control, of shape
+    (episodes, steps), ``time`` (steps,); other shapes raise a ``CirlError``.
     """
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
@@ -55,7 +55,8 @@ def save_circularity(
     for axes, curves, top in ((above, runs, math.inf), (below, services, 1.0)):
         for name, values in curves.items():
             _draw_mean(axes, time, _matching(name, values, time), name, names.index(name), top=top)
-    dressed(above, title="Circularity: means and their 95 % intervals", ylabel=f"λ / {network.mass_unit}")
+    title = "Mean circularity of each step, averaged over episodes, with 95 % intervals"
+    dressed(above, title=title, ylabel=f"λ / {network.mass_unit}")
     dressed(below, title="Service level", ylabel="service level")
     below.set_ylim(-0.03, 1.06)
     _set_time(below, time, network)
@@ -113,9 +114,9 @@ def save_trajectory(
         path: file to write; its folder is made.
         network: the network.
         time: shape (steps,), time.
-        stock: stocks, shape (nodes, steps), mass.
-        flow: flows, shape (arcs, steps), mass/time.
-        circularity: λ, shape (steps,), mass.
+        stock: stocks, shape (stores, steps), mass.
+        flow: mean flows of each interval, shape (arcs, steps), mass/time.
+        circularity: mean λ of each interval, shape (steps,), mass.
         start: stocks before the first step, then masses on batch arcs if ``load`` is given, mass; None leaves them out.
         load: masses on batch arcs, shape (batch arcs, steps), mass; None leaves them out.
         service: service level, shape (steps,); None leaves it out.
@@ -125,10 +126,10 @@ def save_trajectory(
         CirlError: if an array has the wrong shape.
     """
     steps, mass = (len(time),), network.mass_unit
-    stock = shaped("stock", stock, (len(network.nodes), *steps))
+    stock = shaped("stock", stock, (len(network.stores), *steps))
     flow = shaped("flow", flow, (len(network.arcs), *steps))
     circularity = shaped("circularity", circularity, steps)
-    held = [node.id for node in network.nodes]
+    held = [node.id for node in network.stores]
     if load is not None:
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {arc}" for arc in on_the_way]
@@ -142,9 +143,9 @@ def save_trajectory(
     figure.suptitle(title, fontsize=11, fontweight="bold")
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     _draw_largest(panels[0], held_at, stock, held, "Stocks", mass)
-    _draw_largest(panels[1], time, flow, [arc.id for arc in network.arcs], "Flows", f"{mass}/{network.time_unit}")
+    _draw_largest(panels[1], time, flow, [arc.id for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}")
     _draw_mean(panels[2], time, circularity, "", 0)
-    dressed(panels[2], title="Circularity", ylabel=f"λ / {mass}")
+    dressed(panels[2], title="Mean circularity", ylabel=f"λ / {mass}")
     if service is not None:
         _draw_mean(panels[3], time, shaped("service", service, steps), "", 0)
         dressed(panels[3], title="Service level", ylabel="service level")
@@ -158,7 +159,8 @@ def save_fronts(
 ) -> Path:
     """Save λ̄ against the service level of policies, plans or controllers as a PNG and return its path.
 
-    ``bound`` is service level and bound on λ̄, shape (points, 2), by service; what lies above is shaded. Empty for none.
+    Of several services it is the mean level of the one that lacks most. ``bound`` is the level of every service and the
+    bound on λ̄, shape (points, 2), by level; what lies above is shaded. Empty for none.
     """
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
@@ -178,7 +180,8 @@ def save_fronts(
     if len(bound):
         _draw_bound(axes, bound)
     dressed(axes, title=title, ylabel=f"λ̄ / {network.mass_unit}")
-    axes.set_xlabel("mean service level", fontsize=9)
+    of = "" if len(network.services) < 2 else " of the service that lacks most"
+    axes.set_xlabel(f"mean service level{of}", fontsize=9)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
     return save(figure, path)
 

@@ -73,7 +73,7 @@ def _is_evaluated(run: RunDirectory, figures: Mapping[str, Any]) -> bool:
 
 
 def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv) -> list[Path]:
-    """Draw the network before and after, λ(t) trained against neutral and random, and the learning curves.
+    """Draw the network before and after, λ over time trained against neutral and random, and the learning curves.
 
     There are no learning curves if no episode ended while training.
     """
@@ -82,10 +82,10 @@ def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv)
     network = env.network
     before, after = rollouts["neutral"], rollouts["trained"]
     first, last = ((each.final_stock, each.mean_flow) for each in (before, after))
-    labels = ("neutral: mean flows, last stocks", "trained: mean flows, last stocks")
-    means = float(before.circularity.mean()), float(after.circularity.mean())
+    labels = ("neutral: mean λ and flows, last stocks", "trained: mean λ and flows, last stocks")
+    means = float(before.episode_circularity.mean()), float(after.episode_circularity.mean())
     flows = save_before_after(folder / "flows_before_after.png", network, first, last, labels, means)
-    runs = {name: each.circularity for name, each in rollouts.items()}
+    runs = {name: each.circularity_mean for name, each in rollouts.items()}
     services = {name: each.service for name, each in rollouts.items()}
     circularity = save_circularity(folder / "circularity.png", network, interval_ends(network), runs, services)
     curves, metrics = folder / "learning_curves.png", run.metrics()

@@ -20,7 +20,7 @@ FILES = ("pareto.csv", "pareto.json", "pareto.png")
 def write_sweep(sweep: Sweep, folder: Path, **options: Any) -> list[Path]:
     """Write table, provenance and picture, all of them or none, and return their paths."""
     mass = sweep.network.mass_unit
-    header = ["kind", "service level", f"circularity ({mass})", "circularity weight", "training seed"]
+    header = ["kind", "least service level", f"circularity ({mass})", "circularity weight", "training seed"]
     plain = [[each.kind, each.service, each.circularity, each.weight, each.seed] for each in sweep.points]
     about = {"provenance": provenance(sweep.network, sweep.runs, **options), "no_bound": sweep.reason or None}
     with published(folder) as partial:

@@ -25,13 +25,15 @@ def networks_table(networks: Mapping[str, Network]) -> Table:
 
 
 def nodes_table(network: Network, stock: Floats) -> Table:
-    """One row a node: role, stock at the start, set-point, control."""
+    """One row a node: role, stock at the start, set-point, control; those that store nothing have no stock."""
     table = Table(title=f"{network.title or network.name}: nodes ({network.mass_unit})")
     _columns(table, "node", "role", "initial range", "stock", "set-point", "control")
-    for node, held in zip(network.nodes, stock, strict=True):
-        low, high = node.initial
-        span = f"{low:g}" if low == high else f"{low:g} – {high:g}"
-        table.add_row(node.id, node.role.value, span, f"{held:.5g}", _target(node), control_text(network, node))
+    for i, node in enumerate(network.nodes):
+        span, held = "stores nothing", ""
+        if node.stores:
+            low, high = network.initial[:, i]
+            span, held = f"{low:g}" if low == high else f"{low:g} – {high:g}", f"{stock[i]:.5g}"
+        table.add_row(node.id, node.role.value, span, held, _target(node), control_text(network, node))
     return table
 
 
@@ -42,7 +44,7 @@ def arcs_table(network: Network, flow: Floats) -> Table:
     signs = {1.0: "−", -1.0: "+", 0.0: ""}
     for k, arc in enumerate(network.arcs):
         sign = signs[float(network.sustainability[k])]
-        table.add_row(arc.id, law_text(arc), f"{flow[k]:.5g}", sign, _target(arc), control_text(network, arc))
+        table.add_row(arc.id, law_text(network, arc), f"{flow[k]:.5g}", sign, _target(arc), control_text(network, arc))
     return table
 
 
@@ -56,7 +58,7 @@ def _target(compartment: Compartment) -> str:
     return "" if compartment.set_point is None else f"{compartment.set_point:g}"
 
 
-def law_text(arc: Arc) -> str:
+def law_text(network: Network, arc: Arc) -> str:
     """Say the flow law of an arc as a formula."""
     if arc.law is Law.DONOR:
         return f"{arc.rate:g} x({arc.donor})"
@@ -69,7 +71,11 @@ def law_text(arc: Arc) -> str:
     if arc.law is Law.BATCH:
         what = f"{arc.rate:g} x {arc.port} of {arc.by}" if arc.by else f"{len(arc.batches)} on schedule"
         return f"batches: {what}, " + (f"after {arc.delay:g}" if arc.delay else "by vehicle")
-    return "series" if arc.times else f"{arc.flow[0]:g}"
+    if arc.law is Law.SHARE:
+        donor = network.nodes[network.node_index[arc.donor]]
+        share = "s" if arc.control else "rest" if arc.share is None else f"{arc.share:g}"
+        return f"{share} of {donor.rate:g} x({donor.id})" if donor.stores else f"{share} of {donor.id}"
+    return f"{arc.flow:g}"
 
 
 def control_text(network: Network, compartment: Compartment) -> str:
