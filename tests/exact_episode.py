@@ -33,12 +33,14 @@ class Piece:
         stock: at the quadrature points, shape (points, stores).
         flow: at the quadrature points, shape (points, arcs).
         end: stocks at its end, shape (stores,).
+        end_flow: flows at its end, shape (arcs,).
         cut: whether a scheduled flow was cut to what its donor held.
     """
 
     stock: Floats
     flow: Floats
     end: Floats
+    end_flow: Floats
     cut: bool
 
 
@@ -175,7 +177,7 @@ def intervals(network: Network, start: Floats, controls: list[Controls], substep
             at = solved @ np.concatenate([stock, incidence @ order])
             flow = at @ law.T + order
             stock = at[-1]
-            pieces.append(Piece(at[:-1], flow[:-1], at[-1], bool((factor < 1 - 1e-9).any())))
+            pieces.append(Piece(at[:-1], flow[:-1], at[-1], flow[-1], bool((factor < 1 - 1e-9).any())))
         mean = np.mean([WEIGHTS @ piece.flow for piece in pieces], axis=0)
         yield Interval(held, tuple(pieces), mean, _levels(network, stock, mean, step), _circularity(network, mean))
 

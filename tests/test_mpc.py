@@ -91,7 +91,11 @@ def test_a_short_window_sees_what_comes_after_where_the_service_is_out_of_reach(
     links = zip(steps, [*steps[1:], "use"], strict=True)
     chain = Network(
         name="chain",
-        nodes=(replace(RESERVE, initial=(1e3, 1e3), control=valve), *(Node(id=name) for name in (*steps, "use")), TIP),
+        nodes=(
+            replace(RESERVE, initial=(1e3, 1e3), control=valve),
+            *(replace(USE, id=name, initial=(0.0, 0.0)) for name in (*steps, "use")),
+            TIP,
+        ),
         arcs=(
             Arc(id="mining", donor="reserve", recipient=steps[0], rate=0.01),
             *(Arc(id=f"from_{i}", donor=donor, recipient=to, rate=0.7) for i, (donor, to) in enumerate(links)),

@@ -157,6 +157,8 @@ def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
                 stock = np.append(stock, flow @ entering)  # what passes through nodes that store nothing
                 found += [stock, flow, (valve * stock)[layout.valves]]
             found.append(merged[-1].end)
+            if layout.merged:
+                found += [merged[-1].end_flow @ entering, merged[-1].end_flow]
         found += [each.levels, np.array([imbalance(network, each.flow)]), valve[layout.openings]]
     return np.concatenate(found)
 
@@ -178,14 +180,14 @@ def assert_satisfies(problem: Program, v: Floats, mass: float) -> None:
         assert not wrong.any(), f"{of}: variable {place} is {v[column]}, out of its box"
 
 
-def assert_holds(played: Played, degree: int, weight: float | None = None, pieces: int = 12) -> None:
+def assert_holds(played: Played, degree: int, weight: float | None = None, merged: bool = False) -> None:
     """All rows hold for the episode and for its second half, and the objective is the simulator's.
 
     Raises:
         NoCertificate: if recipients may empty their donors from the start.
     """
     network, steps = played.network, played.network.episode.horizon
-    programs = Programs(Admissible.of(network, played.agents or None), degree, weight, pieces=pieces)
+    programs = Programs(Admissible.of(network, played.agents or None), degree, weight, merged=merged)
     layout, mass = programs.layout, float(played.start.sum())
     v = variables(layout, played.intervals)
     problem = programs.program(played.start, played.levels)
@@ -209,17 +211,25 @@ def assert_holds(played: Played, degree: int, weight: float | None = None, piece
 
 @given(
     network=st.from_type(Network),
-    interval=st.floats(0.02, 0.6),
+    interval=st.floats(0.02, 3.0),
     pulls=st.booleans(),
     seed=st.integers(0, 1000),
     style=st.sampled_from(["inside", "ends", "low", "high"]),
     degree=st.integers(1, 3),
     weight=st.sampled_from([None, 0.7]),
+    merged=st.booleans(),
 )
 def test_random_networks(
-    network: Network, interval: float, pulls: bool, seed: int, style: str, degree: int, weight: float | None
+    network: Network,
+    interval: float,
+    pulls: bool,
+    seed: int,
+    style: str,
+    degree: int,
+    weight: float | None,
+    merged: bool,
 ) -> None:
-    """Random networks with orders, valves, series and pulls, under random admissible controls."""
+    """Random networks with orders, valves, shares, series and pulls, under random admissible controls."""
     network = certifiable(network, interval, pulls)
     rng = np.random.default_rng(seed)
     agents = [agent for agent in network.agents if rng.random() < 0.8] or None
@@ -227,7 +237,7 @@ def test_random_networks(
         Programs(Admissible.of(network, agents), 1, None).program(network.initial[1])
     except NoCertificate:
         assume(False)
-    assert_holds(play(network, rng, style, agents), degree, weight)
+    assert_holds(play(network, rng, style, agents), degree, weight, merged)
 
 
 def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int, int], Network]) -> None:

@@ -31,7 +31,13 @@ TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions."""
 
 
-def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None] = lambda share: None) -> Bound:
+def improved(
+    bound: Bound,
+    *,
+    rounds: int = 20,
+    enough: Callable[[Rollout], bool] = lambda run: False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Bound:
     """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
 
     The merit is the objective of the bound; what each service lacks of ``min_service`` is charged PENALTY times what
@@ -41,15 +47,17 @@ def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None
     Args:
         bound: with the actions to start from.
         rounds: most linear programs to solve.
+        enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
     prices = _prices(bound)
     best, run = bound, achieved(bound)
-    merit, trust = _merit(bound, run, prices), TRUST
+    merit, trust, slopes = _merit(bound, run, prices), TRUST, None
     for done in range(rounds):
-        if trust < SMALLEST:
+        if trust < SMALLEST or enough(run):
             break
-        step = _step(best, run, prices, trust)
+        slopes = _jacobians(best, run) if slopes is None else slopes
+        step = _step(best, run, prices, trust, slopes)
         progress((done + 1) / rounds)
         if step is None:  # a smaller region is another program
             trust /= 4
@@ -58,7 +66,7 @@ def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None
         tried = achieved(candidate)
         gained = _merit(bound, tried, prices) - merit
         if gained > 0:
-            best, run, merit, trust = candidate, tried, merit + gained, min(1.0, 2 * trust)
+            best, run, merit, trust, slopes = candidate, tried, merit + gained, min(1.0, 2 * trust), None
         else:
             trust /= 4
     progress(1.0)
@@ -115,17 +123,17 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     return slopes[:, :, :nodes], slopes[:, :, nodes:]
 
 
-def _step(bound: Bound, run: Rollout, prices: Floats, trust: float) -> Floats | None:
+def _step(bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tuple[Floats, Floats]) -> Floats | None:
     """Return the best change of the actions within the trust region to first order, shape (steps, entries).
 
-    None if HiGHS finds none.
+    None if HiGHS finds none; ``slopes`` are the Jacobians around the episode.
 
     Variables of an interval: δx', δf̄, δa, the levels, the imbalance; after the last, what each service lacks.
     """
     network = bound.network
     steps, entries = bound.actions.shape
     nodes, arcs, services = len(network.stores), len(network.arcs), len(network.services)
-    by_stock, by_action = _jacobians(bound, run)
+    by_stock, by_action = slopes
     outputs = nodes + arcs
     size = outputs + entries + services + 1
     level, imbalance = outputs + entries, size - 1

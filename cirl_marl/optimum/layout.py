@@ -18,7 +18,8 @@ class Layout:
     """Where the variables of one interval lie.
 
     For each piece X_i, F_i and Z_i for i = 0 … d, then the stocks at its end; after the last piece, the levels, the
-    imbalance and the valves. Of a node that stores nothing X_i is its throughput, and there is no stock at the end.
+    imbalance and the valves. Of a node that stores nothing X_i is its throughput, and there is no stock at the end. At
+    the end of merged pieces are throughputs and flows, too, under the controls of their interval.
     Z_i = v·X_i is what the valve of a node lets through to several outflows. Moments are counted through all pieces.
 
     Attributes:
@@ -51,7 +52,12 @@ class Layout:
     def piece(self) -> int:
         """Variables of a piece."""
         means = len(self.network.nodes) + len(self.network.arcs) + len(self.valves)
-        return (self.degree + 1) * means + len(self.network.stores)
+        return (self.degree + 1) * means + self._ends
+
+    @cached_property
+    def _ends(self) -> int:
+        """Variables about the end of a piece."""
+        return len(self.network.nodes) + len(self.network.arcs) if self.merged else len(self.network.stores)
 
     @property
     def length(self) -> float:
@@ -67,7 +73,7 @@ class Layout:
         """Return the first of the weighted mean stocks X, then throughputs."""
         # each piece: d + 1 blocks of (X, F, Z), equally long, then the stocks at its end
         piece, i = divmod(moment, self.degree + 1)
-        return piece * self.piece + i * ((self.piece - len(self.network.stores)) // (self.degree + 1))
+        return piece * self.piece + i * ((self.piece - self._ends) // (self.degree + 1))
 
     def flow(self, moment: Place) -> Place:
         """Return the first of the weighted mean flows F."""
@@ -79,7 +85,16 @@ class Layout:
 
     def end(self, piece: Place) -> Place:
         """Return the first of the stocks at the end of a piece; −1 is the last."""
-        return (piece % self.pieces + 1) * self.piece - len(self.network.stores)
+        return (piece % self.pieces + 1) * self.piece - self._ends
+
+    @property
+    def last(self) -> slice:
+        """The stocks at the end of the interval."""
+        return slice(self.end(-1), self.end(-1) + len(self.network.stores))
+
+    def end_flow(self, piece: Place) -> Place:
+        """Return the first of the flows at the end of a merged piece, which stand behind the throughputs."""
+        return self.end(piece) + len(self.network.nodes)
 
     @property
     def level(self) -> int:

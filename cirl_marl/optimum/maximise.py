@@ -207,7 +207,7 @@ def _bounded(
         min_service=min_service,
         degree=layout.degree,
         circularity=circularity,
-        stock=np.concatenate([start[None], planned[:, layout.end(-1) : layout.level]]),
+        stock=np.concatenate([start[None], planned[:, layout.last]]),
         flow=layout.means(planned)[1],
         actions=normalised_actions(admissible, layout, planned),
         problem=problem,

@@ -6,7 +6,7 @@ flows weighted with B_i. Integration by parts and the flow laws hold for them ex
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,10 +21,11 @@ from cirl_marl.optimum.objective import measures, objective
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
 from cirl_marl.optimum.rows import Chained, Rows
 from cirl_marl.optimum.scheduled import deliveries, openings, orders
+from cirl_marl.optimum.settled import ends, settled
 from cirl_marl.optimum.shared import followers, passing
 
-PIECES = 12
-"""Most pieces of an interval; where the simulator has more substeps, they are merged."""
+LARGE = 30_000
+"""Variables beyond which the substeps of an interval, if there are several, are merged into one piece."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +83,7 @@ class Programs:
         service_weight: float | None,
         *,
         held: bool = False,
-        pieces: int = PIECES,
+        merged: bool | None = None,
     ) -> None:
         """Write down what does not depend on the start.
 
@@ -92,11 +93,12 @@ class Programs:
             service_weight: w of λ̄/circularity_scale + w·service; None if λ̄ is maximised.
             held: whether controls are constant within an interval to first order; the program then makes better plans
                 and bounds nothing.
-            pieces: most parts of an interval.
+            merged: whether an interval is one piece, though the simulator has substeps; None: if the program were large
+                otherwise.
         """
         self.admissible = admissible
         self._system = ComparisonSystem(admissible)
-        self.layout = layout = _layout(admissible, self._system.substeps, pieces, degree)
+        self.layout = layout = _layout(admissible, self._system.substeps, merged, degree)
         self._equal, self._under = Chained(layout), Chained(layout)
         for kind in np.unique(admissible.kinds).tolist():
             linked_equal, equal, linked_under, under = (Rows(layout) for _ in range(4))
@@ -108,6 +110,9 @@ class Programs:
                 _held(admissible, layout, kind, equal)
             deliveries(admissible, layout, kind, linked_under)
             falls(admissible, layout, kind, linked_under)
+            if layout.merged:
+                ends(admissible, layout, kind, equal, under)
+                settled(admissible, layout, kind, self._system.of_kind(kind), linked_under)
             measures(layout, admissible.served[kind], under)
             self._equal.add(kind, linked_equal, equal)
             self._under.add(kind, linked_under, under)
@@ -154,7 +159,7 @@ class Programs:
         )
 
 
-def _layout(admissible: Admissible, substeps: int, most: int, degree: int) -> Layout:
+def _layout(admissible: Admissible, substeps: int, merged: bool | None, degree: int) -> Layout:
     network = admissible.network
     nodes = len(network.nodes)
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
@@ -162,7 +167,10 @@ def _layout(admissible: Admissible, substeps: int, most: int, degree: int) -> La
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
-    return Layout(network, min(substeps, most), substeps > most, degree, valves, openings)
+    fine = Layout(network, substeps, False, degree, valves, openings)
+    if substeps > 1 and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
+        return replace(fine, pieces=1, merged=True)
+    return fine
 
 
 def _balances(layout: Layout, rows: Rows) -> None:
@@ -174,9 +182,9 @@ def _balances(layout: Layout, rows: Rows) -> None:
     network, d = layout.network, layout.degree
     moment, node = layout.moment_column, np.arange(len(network.stores))
     row = rows.add(moment, node)
-    for ends, sign in ((network.donors, 1.0), (network.recipients, -1.0)):
-        arcs = np.flatnonzero(ends < len(node))
-        rows.put(row[:, ends[arcs]], layout.flow(moment) + arcs, sign * layout.portion)
+    for side, sign in ((network.donors, 1.0), (network.recipients, -1.0)):
+        arcs = np.flatnonzero(side < len(node))
+        rows.put(row[:, side[arcs]], layout.flow(moment) + arcs, sign * layout.portion)
     for j in layout.moments:
         piece, i = divmod(j, d + 1)
         if i < d:  # Y_i
@@ -255,7 +263,12 @@ def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: rang
         low[:, layout.flow(i) : layout.valve(i)] = least
         high[:, layout.valve(i) :][:, : len(layout.valves)] = (reached.upper * valve[1])[:, layout.valves]
     for piece in range(layout.pieces):
-        high[:, layout.end(piece) : layout.end(piece) + len(network.stores)] = reached.upper[:, : len(network.stores)]
+        last = layout.end(piece)
+        high[:, last : last + len(network.stores)] = reached.upper[:, : len(network.stores)]
+        if layout.merged:
+            high[:, last : last + len(network.nodes)] = reached.upper
+            high[:, layout.end_flow(piece) :][:, : len(network.arcs)] = most
+            low[:, layout.end_flow(piece) :][:, : len(network.arcs)] = least
     high[:, layout.level : layout.imbalance] = 1.0
     weights = network.objective.reference_interval * np.abs(network.sustainability * network.environmental)
     high[:, layout.imbalance] = most @ weights

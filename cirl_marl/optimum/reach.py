@@ -54,7 +54,7 @@ class ComparisonSystem:
         self.substeps, self.substep = dynamics.substeps, dynamics.substep
         self._passes = Passes(admissible.network)
         self._routes: dict[bytes, Routes] = {}
-        self._linear: dict[int, _Linear] = {}
+        self._linear: dict[int, Linear] = {}
 
     def reach(self, initial: Floats, intervals: range) -> Reach:
         """Bound the stocks from ``initial``, shape (stores,), on, over the given intervals of the episode.
@@ -70,7 +70,7 @@ class ComparisonSystem:
         uncut = np.ones((steps, len(network.arcs)), dtype=bool)
         for step, interval in enumerate(intervals):
             least, most = np.where(scheduled, self.admissible.rate(interval), 0.0)
-            linear = self._of_kind(int(self.admissible.kinds[interval]))
+            linear = self.of_kind(int(self.admissible.kinds[interval]))
             entering, outgoing = self._by_node(most)
             incoming = linear.routes.most(entering)
             for _ in range(self.substeps):
@@ -103,30 +103,34 @@ class ComparisonSystem:
         gained, lost = (np.bincount(ends, flow, nodes).astype(float) for ends in (network.recipients, network.donors))
         return gained, lost[: len(network.stores)]
 
-    def _of_kind(self, kind: int) -> _Linear:
+    def of_kind(self, kind: int) -> Linear:
+        """Return what is proportional to stocks in a kind of interval."""
         if kind not in self._linear:
             passed_on = self.network.donors >= len(self.network.stores)
             key = self.admissible.rate(kind)[:, passed_on].tobytes()
             if key not in self._routes:
                 self._routes[key] = Routes(self.admissible, self._passes, kind)
-            self._linear[kind] = _Linear(self.admissible, kind, self._routes[key], self.substep)
+            self._linear[kind] = Linear(self.admissible, kind, self._routes[key], self.substep)
         return self._linear[kind]
 
 
-class _Linear:
+class Linear:
     """What is proportional to stocks in a kind of interval.
 
     Attributes:
         routes: what passes through nodes that store nothing.
         solution: of the lowest and the highest stocks after a substep, shape (2 stores,).
-        growth: the same of the highest, had they no outflow, shape (stores,).
+        gains: most that each stock gets, per stock, sparse, 1/time.
+        growth: the highest stocks after a substep, had they no outflow, shape (stores,).
         sent: most that enters each node that stores nothing, per stock, sparse, 1/time.
+        thrown: most that passes through these, likewise.
         pull: most that recipients pull from each stock, per stock, sparse, 1/time.
         pulled: stocks from which they do.
         share: z/(e^z − 1) for the most that leaves a stock in proportion to it in a substep, z.
     """
 
     def __init__(self, admissible: Admissible, kind: int, routes: Routes, substep: float) -> None:
+        """Compile it for the intervals like the first of that kind."""
         network, self.routes = admissible.network, routes
         stores, nodes = len(network.stores), len(network.nodes)
         driven = ~admissible.scheduled & (network.donors < stores)
@@ -159,8 +163,10 @@ class _Linear:
         self.solution = Held(sparse.coo_array((values, (rows, columns)), shape=(2 * stores, 2 * stores)), substep)
         gains = (np.append(recipient[straight], most.row), np.append(p[straight], most.col))
         values = np.append(high[straight], most.data)
-        self.growth = Held(sparse.coo_array((values, gains), shape=(stores, stores)), substep)
+        self.gains = sparse.csr_array(sparse.coo_array((values, gains), shape=(stores, stores)))
+        self.growth = Held(self.gains, substep)
         self.sent = entering(high, past | split)[stores:]
+        self.thrown = routes.through(self.sent)
         taken = (high[pulled], (donor[pulled], p[pulled]))
         self.pull = sparse.csr_array(sparse.coo_array(taken, shape=(stores, stores)))
         self.pulled = np.bincount(donor[pulled], minlength=stores) > 0

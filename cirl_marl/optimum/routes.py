@@ -8,7 +8,6 @@ import numpy as np
 from scipy import sparse
 
 from cirl_marl.dynamics.passes import Passes
-from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
 
 ROUNDING = 1e-9
@@ -28,6 +27,9 @@ class Routes:
     sum of first terms bounds it. The greatest number of visits V_ij to node j by what enters i solves
     V = I + max_s P(s) V, a Markov decision process; from a V that is too large this iteration falls towards it, so
     any iterate bounds it. What enters i reaches a stock in a share of at most V_i R̄, and of at most 1.
+
+    Attributes:
+        longest: most visits of all nodes together, at least 1.
     """
 
     def __init__(self, admissible: Admissible, passes: Passes, step: int) -> None:
@@ -45,7 +47,9 @@ class Routes:
             arrives, passed = arrives + passed @ arrives, passed @ passed
             if passed.max(initial=0.0) < ROUNDING:
                 break
-        visits = np.repeat(passes.total(step)[:, None], inner, axis=1)
+        total = passes.total(step)
+        self.longest = float(total.max(initial=1.0))
+        visits = np.repeat(total[:, None], inner, axis=1)
         for _ in range(ROUNDS if inner else 0):
             fewer = np.minimum(visits, np.eye(inner) + passes.best(visits, step))
             fallen = (visits - fewer).max()
@@ -65,7 +69,6 @@ class Routes:
         """Return the most that stocks get, likewise."""
         return entering[: self._stores] + self._most @ entering[self._stores :]
 
-    def through(self, entering: Floats) -> Floats:
+    def through(self, entering: Any) -> Any:
         """Return the most that passes through the nodes that store nothing, given what enters these from elsewhere."""
-        passing: Floats = self._visits @ entering
-        return passing
+        return self._visits @ entering

@@ -123,7 +123,7 @@ class Chained:
         # there is no interval before the first: its entries meet known stocks and go to the right-hand side
         layout, (matrix, loosen), before = self._layout, self._known[key], self._before[int(kinds[0])]
         first = np.zeros(layout.size)
-        first[layout.end(-1) : layout.level] = initial
+        first[layout.last] = initial
         to = loosen @ cut.ravel()
         to[: before.shape[0]] -= before @ first
         return matrix, to
