@@ -23,7 +23,7 @@ from cirl_marl.learners.recipe import Recipe
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network import Network
-from cirl_marl.network.elements import Arc, Control, ControlKind, Episode, Node
+from cirl_marl.network.elements import Arc, Control, ControlKind, Episode, Law, Node, Role
 
 TURNOVER = 0.2
 """Share of its stock that a node with outflows sends on in one control interval, as the faster nodes of copper_net."""
@@ -55,6 +55,42 @@ def random_network(arcs: int, seed: int = 0) -> Network:
             for k, (donor, recipient, rate) in enumerate(ends)
         ),
         episode=Episode(control_interval=1.0, horizon=1_000_000),
+    )
+
+
+def yearly_network(*, monthly: bool = False, stores: int = 100, passing: int = 400, seed: int = 0) -> Network:
+    """Return a yearly network of stocks with residence times of 5 to 50 years and of markets, most of them in loops.
+
+    Each market passes what it gets to two others and to a stock, each stock what it releases to two markets; a tenth of
+    the markets have an agent that sets a share, a tenth of the stocks are fed from outside. Markets store nothing; if
+    ``monthly``, they hold what they get for a month instead.
+    """
+    random = np.random.default_rng(seed)
+    asks = Control(kind=ControlKind.SHARE, low=0.1, neutral=0.3, high=0.5)
+    held = {"initial": (0.0, 0.0), "rate": 12.0} if monthly else {"stores": False}
+    years = random.uniform(5.0, 50.0, stores)
+    nodes = [Node(id=f"s{i}", initial=(50.0, 150.0), rate=1.0 / float(years[i])) for i in range(stores)]
+    nodes += [Node(id=f"m{j}", **held) for j in range(passing)]
+    arcs = []
+    for i in range(stores):
+        first, second = random.choice(passing, 2, replace=False)
+        arcs.append(Arc(id=f"s{i}_a", donor=f"s{i}", recipient=f"m{first}", law=Law.SHARE, share=0.6))
+        arcs.append(Arc(id=f"s{i}_b", donor=f"s{i}", recipient=f"m{second}", law=Law.SHARE))
+        if i % 10 == 0:
+            nodes.append(Node(id=f"mine{i}", role=Role.NONRENEWABLE_RESERVOIR))
+            arcs.append(Arc(id=f"feed{i}", donor=f"mine{i}", recipient=f"m{first}", law=Law.EXOGENOUS, flow=5.0))
+    for j in range(passing):
+        first, second = (j + 1 + random.choice(passing - 1, 2, replace=False)) % passing
+        share = {"control": asks} if j % 10 == 0 else {"share": 0.3}
+        arcs.append(Arc(id=f"m{j}_a", donor=f"m{j}", recipient=f"m{first}", law=Law.SHARE, **share))
+        arcs.append(Arc(id=f"m{j}_b", donor=f"m{j}", recipient=f"m{second}", law=Law.SHARE, share=0.2))
+        arcs.append(Arc(id=f"m{j}_c", donor=f"m{j}", recipient=f"s{random.integers(stores)}", law=Law.SHARE))
+    return Network(
+        name="yearly",
+        nodes=tuple(nodes),
+        arcs=tuple(arcs),
+        episode=Episode(control_interval=1.0, horizon=30),
+        time_unit="year",
     )
 
 

@@ -241,7 +241,7 @@ initial = { low = 0, high = 0, unit = "t", source = "forgotten" }
 from = "imports"
 to = "households"
 law = "exogenous"
-series = { times = [0, 1], time_unit = "year", values = [5, 6], unit = "t/day", source = "trade" }
+flow = { times = [0, 1], time_unit = "year", values = [5, 6], unit = "t/day", source = "trade" }
 """
     Path("bottles.toml").write_text(text)
     assert run(monkeypatch, "check", "bottles.toml") == 0

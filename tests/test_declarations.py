@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from cirl_marl import Arc, NetworkError, Node, load_network
 from cirl_marl.definitions.catalogue import folder
+from cirl_marl.definitions.columns import DataFiles
 from cirl_marl.definitions.conversion import Converter
 from cirl_marl.definitions.guide import format_guide
 from cirl_marl.definitions.mistakes import mistakes_of
@@ -45,7 +46,7 @@ def document(**more: object) -> dict[str, object]:
 
 def read(**more: object) -> Warmed:
     """Read an episode as the reader of definition files does."""
-    converter = Converter(NetworkTable.model_validate(DOCUMENT))
+    converter = Converter(NetworkTable.model_validate(DOCUMENT), DataFiles(Path()))
     found = converter._part(Warmed, table_of(Warmed).model_validate(document(**more)), "episode")
     if converter.mistakes:
         raise NetworkError("here", converter.mistakes)

@@ -30,6 +30,7 @@ from cirl_marl import (
     parallel_env,
 )
 from cirl_marl.controllers import Constant
+from cirl_marl.controllers.remarks import remarks
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.dynamics.passes import Passes
@@ -288,3 +289,10 @@ def test_a_loop_that_keeps_mass_in_one_interval_only() -> None:
     with pytest.raises(NetworkError, match=r"round in a loop in interval 2: "):
         markets(2, arcs, episode=Episode(horizon=4))
     assert moved(markets(2, [share("m0", "use", 0.1), *arcs[1:]]))["m0_m1"] == pytest.approx(63.0)
+
+
+def test_a_market_that_gets_nothing_is_remarked_on() -> None:
+    """It passes nothing, which is seldom meant; one that is fed is silent."""
+    network = markets(2, [share("m0", "use"), share("m1", "use")])
+    said = "node 'm1': it stores nothing and nothing enters it, so that nothing ever leaves it"
+    assert [remark for remark in remarks(network) if "stores nothing" in remark] == [said]

@@ -58,7 +58,9 @@ def random_network(nodes: int, arcs: int) -> Network:
     roles = {0: Role.NONRENEWABLE_RESERVOIR, nodes - 1: Role.LANDFILL}
     return Network(
         name="random",
-        nodes=tuple(Node(id=f"node_{i}", role=roles.get(i, Role.TECHNOSPHERE)) for i in range(nodes)),
+        nodes=tuple(
+            Node(id=f"node_{i}", role=roles.get(i, Role.TECHNOSPHERE), initial=(0.0, 0.0)) for i in range(nodes)
+        ),
         arcs=tuple(
             Arc(id=f"arc_{k}", donor=f"node_{i}", recipient=f"node_{j}", rate=0.1)
             for k, (i, j) in enumerate(sorted(pairs))
@@ -128,7 +130,7 @@ def test_long_chain_and_ring(tmp_path: Path, nodes: int) -> None:
     for pairs in (ring, ring[:-1]):
         network = Network(
             name="ring",
-            nodes=tuple(Node(id=f"n{i}") for i in range(nodes)),
+            nodes=tuple(Node(id=f"n{i}", initial=(0.0, 0.0)) for i in range(nodes)),
             arcs=tuple(Arc(id=f"a{i}", donor=f"n{i}", recipient=f"n{j}", rate=0.1) for i, j in pairs),
         )
         positions = arrangement_of(network, 1.4).positions

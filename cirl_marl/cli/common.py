@@ -23,10 +23,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-console = Console(width=None if sys.stdout.isatty() else 140)
-errors = Console(stderr=True)
+# without emoji=False rich prints a flag or a map for the region of FILE.toml:japan:
+console = Console(width=None if sys.stdout.isatty() else 140, emoji=False)
+errors = Console(stderr=True, emoji=False)
 
-NetworkName = Annotated[str, typer.Argument(metavar="NETWORK", help="Name in the catalogue, or a .toml file.")]
+NetworkName = Annotated[
+    str, typer.Argument(metavar="NETWORK", help="Name in the catalogue, or a file: FILE.toml, FILE.toml:REGION.")
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a training run.")]
 Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]

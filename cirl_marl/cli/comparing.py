@@ -22,7 +22,8 @@ def compare(
         str, typer.Option(help=f"Comma-separated, of {', '.join(CONTROLLERS)}; neutral is always there.")
     ] = "neutral,random",
     network: Annotated[
-        str | None, typer.Option(help="Catalogue name or .toml file; default: the network of the runs.")
+        str | None,
+        typer.Option(help="Catalogue name, FILE.toml or FILE.toml:REGION; default: the network of the runs."),
     ] = None,
     scenario: Scenario = None,
     episodes: EpisodeCount = 16,

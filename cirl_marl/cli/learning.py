@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 @app.command()
 def train(
     context: typer.Context,
-    network: Annotated[str | None, typer.Argument(metavar="NETWORK", help="Catalogue name or .toml file.")] = None,
+    network: Annotated[
+        str | None, typer.Argument(metavar="NETWORK", help="Catalogue name, FILE.toml or FILE.toml:REGION.")
+    ] = None,
     recipe: Annotated[str, typer.Option(help="Who learns how: catalogue name or .toml file.")] = "independent_ppo",
     agents: Annotated[
         str | None, typer.Option(help="Who acts and learns, comma-separated ids; default: the network's choice.")

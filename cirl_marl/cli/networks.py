@@ -25,7 +25,7 @@ from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, rollout
 from cirl_marl.controllers.shortages import shortages
-from cirl_marl.definitions.catalogue import load_network, networks, recipes
+from cirl_marl.definitions.catalogue import file_and_region, load_network, networks, recipes
 from cirl_marl.definitions.reading import Definition
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
@@ -150,7 +150,7 @@ def _check_network(source: str) -> None:
 
     network = load_network(source)
     assert network.source is not None
-    Definition(network.source).check()
+    Definition(network.source).check(network.region)
     for each in (network, *network.scenarios.values()):
         try:
             VectorEnv(each, num_envs=1)  # finds what only a network that is run says, as rates no solver can follow
@@ -216,8 +216,9 @@ def plan(
 ) -> None:
     """Write what a policy or controller does in one episode: its actions in physical units over time, as CSV.
 
-    A row is a control interval: when it begins and ends, the value of every control (a flow ordered, a factor on what a
-    valve lets through, or an input of a model) with its unit, the resulting flows, circularity and service level.
+    A row is a control interval: when it begins and ends (if the network has a start on the calendar with the year or
+    date on which it begins), the value of every control (a flow ordered, a factor on what a valve lets through, or an
+    input of a model) with its unit, the resulting flows, circularity and service level.
     """
     from cirl_marl.controllers.schedule import schedule
 
@@ -244,7 +245,7 @@ def _actor(
         raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
     if control is not None:
         return VectorEnv(source, num_envs=1, scenario=scenario), named_controller(control, min_service=min_service)
-    if source in networks() or source.endswith(".toml"):
+    if source in networks() or file_and_region(source):
         raise CirlError(f"plan {source}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
     if scenario is not None or min_service is not None:
         raise CirlError("--scenario and --min-service go with --control; a run has its own scenario and policies")

@@ -37,11 +37,14 @@ def remarks(network: Network) -> Iterator[str]:
 
 
 def _apart(network: Network) -> Iterator[str]:
-    """Yield nodes that no arc touches and that have nothing else to do."""
-    touched = {end for arc in network.arcs for end in (arc.donor, arc.recipient)}
+    """Yield nodes that no arc touches and that have nothing else to do, and those without stock that get nothing."""
+    fed = {arc.recipient for arc in network.arcs}
+    touched = fed | {arc.donor for arc in network.arcs}
     for node in network.nodes:
         if node.model is None and node.id not in touched:
             yield f"node '{node.id}': no arc begins or ends here, so that no mass enters or leaves it"
+        elif not node.stores and node.id not in fed:
+            yield f"node '{node.id}': it stores nothing and nothing enters it, so that nothing ever leaves it"
 
 
 def _without_effect(network: Network) -> Iterator[str]:

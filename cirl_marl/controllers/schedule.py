@@ -14,6 +14,7 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.calendar import labels
 from cirl_marl.network.elements import ControlKind, Law
 from cirl_marl.records.files import write_atomically, write_table
 
@@ -29,11 +30,16 @@ class Schedule:
     rollout: Rollout
 
     def write(self, path: Path) -> None:
-        """Write a CSV file, whole or not at all; a ``CirlError`` says so if its folder is not there."""
+        """Write a CSV file, whole or not at all; a ``CirlError`` says so if its folder is not there.
+
+        Of a network with a start on the calendar it has a further column, the year or date on which an interval begins.
+        """
         if not path.parent.is_dir():
             raise CirlError(f"{path}: the folder {path.parent} does not exist")
-        rows = [[f"{value:.10g}" for value in row] for row in self.columns.T]
-        write_atomically(path, lambda partial: write_table(partial, self.header, rows))
+        calendar, dates = labels(self.network, interval_ends(self.network) - self.network.episode.control_interval)
+        texts = [[f"{value:.10g}" for value in column] for column in self.columns]
+        header, rows = (*self.header[:2], *calendar, *self.header[2:]), zip(*texts[:2], *dates, *texts[2:], strict=True)
+        write_atomically(path, lambda partial: write_table(partial, header, list(rows)))
 
 
 @dataclass

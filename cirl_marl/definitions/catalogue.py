@@ -28,12 +28,12 @@ def folder(kind: str) -> Path:
 
 
 def networks() -> list[str]:
-    """Return the names of the networks in the catalogue.
+    """Return the names of the networks in the catalogue; of a definition with regions the name of each.
 
     >>> "copper_net" in networks()
     True
     """
-    return sorted(path.stem for path in folder("envs").glob("*.toml"))
+    return sorted({name for path in folder("envs").glob("*.toml") for name in _regions(path)})
 
 
 def recipes() -> list[str]:
@@ -42,7 +42,7 @@ def recipes() -> list[str]:
 
 
 def load_network(name: str | Path, *, scenario: str | None = None) -> Network:
-    """Return a network of the catalogue, or of a definition file if ``name`` ends in ``.toml``.
+    """Return a network of the catalogue, or of a definition file if ``name`` ends in ``.toml`` or ``.toml:REGION``.
 
     It is under ``scenario``; None is the default, physical one.
 
@@ -50,24 +50,53 @@ def load_network(name: str | Path, *, scenario: str | None = None) -> Network:
         DefinitionError: if the file has mistakes; all are named.
         CirlError: if there is no such network or scenario.
     """
-    path = Path(name) if str(name).endswith(".toml") else _in_catalogue("envs", str(name), networks())
-    stamp = path.stat().st_mtime_ns if path.is_file() else 0
-    return _read(path.resolve(), stamp).scenario(scenario)
+    path, region = file_and_region(str(name)) or _in_catalogue(str(name))
+    return _definition(path).network(region=region).scenario(scenario)
+
+
+def file_and_region(name: str) -> tuple[Path, str] | None:
+    """Return what ``FILE.toml`` or ``FILE.toml:REGION`` names; None if it is no name of a file."""
+    if name.endswith(".toml"):
+        return Path(name), ""
+    file, _, region = name.rpartition(":")
+    return (Path(file), region) if file.endswith(".toml") else None
 
 
 def recipe_path(name: str | Path) -> Path:
     """Return the file of a recipe of the catalogue, or ``name`` itself if it ends in ``.toml``."""
-    return Path(name) if str(name).endswith(".toml") else _in_catalogue("agents", str(name), recipes())
+    if str(name).endswith(".toml"):
+        return Path(name)
+    if name not in recipes():
+        raise CirlError(f"{unknown('recipe', name, recipes())} A file of your own must end in .toml.")
+    return folder("agents") / f"{name}.toml"
 
 
-def _in_catalogue(kind: str, name: str, known: list[str]) -> Path:
-    if name not in known:
-        what = "network" if kind == "envs" else "recipe"
-        raise CirlError(f"{unknown(what, name, known)} A file of your own must end in .toml.")
-    return folder(kind) / f"{name}.toml"
+def _in_catalogue(name: str) -> tuple[Path, str]:
+    """Return file and region of a network; only files with whose names it begins are read, the longest name first."""
+    for path in sorted(folder("envs").glob("*.toml"), key=lambda each: -len(each.stem)):
+        if name.startswith(path.stem) and name in (found := _regions(path)):
+            return path, found[name]
+    known = networks()
+    regions = [each for each in known if each.startswith(f"{name}_")]
+    raise CirlError(f"{unknown('network', name, regions or known)} A file of your own must end in .toml.")
+
+
+def _regions(path: Path) -> dict[str, str]:
+    """Return the regions of a definition by the names of their networks; the empty one if it has none."""
+    return {f"{path.stem}_{region}": region for region in _definition(path).regions} or {path.stem: ""}
+
+
+def _definition(path: Path) -> Definition:
+    """Return a definition, as it was read before if neither it nor its data files have been edited since."""
+    stamp = path.stat().st_mtime_ns if path.is_file() else 0
+    found = _read(path.resolve(), stamp)
+    if found.files.edited:
+        _read.cache_clear()
+        found = _read(path.resolve(), stamp)
+    return found
 
 
 @cache
-def _read(path: Path, stamp: int) -> Network:
+def _read(path: Path, stamp: int) -> Definition:
     del stamp  # part of the cache key, so that an edited file is read again
-    return Definition(path).network()
+    return Definition(path)

@@ -5,16 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 from cirl_marl.compartments import CompartmentModel, model_class
+from cirl_marl.definitions.columns import DataFiles
 from cirl_marl.definitions.mistakes import parameter_mistakes
-from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable, QuantityTable, Range
+from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, QuantityTable, Range
+from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
+from cirl_marl.definitions.series import Clock, column_value, inline_series
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network import Network, elements
 from cirl_marl.network.declared import Declared, Numbers, Quantity, declarations
 from cirl_marl.network.elements import TAKEN, Arc, Control, ControlKind, Law, Node
+from cirl_marl.network.series import Value
 from cirl_marl.network.units import factor
 
 GIVEN = ("rate", "flow", "batches")
-"""Keys of which a law needs one, if it takes any of them: an exogenous flow a rate or batches."""
+"""Keys of which a law needs one, if it takes any of them."""
+REGION = "{region}"
+"""What stands for the text of the region in the title and in ``where``."""
 
 HINTS = {
     "rate": "a rate, 1/time, is the flow divided by the stock of its donor (law 'recipient': of its recipient); "
@@ -27,17 +33,25 @@ HINTS = {
 class Converter:
     """Converts one validated document to the network's units, collecting what does not fit."""
 
-    def __init__(self, table: NetworkTable) -> None:
-        """Take the document; ``network`` converts it."""
-        self.table = table
+    def __init__(self, table: NetworkTable, files: DataFiles, region: str = "") -> None:
+        """Take the document, the files that it names and the region meant; ``network`` converts it."""
+        self.table, self.files, self.region = table, files, region
         self.mistakes: list[str] = []
+        self.used: set[str] = set()
+        self._told: set[str] = set()
         mass, time = table.units.mass, table.units.time
         self.targets = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})", "steps": "1"}
         self.factors: dict[tuple[str, str], float] = {}
-        self.scales: dict[str, float] = {}
+        self.scales: dict[str, Any] = {}
+        episode: Any = table.episode
+        self.clock = Clock(episode.start, time)
 
-    def network(self, scenario: str) -> Network:
-        """Return the network; a ``NetworkError`` has every inconsistent unit, or else every fault of the network."""
+    def network(self, **known: Any) -> Network:
+        """Return the network with fields that are ``known`` besides.
+
+        Raises:
+            NetworkError: with every inconsistent unit and unusable column, or else every fault of the network.
+        """
         table = self.table
         for key, unit, base in (("mass", table.units.mass, "kg"), ("time", table.units.time, "s")):
             try:
@@ -57,16 +71,21 @@ class Converter:
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),
         }
+        title = self._placed(table.title, "title")
         if self.mistakes:
             raise NetworkError(table.name, self.mistakes)
         return Network(
-            name=table.name,
-            title=table.title,
+            name="_".join([table.name, *([self.region] if self.region else [])]),
+            title=title,
+            material=table.material,
+            references=tuple(table.references),
             mass_unit=table.units.mass,
             time_unit=table.units.time,
-            scenario_name=scenario,
+            region=self.region,
+            data_sha256={name: self.files.sha256(name) for name in sorted(self.used)},
             acting=tuple(table.agents),
             **parts,
+            **known,
         )
 
     def _part(self, made: type[Any], table: Any, where: str, **known: Any) -> Any:
@@ -75,13 +94,16 @@ class Converter:
             given = getattr(table, name, None)
             if name not in known and given is not None:
                 known[name] = self._read(declared, given, table, f"{where}.{declared.key or name}")
-        return made(**known)
+        try:
+            return made(**known)
+        except NetworkError as error:
+            raise NetworkError(self.table.name, [f"{where}: {problem}" for problem in error.problems]) from None
 
     def _read(self, declared: Declared, given: Any, table: Any, where: str) -> Any:
         """Return what a declared field is in Python."""
         if isinstance(declared, Quantity):
             kind = declared.kind(table)
-            value = self._value(given, kind, where)
+            value: Any = None if given == declared.none else self._value(given, kind, where)
             if kind != "steps":
                 return value
             if value != int(value):
@@ -159,18 +181,44 @@ class Converter:
         if control is None:
             return None
         taken = control.unit if model is None else model.input_unit
-        target = {ControlKind.RATE: "1", ControlKind.FLOW: "flow", ControlKind.INPUT: taken}[control.kind]
+        target = {ControlKind.FLOW: "flow", ControlKind.INPUT: taken}.get(control.kind, "1")
         if target is None and model is not None and control.unit != "1":
             remedy = "give its class one, or write unit = '1' and the numbers as the model takes them"
             stated = f"unit '{control.unit}': model '{model.kind}' states no input_unit to convert to"
             self.mistakes.append(f"{where}: {stated}; {remedy}")
             return None
         unit = self._factor(control.unit, target or "1", where)
-        low, neutral, high = (value * unit for value in (control.low, control.neutral, control.high))
-        return Control(kind=control.kind, low=low, neutral=neutral, high=high)
+        sides = {
+            side: self._in_time(getattr(control, side), unit, f"{where}.{side}") for side in ("low", "neutral", "high")
+        }
+        return Control(kind=control.kind, **sides)
 
-    def _value(self, quantity: QuantityTable, kind: str, where: str) -> float:
-        return quantity.value * self._factor(quantity.unit, kind, where)
+    def _value(self, quantity: Any, kind: str, where: str) -> Value:
+        unit = self._factor(quantity.unit, kind, where)
+        return self._in_time(quantity.value if isinstance(quantity, QuantityTable) else quantity, unit, where)
+
+    def _in_time(self, given: float | AmountSeries | AmountColumn, unit: float, where: str) -> Value:
+        """Return a number, or one that changes in time, in the network's units, of which its own is ``unit``."""
+        if not isinstance(given, AmountSeries | AmountColumn):
+            return given * unit
+        try:
+            if isinstance(given, AmountSeries):
+                return inline_series(given, unit, self.clock)
+            texts = {key: self._placed(text, f"{where}.where.{key}") for key, text in given.where.items()}
+            found = column_value(given, texts, self.files, unit, self.clock)
+        except CirlError as error:
+            if str(error) not in self._told or isinstance(given, AmountSeries):
+                self.mistakes.append(f"{where}: {error}")
+            self._told.add(str(error))  # a file that cannot be read is told once, not for each of its columns
+            return 0.0
+        self.used.add(given.file)
+        return found
+
+    def _placed(self, text: str, where: str) -> str:
+        """Return a text of the file with that of the region in its place."""
+        if REGION in text and not self.region:
+            self.mistakes.append(f"{where}: '{text}': a definition without [regions] has no {REGION}")
+        return text.replace(REGION, self.table.regions.get(self.region, ""))
 
     def _factor(self, unit: str, kind: str, where: str) -> float:
         """Return what converts ``unit`` to the network's unit of a kind, or to the unit ``kind`` if it is none."""

@@ -10,7 +10,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from cirl_marl.definitions import schema
+from cirl_marl.definitions import quantities, schema
 
 PARTS: dict[str, tuple[Any, str]] = {
     "network": (schema.NetworkTable, "The file itself"),
@@ -24,8 +24,10 @@ PARTS: dict[str, tuple[Any, str]] = {
     "control": (schema.ControlTable, "`control` of a node or an arc"),
     "model": (schema.ModelTable, "`model` of a node or an arc"),
     "service": (schema.ServiceTable, "`[services.NAME]`"),
-    "quantity": (schema.QuantityTable, "Every number with a unit"),
-    "range": (schema.Range, "`initial` of a node"),
+    "quantity": (quantities.QuantityTable, "Every number with a unit"),
+    "series": (quantities.SeriesTable, "For a quantity; in a control without `unit` and `source`, which are its own"),
+    "column": (quantities.ColumnTable, "For a quantity; in a control without `unit` and `source`, which are its own"),
+    "range": (quantities.Range, "`initial` of a node"),
     "batches": (schema.Batches, "`batches` of an arc"),
 }
 
@@ -49,7 +51,9 @@ def _part(name: str, table: type[BaseModel], place: str) -> str:
 
 def _key(key: str, field: FieldInfo) -> str:
     """Return the line of a key: what it takes, if that is a table of its own, and what it means."""
-    taken = [name for name, (table, _) in PARTS.items() if table in (field.annotation, *get_args(field.annotation))]
+    kinds = [*quantities.forms(field.annotation).values(), field.annotation]
+    kinds += get_args(field.annotation)
+    taken = [name for name, (table, _) in PARTS.items() if {table, *table.__bases__} & set(kinds)]
     needed = "required" if field.is_required() else "may be left out"
     about = f": {field.description.replace('``', '`')}" if field.description else ""
     return _wrapped(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in taken), needed])}){about}.")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import inspect
 import re
 import tomllib
-import types
 import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from cirl_marl.definitions.quantities import FORMS, forms
 from cirl_marl.errors import unknown
 
 BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
@@ -52,7 +52,9 @@ def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[str]:
 
 def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
     location = [str(part) for part in item["loc"] if part != "[key]"]
-    path = ".".join(location) or "file"
+    path = ".".join(part for part in location if part not in FORMS) or "file"
+    if item["type"] == "extra_forbidden" and location[::2] == ["arcs", "series"]:
+        return f"{path}: write flow = {{ times = […], values = […], time_unit = …, unit = …, source = … }}"
     if item["type"] == "extra_forbidden":
         parent = _model_at(model, location[:-1])
         known = [f.alias or name for name, f in parent.model_fields.items()] if parent else []
@@ -80,12 +82,14 @@ def _model_at(model: type[BaseModel], location: list[str]) -> type[BaseModel] | 
     """Return the model of the table at ``location``."""
     current: Any = model
     for part in location:
-        if isinstance(current, type) and issubclass(current, BaseModel):
+        if part in FORMS:
+            current = forms(current)[part]
+        elif isinstance(current, type) and issubclass(current, BaseModel):
             fields = {f.alias or name: f.annotation for name, f in current.model_fields.items()}
             current = fields.get(part)
         else:
             current = typing.get_args(current)[-1]
-        if isinstance(current, types.UnionType):
+        if type(None) in typing.get_args(current):
             current = next(arg for arg in typing.get_args(current) if arg is not type(None))
     return current if isinstance(current, type) and issubclass(current, BaseModel) else None
 

@@ -7,37 +7,42 @@ import difflib
 import hashlib
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from cirl_marl.definitions.columns import DataFiles
 from cirl_marl.definitions.conversion import Converter
 from cirl_marl.definitions.mistakes import choices, mistakes_of, toml_mistake
+from cirl_marl.definitions.quantities import FORMS
 from cirl_marl.definitions.schema import NetworkTable
 from cirl_marl.errors import DefinitionError, NetworkError, unknown
 from cirl_marl.network import Network
 
 DEFAULT = "default"
 """The scenario that stands outside ``[scenarios]``."""
+FIXED = ("name", "regions", "scenarios")
+"""What is the same in every scenario."""
 
 
 class Definition:
-    """A definition file; each scenario of it is built when it is asked for.
+    """A definition file; each scenario of it, in each region, is built when it is asked for.
 
     Attributes:
         path: of the file.
         names: of the scenarios, ``default`` first.
+        regions: by id the texts of the regions, each of which is a network of its own; empty if it is one network.
+        files: the data files that it names.
     """
 
     def __init__(self, path: Path) -> None:
         """Read the file; no network is built yet.
 
         Raises:
-            DefinitionError: if it is no TOML, or its scenarios are no tables.
+            DefinitionError: if it is no TOML, or its scenarios or regions are no tables.
         """
-        self.path = path
+        self.path, self.files = path, DataFiles(path.parent)
         self._document = read_toml(path)
         self._sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         overrides = self._document.get("scenarios", {})
@@ -49,29 +54,42 @@ class Definition:
             )
         self._overrides = {DEFAULT: {}, **overrides}
         self.names = tuple(self._overrides)
-        self._built: dict[str, Network] = {}
+        self.regions = self._document.get("regions", {})
+        if not isinstance(self.regions, dict):
+            raise DefinitionError(str(path), ['regions: must be a table of texts, as japan = "Japan"'])
+        self._built: dict[tuple[str, str], Network] = {}
 
-    def network(self, name: str = DEFAULT) -> Network:
+    def network(self, name: str = DEFAULT, region: str = "") -> Network:
         """Return the network under a scenario; the others hang on it, and are built when they are asked for.
 
         Raises:
-            DefinitionError: with every mistake in what the scenario is made of; nothing is returned half-read.
+            DefinitionError: with every mistake in what the scenario is made of; nothing is returned half-read. If
+                there is no such region, with those there are.
         """
-        if name not in self._built:
+        if region not in (self.regions or [""]):
+            example = f"as in {self.path.name}:{next(iter(self.regions), 'japan')}"
+            which = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
+            raise DefinitionError(str(self.path), [unknown("region", region, self.regions) if region else which])
+        if (name, region) not in self._built:
             override, where = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
             mistakes = list(_strangers(self._document, override, where))
             if mistakes:
                 raise DefinitionError(str(self.path), mistakes)
             told = {key: value for key, value in override.items() if key != "without"}
             try:
-                network = _build(_merge(_without(self._document, override), told), name)
+                self._built[name, region] = _build(
+                    _merge(_without(self._document, override), told),
+                    (self.files, region),
+                    scenario_name=name,
+                    scenarios=_Others(self, name, region),
+                    source=self.path,
+                    source_sha256=self._sha256,
+                )
             except NetworkError as error:
                 raise DefinitionError(str(self.path), [where + problem for problem in error.problems]) from None
-            others = _Others(self, name)
-            self._built[name] = replace(network, scenarios=others, source=self.path, source_sha256=self._sha256)
-        return self._built[name]
+        return self._built[name, region]
 
-    def check(self) -> None:
+    def check(self, region: str = "") -> None:
         """Build every scenario.
 
         Raises:
@@ -80,7 +98,7 @@ class Definition:
         mistakes: list[str] = []
         for name in self.names:
             try:
-                self.network(name)
+                self.network(name, region)
             except DefinitionError as error:
                 mistakes += error.problems
                 if name == DEFAULT:
@@ -90,15 +108,15 @@ class Definition:
 
 
 class _Others(Mapping[str, Network]):
-    """The scenarios of a definition but one."""
+    """The scenarios of a definition but one, in a region."""
 
-    def __init__(self, definition: Definition, own: str) -> None:
-        self._definition, self._own = definition, own
+    def __init__(self, definition: Definition, own: str, region: str) -> None:
+        self._definition, self._own, self._region = definition, own, region
 
     def __getitem__(self, name: str) -> Network:
         if name not in set(self):
             raise KeyError(name)
-        return self._definition.network(name)
+        return self._definition.network(name, self._region)
 
     def __iter__(self) -> Iterator[str]:
         return (name for name in self._definition.names if name != self._own)
@@ -145,7 +163,7 @@ def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
     kind = old.get("kind")
     if isinstance(kind, str):
         return bool(new.get("kind", kind) != kind)
-    return isinstance(old.get("source"), str)
+    return any(isinstance(old.get(key), str | list) for key in ("source", "file", "times"))
 
 
 def _without(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
@@ -168,6 +186,8 @@ def _lost(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
     if len(set(paths)) != len(paths):
         yield f"{where}without: names a path twice"
     for path in paths:
+        if path.partition(".")[0] in FIXED:
+            yield f"{where}without: '{path}': a scenario cannot set it"
         for other in paths:
             if path.startswith(f"{other}."):
                 yield f"{where}without: '{path}' lies in '{other}', which goes as a whole"
@@ -192,30 +212,35 @@ def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: 
         for name in given:
             if name not in known:
                 yield f"{where}{table}: {unknown(table[:-1], name, known)}"
-    for key in ("name", "scenarios"):
+    for key in FIXED:
         if key in override:
             yield f"{where}{key}: a scenario cannot set it"
 
 
-def _build(document: Mapping[str, Any], scenario: str) -> Network:
+def _build(document: Mapping[str, Any], beside: tuple[DataFiles, str], **known: Any) -> Network:
+    """Return the network of a document, of the files and the region ``beside`` it, and of fields ``known`` besides."""
     name = str(document.get("name", "?"))
     try:
         table = NetworkTable.model_validate(document)
     except ValidationError as error:
         mistakes = mistakes_of(error, NetworkTable)
-        raise NetworkError(name, [*mistakes, *_further_mistakes(document, error, scenario)]) from None
-    return Converter(table).network(scenario)
+        raise NetworkError(name, [*mistakes, *_further_mistakes(document, error, beside, known)]) from None
+    return Converter(table, *beside).network(**known)
 
 
-def _further_mistakes(document: Mapping[str, Any], error: ValidationError, scenario: str) -> list[str]:
+def _further_mistakes(
+    document: Mapping[str, Any], error: ValidationError, beside: tuple[DataFiles, str], known: Mapping[str, Any]
+) -> list[str]:
     """Look for mistakes behind the given ones, with misspelt values mended and unknown keys left out."""
     mended = copy.deepcopy(dict(document))
     for item in error.errors():
-        *path, last = [part for part in item["loc"] if part != "[key]"]
+        *path, last = [part for part in item["loc"] if part not in ("[key]", *FORMS)]
         table: Any = mended
         for part in path:
             table = table[part]
-        if item["type"] == "extra_forbidden":
+        if item["type"] == "extra_forbidden" and last == "series":
+            table["flow"] = table.pop(last)  # as it was written when arcs had this key
+        elif item["type"] == "extra_forbidden":
             del table[last]
         elif item["type"] in ("enum", "literal_error"):
             valid = choices(str(item["ctx"]["expected"]))
@@ -223,7 +248,7 @@ def _further_mistakes(document: Mapping[str, Any], error: ValidationError, scena
         else:
             return []
     try:
-        _build(mended, scenario)
+        _build(mended, beside, **known)
     except NetworkError as further:
         return list(further.problems)
     return []

@@ -8,9 +8,22 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, create_model
+from pydantic import Field, StrictBool, create_model
 
+from cirl_marl.definitions.quantities import (
+    ColumnTable,
+    Number,
+    QuantityTable,
+    Range,
+    SeriesTable,
+    Source,
+    Table,
+    Time,
+    VaryingAmount,
+    varying,
+)
 from cirl_marl.network.declared import (
+    CalendarTime,
     Declared,
     Nested,
     Numbers,
@@ -23,34 +36,9 @@ from cirl_marl.network.declared import (
 from cirl_marl.network.elements import Arc, Control, Episode, Node, Objective, Observation, Service
 from cirl_marl.network.validate import IDENTIFIER
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Source = Annotated[str, Field(min_length=1, description="where the number comes from")]
 Identifier = Annotated[str, Field(pattern=IDENTIFIER)]
 IN_MODEL = ("inner", "reward_scale")
 """Fields of compartments that stand in the table of their model."""
-
-
-class Table(BaseModel):
-    """A TOML table without unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
-
-
-class QuantityTable(Table):
-    """A number with its unit and source."""
-
-    value: Number
-    unit: str = Field(description="pint unit, such as 'kt', '1/day', 't/day'; '1' if dimensionless")
-    source: Source
-
-
-class Range(Table):
-    """An interval from which initial stocks are drawn uniformly."""
-
-    low: Number
-    high: Number
-    unit: str
-    source: Source
 
 
 class Batches(Table):
@@ -96,7 +84,7 @@ def table_of(made: type[Any], **more: Any) -> Any:
         raise TypeError(f"{made.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
     spelled = {name: _spelled(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
     keys = {name: _key(made, name, kind) for name, kind in spelled.items() if kind is not None}
-    if Number in spelled.values():
+    if VaryingAmount in spelled.values():
         more |= {"unit": (str, ...), "source": (Source, ...)}
     summary = str(made.__doc__).partition("\n")[0]
     return create_model(f"{made.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
@@ -108,7 +96,7 @@ def _key(made: type[Any], name: str, kind: Any) -> tuple[Any, Any]:
     told: dict[str, Any] = {"description": declared.meaning, "alias": declared.key or None}
     if is_required(made, name):
         return kind, Field(**told)
-    if isinstance(kind, type) and issubclass(kind, BaseModel):
+    if isinstance(declared, Quantity | Numbers | Nested | CalendarTime):
         return kind | None, Field(None, **told)
     return kind, Field(list(default) if isinstance(default, tuple) else default, **told)
 
@@ -118,10 +106,14 @@ def _spelled(declared: Declared, hint: Any) -> Any:
     if isinstance(declared, Word):
         return declared.of if isinstance(declared.of, type) else Literal[declared.of]
     if isinstance(declared, Numbers):
-        tables = {"range": Range, "batches": Batches, "amount": Number}
+        tables = {"range": Range, "batches": Batches, "amount": VaryingAmount}
         return tables[declared.spelled] if declared.spelled else None
     if isinstance(declared, Nested):
         return ControlTable if declared.of == "control" else ModelTable
+    if isinstance(declared, CalendarTime):
+        return Time
+    if isinstance(declared, Quantity) and declared.varies:
+        return varying(QuantityTable, SeriesTable, ColumnTable, declared.none)
     if isinstance(declared, Quantity):
         return QuantityTable
     return {bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
@@ -157,7 +149,12 @@ class NetworkTable(Table):
     name: Identifier
     title: str
     material: str
-    references: list[str] = []
+    references: list[str] = Field([], description="where its numbers come from, as a whole")
+    regions: dict[Identifier, str] = Field(
+        {},
+        description="if the file stands for several networks: by what the name of each ends in, the text for which "
+        "{region} stands in its title and in ``where``",
+    )
     units: UnitsTable
     episode: EpisodeTable  # type: ignore[valid-type]
     scales: ScalesTable
@@ -166,7 +163,7 @@ class NetworkTable(Table):
     agents: list[str] = Field([], description="who acts; default: every compartment with a control")
     nodes: dict[Identifier, NodeTable]  # type: ignore[valid-type]
     arcs: dict[Identifier, ArcTable]  # type: ignore[valid-type]
-    services: dict[Identifier, ServiceTable] = {}  # type: ignore[valid-type]
+    services: dict[Identifier, ServiceTable] = Field({})  # type: ignore[valid-type]
     scenarios: dict[Identifier, dict[str, Any]] = Field(
         {},
         description="tables that replace those of the default scenario, key by key, after those named in 'without', "
@@ -193,7 +190,7 @@ def json_schema() -> dict[str, Any]:
 
     tables = [name for name, body in definitions.items() if body.get("type") == "object"]
     parts = {f"{name}Part": part(definitions[name]) for name in tables}
-    properties = {k: v for k, v in schema["properties"].items() if k not in ("scenarios", "name")}
+    properties = {k: v for k, v in schema["properties"].items() if k not in ("scenarios", "regions", "name")}
     without = {"type": "array", "items": {"type": "string"}, "description": "what to leave out first, as dotted paths"}
     parts["Scenario"] = {
         "type": "object",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from datetime import date
 from typing import Any
 
 import tomlkit
@@ -12,8 +13,9 @@ import tomlkit
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
-from cirl_marl.network.declared import Nested, Numbers, Quantity, declarations, default_of, is_required
+from cirl_marl.network.declared import CalendarTime, Nested, Numbers, Quantity, declarations, default_of, is_required
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
+from cirl_marl.network.series import Series, Value
 
 SOURCE = "network built in Python"
 
@@ -30,9 +32,10 @@ def definition_of(network: Network) -> str:
 
 
 def fingerprint(network: Network) -> str:
-    """Return a hash of the network under its scenario, of its definition, with its name as the title."""
-    document = _Writer(dataclasses.replace(network, title=network.name)).document()
-    return hashlib.sha256(json.dumps(document).encode()).hexdigest()
+    """Return a hash of the network under its scenario: of its definition, but for what changes no result."""
+    document = _Writer(network).document() | {"title": network.name, "material": Network.material}
+    document.pop("references", None)
+    return hashlib.sha256(json.dumps(document, default=str).encode()).hexdigest()
 
 
 def _laid_out(document: dict[str, Any]) -> tomlkit.TOMLDocument:
@@ -74,7 +77,8 @@ class _Writer:
         return {
             "name": network.name,
             "title": network.title,
-            "material": "not stated",
+            "material": network.material,
+            **({"references": list(network.references)} if network.references else {}),
             "agents": list(network.acting),
             "units": {"mass": network.mass_unit, "time": network.time_unit},
             "scales": {"stock": self._quantity(1.0, "mass"), "flow": self._quantity(1.0, "flow")},
@@ -94,7 +98,9 @@ class _Writer:
             needed = is_required(type(part), name) or name == _needed(part)
             if not needed and value == default_of(type(part), name):
                 continue
-            if isinstance(declared, Quantity):
+            if isinstance(declared, CalendarTime):
+                table[key] = value if isinstance(value, date) else float(value)
+            elif isinstance(declared, Quantity):
                 table[key] = self._quantity(value, declared.kind(part))
             elif isinstance(declared, Numbers):
                 table |= self._numbers(part, value, declared, key)
@@ -125,7 +131,8 @@ class _Writer:
         unit = self._units["flow"] if control.kind is ControlKind.FLOW else "1"
         if control.kind is ControlKind.INPUT and part.model is not None:
             unit = part.model.input_unit or "1"
-        bounds = {name: float(getattr(control, name)) for name in ("low", "neutral", "high")}
+        sides = {side: getattr(control, side) for side in ("low", "neutral", "high")}
+        bounds = {side: self._series(at) if isinstance(at, Series) else float(at) for side, at in sides.items()}
         return {"kind": control.kind.value, **bounds, "unit": unit, "source": SOURCE}
 
     def _model(self, part: Compartment) -> dict[str, Any]:
@@ -147,8 +154,17 @@ class _Writer:
         table["reward_scale"] = self._quantity(part.reward_scale, "1")
         return table
 
-    def _quantity(self, value: float, kind: str) -> dict[str, Any]:
-        return {"value": float(value), "unit": self._units.get(kind, "1"), "source": SOURCE}
+    def _quantity(self, value: Value, kind: str) -> dict[str, Any]:
+        number = self._series(value) if isinstance(value, Series) else {"value": float(value)}
+        return {**number, "unit": self._units.get(kind, "1"), "source": SOURCE}
+
+    def _series(self, series: Series) -> dict[str, Any]:
+        told: dict[str, Any] = {name: list(map(float, getattr(series, name))) for name in ("times", "values")}
+        if series.interpolation != "step":
+            told["interpolation"] = series.interpolation
+        if series.until is not None:
+            told["until"] = float(series.until)
+        return {**told, "time_unit": self._units["time"]}
 
 
 def _needed(part: Any) -> str:

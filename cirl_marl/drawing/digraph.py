@@ -14,6 +14,7 @@ from cirl_marl.drawing.picture import draw_network, largest_flow, legend_of
 from cirl_marl.drawing.style import number, save, spoken
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.calendar import labels
 
 __all__ = ["Canvas", "draw_network", "save_before_after", "save_network"]
 
@@ -77,7 +78,9 @@ class Canvas:
         """
         network = self._network
         reference = max(self._reference, largest_flow(flow))
-        title = f"{spoken(network.name)}, {network.time_unit} {number(time)}"
+        calendar, dates = labels(network, time)
+        when = [*calendar, *dates[0]] if dates else [network.time_unit, number(time)]
+        title = f"{spoken(network.name)}, {' '.join(when)}"
         draw_network(self._axes, network, stock, flow, title=title, circularity=circularity, reference_flow=reference)
         self._agg.draw()  # type: ignore[no-untyped-call]
         pixels = np.asarray(self._agg.buffer_rgba())  # type: ignore[no-untyped-call]

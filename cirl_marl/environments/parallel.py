@@ -206,6 +206,9 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         for agent, success in outcome.success.items():
             if agent in infos:
                 infos[agent]["success"] = bool(success[0])
+        if (year := self.batch.year) is not None:
+            for info in infos.values():
+                info["year"] = float(year[0])
         return infos
 
 

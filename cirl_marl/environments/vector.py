@@ -22,6 +22,7 @@ from cirl_marl.environments.starts import Starts
 from cirl_marl.environments.state import Outcome, Snapshot, State
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
 
 Infos = dict[str, dict[str, Any]]
@@ -128,6 +129,12 @@ class VectorEnv:
             raise ControlError("the environment has no state yet: call reset() first")
         return self._state
 
+    @property
+    def year(self) -> Floats | None:
+        """Calendar year of each copy, with its fraction, shape (B,); None if the network does not begin in a year."""
+        episode = self.network.episode
+        return None if episode.start is None else years(self.network, self.physical.step * episode.control_interval)
+
     def reset(self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None) -> _Seen:
         """Start an episode in every copy and return the observations.
 
@@ -155,6 +162,10 @@ class VectorEnv:
         """
         outcome = self.advance(self.stack(actions))
         infos: Infos = outcome.infos(self.agents)
+        if (year := self.year) is not None:
+            year.flags.writeable = False  # the same for all agents
+            for info in infos.values():
+                info["year"] = year
         observation = outcome.observation
         if outcome.truncated.any():
             self._report_ends(infos, outcome)

@@ -71,6 +71,7 @@ def provenance(network: Network, runs: Sequence[RunDirectory] = (), **options: A
             "name": network.name,
             "scenario": network.scenario_name,
             "file_sha256": network.source_sha256,
+            "data_sha256": dict(network.data_sha256),
             "definition_sha256": fingerprint(network),
         },
         "options": options,
@@ -87,7 +88,8 @@ def _run(run: RunDirectory) -> dict[str, Any]:
         "state": status["state"],
         "joint_steps": status["joint_steps"],
         "config_sha256": _hash((run.path / "config.json").read_bytes()),
-        "network_sha256": _hash((run.path / "network.toml").read_bytes()),
+        "network_sha256": _hash(run.definition.read_bytes()),
+        "data_sha256": config.data_sha256,
         "policies_sha256": {
             group.name: _hash((run.checkpoint / f"{group.name}.zip").read_bytes()) for group in run.groups()
         },

@@ -171,9 +171,11 @@ def _create(directory: Path, config: RunConfig, network: Network) -> RunDirector
     asked = {group: {name: getattr(now, name)} for name, (group, now) in groups.items() if name in config.options}
     source = network.source
     if source is not None and source.is_file():
-        read = load_network(source, scenario=network.scenario_name).with_options(**asked)
+        read = load_network(network.address, scenario=network.scenario_name).with_options(**asked)
         if read == network:
-            return RunDirectory.create(directory, config, source)
+            data = {**load_network(network.address).data_sha256, **read.data_sha256}  # it is read by its default
+            kept = config.model_copy(update={"region": read.region, "data_sha256": data})
+            return RunDirectory.create(directory, kept, source)
     with tempfile.TemporaryDirectory() as folder:
         written = Path(folder) / "network.toml"
         write_network(network, written)

@@ -22,8 +22,8 @@ from pydantic_core import PydanticCustomError
 
 from cirl_marl.definitions.catalogue import recipe_path
 from cirl_marl.definitions.mistakes import mistakes_of
+from cirl_marl.definitions.quantities import Number
 from cirl_marl.definitions.reading import read_toml
-from cirl_marl.definitions.schema import Number
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
 from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of

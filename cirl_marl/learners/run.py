@@ -4,7 +4,8 @@
 
     RUN/
       config.json          network, recipe, seed, steps, copies, options, as resolved
-      network.toml         the definition that was trained on
+      network.toml         the definition that was trained on; network/network.toml, with its data files beside or
+                           below it, if it has such
       versions.json        of Python and of every package that matters
       status.json          state, joint steps, the checkpoint that counts; rewritten last, atomically
       checkpoints/NNN/     LEARNER.zip (policy and optimiser), LEARNER.normaliser.pkl,
@@ -19,6 +20,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from pydantic import StrictInt, ValidationError, field_validator
+from pydantic import Field, StrictInt, ValidationError, field_validator
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.mistakes import mistakes_of
@@ -45,7 +47,8 @@ class RunConfig(Settings):
     """What a run was asked to do, fully resolved.
 
     ``steps`` are environment steps, summed over the copies, of which there are ``envs``. Every random stream derives
-    from ``seed``; ``options`` are those of ``VectorEnv``.
+    from ``seed``; ``options`` are those of ``VectorEnv``. Of a definition with regions, ``region`` is the one that was
+    trained on; ``data_sha256`` are the hashes of the data files by the names that the definition gives them.
     """
 
     network: str
@@ -56,6 +59,8 @@ class RunConfig(Settings):
     steps: StrictInt
     envs: StrictInt
     options: dict[str, Any]
+    region: str = ""
+    data_sha256: dict[str, str] = Field(default_factory=dict)
 
     @field_validator("options")
     @classmethod
@@ -89,7 +94,11 @@ class RunDirectory:
         except (TypeError, ValueError) as error:
             raise RunError(f"{run.path}: a run on disk needs a recipe of plain values: {error}") from error
         run.path.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(definition, run.path / "network.toml")
+        kept = run.path / "network" if config.data_sha256 else run.path
+        data = {name: definition.parent / name for name in config.data_sha256}
+        for name, source in {"network.toml": definition, **data}.items():
+            (kept / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, kept / name)
         write_json(run.path / "versions.json", versions())
         write_json(run.path / "config.json", plain)
         run.set_status("running", 0, None)
@@ -157,8 +166,23 @@ class RunDirectory:
         return config.recipe.groups(self.network(), config.agents)
 
     def network(self) -> Network:
-        """Return the network that the run trained on, under its scenario; a ``RunError`` if its file is missing."""
-        return load_network(self._file("network.toml"), scenario=self.config.scenario)
+        """Return the network that the run trained on, under its scenario.
+
+        Raises:
+            RunError: if a file of it is missing, or is not the one that it was trained with.
+        """
+        config = self.config
+        for name, sha256 in config.data_sha256.items():
+            file = self._file(f"network/{name}")
+            if (given := hashlib.sha256(file.read_bytes()).hexdigest()) != sha256:
+                raise RunError(f"{file}: is not the file of this training, whose SHA-256 was {sha256}; it is {given}")
+        address = f"{self.definition}:{config.region}" if config.region else self.definition
+        return load_network(address, scenario=config.scenario)
+
+    @property
+    def definition(self) -> Path:
+        """The file of the network; a ``RunError`` if it is missing."""
+        return self._file("network/network.toml" if self.config.data_sha256 else "network.toml")
 
     def make_env(self, num_envs: int) -> VectorEnv:
         """Return the environment that the run trained in, with ``num_envs`` copies."""

@@ -12,6 +12,7 @@ import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, MISSING, dataclass, fields
+from datetime import date, datetime
 from enum import StrEnum
 from functools import cache, partial
 from numbers import Integral, Real
@@ -100,6 +101,7 @@ class Quantity(Declared):
     positive: Annotated[bool, "whether it lies above 0"] = False
     joint: Annotated[bool, "whether its bounds depend on other fields, so that they are checked with these"] = False
     varies: Annotated[bool, "whether it may change in time"] = False
+    none: Annotated[str, "the word that definition files may give for None"] = ""
 
     def kind(self, part: object) -> Kind:
         """Return the kind of quantity in ``part``, a part of a network or its table in a definition file."""
@@ -147,6 +149,18 @@ class Numbers(Declared):
 
 Amount = partial(Numbers, form="a number", shape=(), spelled="amount", varies=True)
 """A number whose unit is that of the table in which it stands."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalendarTime(Declared):
+    """A point in time on the calendar, which definition files spell as a number or a date."""
+
+    def problem(self, value: object) -> str:
+        """See ``Declared.problem``."""
+        year: Any = value.year if isinstance(value, date) else value
+        if isinstance(year, Real) and not isinstance(value, bool | datetime) and 1 <= float(year) < 9999:
+            return ""
+        return f"a calendar year such as 2000 or 2000.5, or a date, got {value!r}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from datetime import date
 from enum import StrEnum
 from typing import Annotated, Literal, get_args
 
 from cirl_marl.network.declared import (
     Amount,
+    CalendarTime,
     Checked,
     Declared,
     Kinds,
@@ -208,9 +210,10 @@ class Arc(Compartment):
     share: Annotated[
         Value | None,
         Share(
-            "s (share law); None: what the others leave, or what the control sets. Uncontrolled shares keep their "
-            "proportions in what controlled ones leave",
+            "s (share law); None, in files ``rest``: what the others leave, or what the control sets. Uncontrolled "
+            "shares keep their proportions in what controlled ones leave",
             varies=True,
+            none="rest",
         ),
     ] = None
     by: Annotated[
@@ -304,6 +307,13 @@ class Episode(Checked):
         float | None,
         Quantity(
             "step of the ``rk4`` and ``euler`` solvers, a whole fraction of the control interval", of="time", joint=True
+        ),
+    ] = None
+    start: Annotated[
+        float | date | None,
+        CalendarTime(
+            "when it begins on the calendar, a year such as 2000 or 2000.5, or a date; None if the calendar does not "
+            "matter"
         ),
     ] = None
 

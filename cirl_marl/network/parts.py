@@ -31,8 +31,12 @@ class Parts:
         mass_unit: unit of stocks.
         time_unit: unit of time.
         title: one line for tables.
+        material: the target material.
+        references: where its numbers come from, as a whole.
         source: definition file that it was read from; None if it was built in Python.
         source_sha256: hash of that file as it was then.
+        data_sha256: hashes of the data files that the definition names, likewise, by the names that it gives them.
+        region: the one of the regions of the definition that this is; empty if it has none.
         scenario_name: the scenario that this network describes.
         scenarios: the other scenarios of the same definition, by name.
     """
@@ -48,10 +52,19 @@ class Parts:
     mass_unit: str = "kg"
     time_unit: str = "day"
     title: str = ""
+    material: str = "not stated"
+    references: tuple[str, ...] = ()
     source: Path | None = field(default=None, repr=False, compare=False)
     source_sha256: str | None = field(default=None, repr=False, compare=False)
+    data_sha256: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
+    region: str = field(default="", compare=False)
     scenario_name: str = "default"
     scenarios: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def address(self) -> str:
+        """What loads it again: its definition file, with the region if there is one; empty if it has no file."""
+        return "" if self.source is None else ":".join(filter(None, (str(self.source), self.region)))
 
     def held(self, value: Value) -> Floats:
         """Return a value in each control interval, its mean over the interval, shape (horizon,)."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import field
 from itertools import pairwise
 from typing import Annotated
 
@@ -34,7 +35,7 @@ class Series(Checked, Changing):
             "time up to which the last value is known to hold; None: for good (``step``), or no longer", of="time"
         ),
     ] = None
-    origin: Annotated[str, Declared("where it was read from, for messages")] = ""
+    origin: Annotated[str, Declared("where it was read from, for messages")] = field(default="", compare=False)
 
     def __format__(self, spec: str) -> str:
         """Say its lowest and its highest value."""
@@ -59,14 +60,20 @@ class Series(Checked, Changing):
                 return
         if not all(map(math.isfinite, (self.times[0], *self.values))):
             yield "series: times and values must be finite"
+        elif self.until is not None and not self.until >= self.times[-1]:
+            yield f"series: until {self.until:g} lies before its last time, {self.times[-1]:g}"
 
-    def uncovered(self, length: float) -> str:
-        """Return what is missing of an episode of some length; nothing if the series covers it."""
+    def uncovered(self, length: float, said: Callable[[float], str] = "{:g}".format) -> str:
+        """Return what is missing of an episode of some length; nothing if the series covers it.
+
+        ``said`` puts times into words.
+        """
         slack = 1e-9 * max(length, 1.0)
         if self.times[0] > slack:
-            return f"series begins at {self.times[0]:g}, after the episode does"
+            return f"series begins at {said(self.times[0])}, after the episode does; it needs a value for {said(0.0)}"
         if self.end < length - slack:
-            return f"series ends at {self.end:g}, but the episode at {length:g}"
+            missing = f"series ends at {said(self.end)}, but the episode at {said(length)}"
+            return f"{missing}; give what is missing, or a shorter horizon"
         return ""
 
     def means(self, edges: Floats) -> Floats:

@@ -16,7 +16,13 @@ from cirl_marl.network.parts import Parts
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.splits import splits, trap_problems
 from cirl_marl.network.units import factor
-from cirl_marl.network.validate_settings import is_whole, repeated, service_problems, setting_problems
+from cirl_marl.network.validate_settings import (
+    calendar_problems,
+    is_whole,
+    repeated,
+    service_problems,
+    setting_problems,
+)
 from cirl_marl.network.validate_storage import series_problems, share_problems, storage_problems
 
 IDENTIFIER = r"^[a-z][a-z0-9_]*$"
@@ -41,7 +47,7 @@ def problems(network: Parts) -> Iterator[str]:
     if not network.nodes:
         yield "nodes: a network needs at least one"
     kinds = [(c.id, type(c.model)) for c in (*network.nodes, *network.arcs) if c.model is not None]
-    timeless = [*bound_problems(network.episode)] or [*series_problems(network)]
+    timeless = [*bound_problems(network.episode), *calendar_problems(network)] or [*series_problems(network)]
     yield from timeless
     if timeless:
         return  # without a clock, or with such series, there are no values to look at

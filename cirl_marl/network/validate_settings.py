@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 
 import numpy as np
 
 from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network.calendar import LAST_YEAR, years
 from cirl_marl.network.declared import bound_problems
 from cirl_marl.network.elements import MAX_STEPS, Arc, Compartment, Episode, Law, Service
 from cirl_marl.network.model import ContinuousModel, DiscreteTimeModel, Measuring, OwnStepModel
@@ -45,6 +47,16 @@ def setting_problems(network: Parts) -> Iterator[str]:
     for name in network.observation.nodes:
         if name not in signals:
             yield f"observation: {unknown('node or inner state', name, signals)}"
+
+
+def calendar_problems(network: Parts) -> Iterator[str]:
+    """Yield it if the calendar ends before the episode."""
+    episode = network.episode
+    with suppress(CirlError):  # an unknown unit is a problem of its own
+        if episode.start is not None:
+            end = years(network, episode.control_interval * episode.horizon)
+            if not end < LAST_YEAR:
+                yield f"episode: it ends in the year {end:g}, after the calendar; is control_interval in another unit?"
 
 
 def _clock_problems(network: Parts, compartment: Compartment) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from cirl_marl.network.calendar import labels
 from cirl_marl.network.declared import declarations
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node, Role
 from cirl_marl.network.parts import Parts
@@ -42,6 +43,10 @@ def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
 def series_problems(network: Parts) -> Iterator[str]:
     """Yield series that are none, or that do not cover the episode."""
     length = network.episode.control_interval * network.episode.horizon
+
+    def said(time: float) -> str:
+        return f"{time:g}" + "".join(f" ({each})" for dates in labels(network, time)[1] for each in dates)
+
     parts: list[Any] = [*network.nodes, *network.arcs, *network.services]
     named: list[tuple[str, Any]] = [(f"{type(part).__name__.lower()} '{part.id}': ", part) for part in parts]
     named += [(f"{where}control.", c.control) for where, c in named if isinstance(c, Compartment) and c.control]
@@ -49,7 +54,7 @@ def series_problems(network: Parts) -> Iterator[str]:
         for name in declarations(type(part)):
             value = getattr(part, name)
             if isinstance(value, Series):
-                told = list(value.problems()) or [value.uncovered(length)]
+                told = list(value.problems()) or [value.uncovered(length, said)]
                 origin = f" ({value.origin})" if value.origin else ""
                 yield from (f"{where}{name}: {each}{origin}" for each in told if each)
 

@@ -15,6 +15,7 @@ from scipy.special import stdtrit
 from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dressed, save, shaped, spoken
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import Law
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def save_circularity(
     ``runs`` are means of λ over the intervals, mass, and ``services`` service levels by control, of shape
     (episodes, steps), ``time`` (steps,); other shapes raise a ``CirlError``.
     """
+    time = _shown(time, network)
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
     names = list(dict.fromkeys([*runs, *services]))
@@ -113,7 +115,7 @@ def save_trajectory(
     Args:
         path: file to write; its folder is made.
         network: the network.
-        time: shape (steps,), time.
+        time: ends of the intervals, shape (steps,), time.
         stock: stocks, shape (stores, steps), mass.
         flow: mean flows of each interval, shape (arcs, steps), mass/time.
         circularity: mean λ of each interval, shape (steps,), mass.
@@ -134,20 +136,23 @@ def save_trajectory(
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {arc}" for arc in on_the_way]
         stock = np.concatenate([stock, shaped("load", load, (len(on_the_way), *steps))])
-    held_at = time
+    # what is a mean over an interval stands in its middle, a stock at its end
+    middle, held_at = (_shown(each, network) for each in (time - network.episode.control_interval / 2, time))
     if start is not None:
         stock = np.column_stack([shaped("start", start, (len(stock),)), stock])
-        held_at = np.concatenate([[0.0], time])
+        held_at = np.concatenate([_shown(np.zeros(1), network), held_at])
     heights = (1.25, 1.25, 0.8) if service is None else (1.25, 1.25, 0.8, 0.5)
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
     figure.suptitle(title, fontsize=11, fontweight="bold")
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     _draw_largest(panels[0], held_at, stock, held, "Stocks", mass)
-    _draw_largest(panels[1], time, flow, [arc.id for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}")
-    _draw_mean(panels[2], time, circularity, "", 0)
+    _draw_largest(
+        panels[1], middle, flow, [arc.id for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}"
+    )
+    _draw_mean(panels[2], middle, circularity, "", 0)
     dressed(panels[2], title="Mean circularity", ylabel=f"λ / {mass}")
     if service is not None:
-        _draw_mean(panels[3], time, shaped("service", service, steps), "", 0)
+        _draw_mean(panels[3], middle, shaped("service", service, steps), "", 0)
         dressed(panels[3], title="Service level", ylabel="service level")
         panels[3].set_ylim(-0.03, 1.06)
     _set_time(panels[-1], held_at, network)
@@ -199,8 +204,14 @@ def _dots(time: Floats) -> str:
     return "o" if len(time) == 1 else ""
 
 
+def _shown(time: Floats, network: Network) -> Floats:
+    """Return times as axes show them: as calendar years, if the network has a start."""
+    return time if network.episode.start is None else years(network, time)
+
+
 def _set_time(axes: Axes, time: Floats, network: Network) -> None:
-    axes.set_xlabel(f"time / {network.time_unit}", fontsize=9)
+    axes.set_xlabel("year" if network.episode.start is not None else f"time / {network.time_unit}", fontsize=9)
+    axes.ticklabel_format(axis="x", useOffset=False)  # 2000, not 0 with +2e3 in a corner
     if len(time) > 1:
         axes.set_xlim(float(np.min(time)), float(np.max(time)))
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import Beginning, Rollout, interval_ends
 from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.network.calendar import labels
 from cirl_marl.records.files import write_atomically, write_table
 from cirl_marl.report.curves import save_trajectory
 
@@ -15,10 +16,10 @@ from cirl_marl.report.curves import save_trajectory
 def write_trajectory(folder: Path, name: str, env: VectorEnv, begun: Beginning, run: Rollout, title: str) -> list[Path]:
     """Write ``name.csv`` and ``name.png`` of what ``run`` did in ``env`` from where it began; return their paths.
 
-    The table has a row for the start and one for the end of each interval: λ at the end and the mean of λ, the service
-    level, stocks at the end, mean flows, what passes through nodes without stock, masses on the way and inner states
-    that an agent may see. The picture shows λ as a mean, as it does the flows. ``env`` is left at the start of the
-    episode.
+    The table has a row for the start and one for the end of each interval: year or date at the end, if the network has
+    a start on the calendar, λ at the end and the mean of λ, the service level, stocks at the end, mean flows, what
+    passes through nodes without stock, masses on the way and inner states that an agent may see. The picture shows λ as
+    a mean, as it does the flows. ``env`` is left at the start of the episode.
     """
     folder.mkdir(parents=True, exist_ok=True)
     begun.reset(env)
@@ -26,9 +27,12 @@ def write_trajectory(folder: Path, name: str, env: VectorEnv, begun: Beginning, 
     stock, load = start.stock[env.rows.nodes, 0], batches.loads(start.stock)[:, 0]
     inner = start.inner[env.dynamics.inner.visible, 0]
     lambdas, moved = (run.circularity[0], run.circularity_mean[0]), (*run.flow.T, *env.network.throughput(run.flow.T))
-    columns = (time, *lambdas, run.service[0], *run.stock.T, *moved, *run.load.T, *run.inner.T)
-    first = [0.0, *[None] * 3, *stock.tolist(), *[None] * len(moved), *load.tolist(), *inner.tolist()]
-    rows = [first, *zip(*(column.tolist() for column in columns), strict=True)]
+    columns = (*lambdas, run.service[0], *run.stock.T, *moved, *run.load.T, *run.inner.T)
+    first = [*[None] * 3, *stock.tolist(), *[None] * len(moved), *load.tolist(), *inner.tolist()]
+    times = np.concatenate([[0.0], time])
+    clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
+    measured = [first, *zip(*(column.tolist() for column in columns), strict=True)]
+    rows = [[*at, *values] for at, values in zip(clock, measured, strict=True)]
     table, picture = folder / f"{name}.csv", folder / f"{name}.png"
     write_atomically(table, lambda partial: write_table(partial, _header(env), rows))
     save_trajectory(
@@ -49,7 +53,8 @@ def write_trajectory(folder: Path, name: str, env: VectorEnv, begun: Beginning, 
 def _header(env: VectorEnv) -> list[str]:
     network, physics = env.network, env.dynamics.inner
     mass, time = network.mass_unit, network.time_unit
-    header = [f"time ({time})", f"circularity at the end ({mass})", f"mean circularity ({mass})", "service level"]
+    header = [f"time ({time})", *(f"{each} at the end" for each in labels(network, 0.0)[0])]
+    header += [f"circularity at the end ({mass})", f"mean circularity ({mass})", "service level"]
     header += [f"stock of {node.id} ({mass})" for node in network.stores]
     header += [f"flow of {arc.id} ({mass}/{time})" for arc in network.arcs]
     header += [f"throughput of {node.id} ({mass}/{time})" for node in network.nodes if not node.stores]

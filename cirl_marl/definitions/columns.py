@@ -1,0 +1,176 @@
+"""Columns of CSV files that stand beside a definition: numbers, and series of them."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network.calendar import When
+
+YEAR = "year"
+"""The column of times, if a file has one of this name and nothing else is said."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Numbers of a column, with the times of the rows as the file has them; a single number without times if None."""
+
+    times: Sequence[When] | None
+    values: Sequence[float]
+    origin: str
+
+
+class DataFiles:
+    """The CSV files that one definition names, each read once."""
+
+    def __init__(self, folder: Path) -> None:
+        """Look for files in ``folder``, that of the definition, and below it."""
+        self._folder = folder.resolve()
+        self._tables: dict[str, _Table] = {}
+        self._stamps: dict[Path, int] = {}
+
+    @property
+    def edited(self) -> bool:
+        """Whether a file has changed, or is gone, since it was read."""
+        return any(not path.is_file() or path.stat().st_mtime_ns != stamp for path, stamp in self._stamps.items())
+
+    def sha256(self, name: str) -> str:
+        """Return the hash of a file as it was read."""
+        return self._table(name).sha256
+
+    def column(self, name: str, column: str, where: Mapping[str, str], times: str | None) -> Column:
+        """Return the numbers of ``column`` in the rows whose columns have the texts of ``where``.
+
+        ``times`` is the column of their times; None: ``year``, if there is such a column and ``where`` leaves it free.
+
+        Raises:
+            CirlError: naming file, line, column and value, with what to do.
+        """
+        return self._table(name).column(column, where, times)
+
+    def _table(self, name: str) -> _Table:
+        if name not in self._tables:
+            path, told = self._folder / name, f"file '{name}'"
+            if Path(name).is_absolute() or ".." in Path(name).parts or not path.resolve().is_relative_to(self._folder):
+                raise CirlError(f"{told}: must lie in {self._folder}, the folder of the definition, or below it")
+            if not path.is_file():
+                beside = sorted(each.name for each in path.parent.glob("*.csv"))
+                raise CirlError(f"{told}: is not there; {unknown(f'file in {path.parent}', path.name, beside)}")
+            self._stamps[path] = path.stat().st_mtime_ns
+            self._tables[name] = _Table(name, path.read_bytes())
+        return self._tables[name]
+
+
+class _Table:
+    """One CSV file."""
+
+    def __init__(self, name: str, content: bytes) -> None:
+        self.name, self.sha256 = name, hashlib.sha256(content).hexdigest()
+        try:
+            reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+            # csv counts the line on which a row ends
+            numbered = [(reader.line_num, row) for row in reader if row]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise CirlError(f"file '{name}': is no CSV file in UTF-8: {error}") from error
+        if not numbered:
+            raise CirlError(f"file '{name}': is empty; its first line names the columns")
+        (_, self.header), *self.rows = numbered
+        self.place = {column: i for i, column in enumerate(self.header)}
+        if len(self.place) != len(self.header):
+            twice = next(each for each in self.header if self.header.count(each) > 1)
+            raise CirlError(f"file '{name}', line 1: names the column '{twice}' twice")
+        for line, row in self.rows:
+            if len(row) != len(self.header):
+                raise CirlError(f"file '{name}', line {line}: {len(row)} cells in {len(self.header)} columns")
+        self._indices: dict[tuple[int, ...], dict[tuple[str, ...], list[int]]] = {}
+
+    def column(self, column: str, where: Mapping[str, str], times: str | None) -> Column:
+        if times is None and YEAR in self.place and YEAR not in where:
+            times = YEAR
+        for each in (column, *where, *([] if times is None else [times])):
+            if each not in self.place:
+                raise CirlError(f"file '{self.name}': {unknown('column', each, self.header)}")
+        chosen = self._chosen(where)
+        lines = [self.rows[i][0] for i in chosen]
+        values = [self._number(*self.rows[i], column) for i in chosen]
+        origin = f"{self.name}, column '{column}'" + (f", where {_told(where)}" if where else "")
+        if times is not None:
+            return Column(self._times(chosen, times), values, origin)
+        if len(chosen) > 1:
+            remedy = "fix more columns in 'where', or name the column of times in 'times'"
+            raise CirlError(f"{origin}: lines {lines[0]} and {lines[1]} both match; {remedy}")
+        return Column(None, values, origin)
+
+    def _chosen(self, where: Mapping[str, str]) -> list[int]:
+        """Return the rows that match, by an index of the columns in ``where``: many series name the same ones."""
+        keys = tuple(self.place[each] for each in where)
+        if keys not in self._indices:
+            index: dict[tuple[str, ...], list[int]] = {}
+            for i, (_, row) in enumerate(self.rows):
+                index.setdefault(tuple(row[key] for key in keys), []).append(i)
+            self._indices[keys] = index
+        chosen = self._indices[keys].get(tuple(where.values()))
+        if not chosen:
+            raise CirlError(f"file '{self.name}': {self._unmatched(where)}")
+        return chosen
+
+    def _unmatched(self, where: Mapping[str, str]) -> str:
+        """Say which entry of ``where`` leaves no row, with the nearest value that would leave one."""
+        rows, before = [row for _, row in self.rows], ""
+        for key, value in where.items():
+            known = dict.fromkeys(row[self.place[key]] for row in rows)
+            if value not in known:
+                return f"no row matches 'where'{before}: {unknown(key, value, sorted(known))}"
+            rows = [row for row in rows if row[self.place[key]] == value]
+            before += f"{' and' if before else ' with'} {key} = '{value}'"
+        return "has no rows"
+
+    def _number(self, line: int, row: Sequence[str], column: str) -> float:
+        text = row[self.place[column]]
+        try:
+            value = float(text.replace("_", "?"))
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            remedy = "is no number; write one as in 1234.5" if text.strip() else "is empty; write a number, or 0"
+            raise CirlError(f"file '{self.name}', line {line}, column '{column}': '{text}' {remedy}")
+        return value
+
+    def _times(self, chosen: Iterable[int], column: str) -> list[When]:
+        """Return the times of rows, which increase; all numbers or all dates, as the first is."""
+        dated = _date(self.rows[next(iter(chosen))][1][self.place[column]]) is not None
+        seen: dict[Any, int] = {}
+        latest: Any = None
+        for i in chosen:
+            line, row = self.rows[i]
+            told = f"file '{self.name}', line {line}, column '{column}'"
+            text = row[self.place[column]]
+            time: Any = _date(text) if dated else self._number(line, row, column)
+            if time is None:
+                raise CirlError(f"{told}: '{text}' is no date such as 2020-03-01, as others are")
+            if time in seen:
+                remedy = "fix more columns in 'where', or leave one row out"
+                raise CirlError(f"{told}: '{text}' stands in line {seen[time]} too; {remedy}")
+            if seen and time < latest:
+                raise CirlError(f"{told}: '{text}' comes after a later time; sort the rows by '{column}'")
+            seen[time], latest = line, time
+        return list(seen)
+
+
+def _date(text: str) -> date | None:
+    try:
+        return date.fromisoformat(text)
+    except ValueError:
+        return None
+
+
+def _told(where: Mapping[str, str]) -> str:
+    return " and ".join(f"{key} = '{value}'" for key, value in where.items())

@@ -1,0 +1,130 @@
+"""The forms in which definition files give numbers: with a unit and a source, as a series, or as a column of a file."""
+
+from __future__ import annotations
+
+from datetime import date, datetime
+from typing import Annotated, Any, Literal, Union, get_args
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema
+from pydantic_core import PydanticCustomError
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Source = Annotated[str, Field(min_length=1, description="where the number comes from")]
+
+
+class Table(BaseModel):
+    """A TOML table without unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class QuantityTable(Table):
+    """A number with its unit and source."""
+
+    value: Number
+    unit: str = Field(description="pint unit, such as 'kt', '1/day', 't/day'; '1' if dimensionless")
+    source: Source
+
+
+class Range(Table):
+    """An interval from which initial stocks are drawn uniformly."""
+
+    low: Number
+    high: Number
+    unit: str
+    source: Source
+
+
+def _moment(given: object) -> object:
+    if isinstance(given, int | float | date) and not isinstance(given, bool | datetime):
+        return given
+    raise PydanticCustomError("moment", "must be a number, such as the year 2000 or 2000.5, or a date, as 2020-03-01")
+
+
+Time = Annotated[
+    Any,
+    BeforeValidator(_moment),
+    WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "string", "format": "date"}]}),
+]
+Interpolation = Annotated[
+    Literal["step", "linear"],
+    Field(description="``step``: a value holds until the next one; ``linear``: straight lines between them"),
+]
+TimeUnit = Annotated[
+    str | None,
+    Field(
+        description="unit of times that count from the start of the episode; without it they are calendar years or "
+        "dates, for which [episode] has a start"
+    ),
+]
+
+
+class AmountSeries(Table):
+    """Numbers that change in time, in the unit of the table in which they stand."""
+
+    times: list[Time] = Field(description="when each value holds; the first not after the start of the episode")
+    values: list[Number] = Field(description="one for each time")
+    interpolation: Interpolation = "step"
+    time_unit: TimeUnit = None
+    until: Time | None = Field(
+        None, description="when the last value ceases to hold; by default never with steps, at its time with lines"
+    )
+
+
+class SeriesTable(AmountSeries):
+    """A quantity that changes in time."""
+
+    unit: str
+    source: Source
+
+
+class AmountColumn(Table):
+    """Numbers of a CSV file, in the unit of the table in which they stand; a single one if they have no times."""
+
+    file: str = Field(description="name of the file, which lies in the folder of the definition or below it")
+    column: str = Field(description="the column with the numbers")
+    where: dict[str, str] = Field(
+        {}, description="texts by which rows are chosen, by column; {region} in a text stands for that of [regions]"
+    )
+    times: str | None = Field(
+        None, description="the column with the times; default: ``year``, if there is one that ``where`` leaves free"
+    )
+    interpolation: Interpolation = "step"
+    time_unit: TimeUnit = None
+
+
+class ColumnTable(AmountColumn):
+    """A quantity that stands in a CSV file; the last step holds as long as the one before it."""
+
+    unit: str
+    source: Source
+
+
+WORD, VALUE, SERIES, COLUMN = FORMS = ("<word>", "<value>", "<series>", "<column>")
+"""Tags of the forms in which a number that may vary is given; in pydantic's mistakes they stand among the keys."""
+
+
+def _form(given: object) -> str:
+    keys = set(given) if isinstance(given, dict) else set()
+    return COLUMN if {"file", "column", "where"} & keys else SERIES if {"times", "values"} & keys else VALUE
+
+
+def varying(value: Any, series: Any, column: Any, word: str = "") -> Any:
+    """Return the type of a number that may be given in several forms, which its keys tell, or as a word."""
+    forms = [Annotated[value, Tag(VALUE)], Annotated[series, Tag(SERIES)], Annotated[column, Tag(COLUMN)]]
+    if not word:
+        return Annotated[Union[*forms], Discriminator(_form)]
+    either = Discriminator(lambda given: WORD if isinstance(given, str) else _form(given))
+    return Annotated[Union[*forms, Annotated[Literal[word], Tag(WORD)]], either]
+
+
+def forms(kind: Any) -> dict[str, Any]:
+    """Return the forms of a number that may vary, by tag; none of other types."""
+    found: dict[str, Any] = {}
+    for each in get_args(kind):
+        tags = [told.tag for told in getattr(each, "__metadata__", ()) if isinstance(told, Tag)]
+        found |= {tags[0]: get_args(each)[0]} if tags else forms(each)
+    return found
+
+
+VaryingAmount = varying(Number, AmountSeries, AmountColumn)

@@ -1,0 +1,65 @@
+"""From the tables and columns of a definition to series in the units of the network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+
+from cirl_marl.definitions.columns import DataFiles
+from cirl_marl.definitions.quantities import AmountColumn, AmountSeries
+from cirl_marl.errors import CirlError
+from cirl_marl.network.calendar import When, elapsed
+from cirl_marl.network.series import Series, Value
+from cirl_marl.network.units import factor
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """What times of a definition count from: the ``start`` of its episode, if it has one, in the network's ``unit``."""
+
+    start: When | None
+    unit: str
+
+    def times(self, given: Sequence[When], time_unit: str | None) -> tuple[float, ...]:
+        """Return times since the start; given as such in ``time_unit``, or without it as years or dates."""
+        if time_unit is not None:
+            tick = factor(time_unit, self.unit)
+            dates = [each for each in given if isinstance(each, date)]
+            if dates:
+                raise CirlError(f"{dates[0]} is a date, which takes no time_unit; leave it out")
+            return tuple(each * tick for each in given if not isinstance(each, date))
+        if self.start is None:
+            remedy = "give a time_unit, in which times count from the start, or the start of the [episode]"
+            raise CirlError(f"times are years or dates only if the episode has a start; {remedy}")
+        return tuple(elapsed(each, self.start, self.unit) for each in given)
+
+
+def inline_series(table: AmountSeries, unit: float, clock: Clock) -> Series:
+    """Return a series written in the definition; ``unit`` is that of its values."""
+    return Series(
+        times=clock.times(table.times, table.time_unit),
+        values=tuple(value * unit for value in table.values),
+        interpolation=table.interpolation,
+        until=None if table.until is None else clock.times([table.until], table.time_unit)[0],
+    )
+
+
+def column_value(table: AmountColumn, where: Mapping[str, str], files: DataFiles, unit: float, clock: Clock) -> Value:
+    """Return what a column of a file holds in the rows ``where`` its other columns have these texts.
+
+    The last of several steps is known as long as the one before it holds; a single one for a year or a ``time_unit``.
+    """
+    column = files.column(table.file, table.column, where, table.times)
+    values = tuple(value * unit for value in column.values)
+    if column.times is None:
+        return values[0]
+    times = clock.times(column.times, table.time_unit)
+    last = times[-1] - times[-2] if len(times) > 1 else factor(table.time_unit or "year", clock.unit)
+    return Series(
+        times=times,
+        values=values,
+        interpolation=table.interpolation,
+        until=times[-1] + last if table.interpolation == "step" else None,
+        origin=column.origin,
+    )

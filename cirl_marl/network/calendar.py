@@ -1,0 +1,78 @@
+"""From elapsed time to the calendar and back, for networks that begin on it.
+
+A year is 365.25 days, as it is for units. Networks whose unit of time is a month or longer count in years: a time t is
+the year start + t. All others count in days: a time t is the date start + t.
+"""
+
+from __future__ import annotations
+
+from datetime import date, datetime, timedelta
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cirl_marl.network.parts import Parts
+from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.units import factor
+
+When = float | date
+"""A calendar year such as 2000 or 2000.5, or a date."""
+
+YEAR = 365.25
+"""Days of a year."""
+LAST_YEAR = 9999
+
+
+def in_years(unit: str) -> bool:
+    """Whether networks whose unit of time is ``unit`` count in years."""
+    return factor(unit, "day") > 28
+
+
+def year(moment: When) -> float:
+    """Return a moment as a calendar year with its fraction.
+
+    >>> year(date(2020, 7, 1)) == 2020 + 182 / 365.25
+    True
+    """
+    if isinstance(moment, date):
+        return moment.year + (moment - date(moment.year, 1, 1)).days / YEAR
+    return float(moment)
+
+
+def elapsed(moment: When, start: When, unit: str) -> float:
+    """Return the time from ``start`` to ``moment``, in ``unit``; negative if it lies before.
+
+    >>> elapsed(2001.5, 2000, "year"), elapsed(date(2020, 3, 1), 2020, "day")
+    (1.5, 60.0)
+    """
+    if isinstance(moment, date) and not in_years(unit):
+        return (_clock(moment) - _clock(start)) / timedelta(days=1) * factor("day", unit)
+    return (year(moment) - year(start)) * factor("year", unit)
+
+
+def years(network: Parts, time: ArrayLike) -> Floats:
+    """Return times since the start of an episode as calendar years; the network must have a start."""
+    start = network.episode.start
+    assert start is not None
+    found: Floats = year(start) + np.asarray(time, dtype=np.float64) * factor(network.time_unit, "year")
+    return found
+
+
+def labels(network: Parts, time: ArrayLike) -> tuple[list[str], list[list[str]]]:
+    """Return the headers and the columns of a table for times on the calendar: one each, or none without a start."""
+    start = network.episode.start
+    if start is None:
+        return [], []
+    if in_years(network.time_unit):
+        return ["year"], [[f"{each:.10g}" for each in np.atleast_1d(years(network, time)).tolist()]]
+    seconds = np.atleast_1d(time) * factor(network.time_unit, "s")
+    dates = [_clock(start) + timedelta(seconds=round(each)) for each in seconds.tolist()]
+    whole = all(each.time() == each.min.time() for each in dates)
+    return ["date"], [[each.isoformat(" ", "minutes")[: 10 if whole else None] for each in dates]]
+
+
+def _clock(moment: When) -> datetime:
+    """Return a moment on a clock without zones; the fraction of a year is one of 365.25 days."""
+    if isinstance(moment, date):
+        return datetime(moment.year, moment.month, moment.day)
+    return datetime(int(moment), 1, 1) + timedelta(days=(moment % 1) * YEAR)

@@ -1,0 +1,66 @@
+"""An ordinary material flow analysis of 30 years, from its file to its flows: the example ``metal_cycle``."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cirl_marl import VectorEnv, load_network
+from cirl_marl.controllers import Constant
+from cirl_marl.controllers.remarks import remarks
+from cirl_marl.controllers.rollout import beginning, rollout
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
+
+
+def by_hand(collected: np.ndarray) -> dict[str, np.ndarray]:
+    """Return flows and stocks of all years in closed form, from the columns of the data file."""
+    with EXAMPLE.with_suffix(".csv").open() as file:
+        rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    known = [row["year"] for row in rows]
+    years = np.arange(2020, 2050)
+    # the mean of straight lines over a year in which none of them bends is their value in the middle
+    demand, products = (
+        np.interp(years + 0.5, known, [row[key] for row in rows]) for key in ("demand", "fabrication_yield")
+    )
+    stock, found = 1100.0, []
+    for ore, kept, share in zip(demand, products, collected, strict=True):
+        # ingots = ore + scrap, of which 99 % is made into products or comes back: the loop multiplies both sources
+        loop = 0.99 / (1.0 - 0.99 * (1.0 - kept))
+        gain, rate = kept * loop, 0.04
+        # dx/dt = gain·(ore + share·rate·x) − rate·x
+        net = rate * (1.0 - gain * share)
+        after = stock * np.exp(-net) + gain * ore * -np.expm1(-net) / net
+        released = rate * (gain * ore - (after - stock)) / net
+        found.append((after, released, loop * (ore + share * released)))
+        stock = float(after)
+    use, released, fabricated = np.array(found).T
+    return {"use": use, "end_of_life": released, "casting": fabricated, "smelting": demand}
+
+
+@pytest.mark.parametrize("action", [None, -1.0, 1.0])
+def test_flows_of_thirty_years_against_closed_forms(action: float | None) -> None:
+    """Stocks and flows of every year; the loop of new scrap and yields that rise from year to year included."""
+    env = VectorEnv(load_network(EXAMPLE), num_envs=1)
+    begun = beginning(env)
+    neutral = Constant({} if action is None else {"old_scrap": action})
+    run = rollout(env, neutral, seed=begun.seed, start=begun.given)
+    highest = np.where(np.arange(2020, 2050) < 2040, 0.5, 0.9)
+    collected = {None: np.full(30, 0.5), -1.0: np.full(30, 0.3), 1.0: highest}[action]
+    expected = by_hand(collected)
+    network = env.network
+    np.testing.assert_allclose(run.stock[:, network.node_index["use"]], expected["use"], rtol=1e-11)
+    for arc in ("end_of_life", "casting", "smelting"):
+        np.testing.assert_allclose(run.flow[:, network.arc_index[arc]], expected[arc], rtol=1e-11)
+    lost = run.flow[:, [network.arc_index[arc] for arc in ("smelting", "lost", "dross")]].sum(axis=1)
+    np.testing.assert_allclose(run.circularity_mean[0], -lost, rtol=1e-12)
+    demanded = 1000 + 800 * (np.arange(30) + 0.5) / 30
+    np.testing.assert_allclose(run.service[0], np.minimum(1.0, expected["use"] / demanded), rtol=1e-11)
+
+
+def test_nothing_is_remarked_on() -> None:
+    """Neither a source too small nor a valve taken for a share."""
+    assert not list(remarks(load_network(EXAMPLE)))
