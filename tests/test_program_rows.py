@@ -16,6 +16,7 @@ from exact_episode import Controls, Interval, control_of, imbalance, intervals, 
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from small_networks import cycle
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, VectorEnv
 from cirl_marl.network.series import Series
@@ -461,3 +462,26 @@ def test_the_most_that_is_delivered() -> None:
     cost[problem.layout.flow(0) + np.array(ordered)] = -1.0
     most = -float(cost @ solve(replace(problem, cost=cost)).plan)
     assert most == pytest.approx(delivered, rel=1e-7)
+
+
+@pytest.mark.parametrize("style", ["inside", "ends", "low", "high"])
+@pytest.mark.parametrize("merged", [False, True])
+@pytest.mark.parametrize("hoarded", [40.0, 0.0, 500.0])
+def test_fast_stocks_and_strong_loops(hoarded: float, merged: bool, style: str) -> None:
+    """Shares that could multiply mass, plants that settle within an interval, and schedules that are cut."""
+    rng = np.random.default_rng(3)
+    for degree in (1, 3):
+        played = play(cycle(hoarded=hoarded), rng, style)
+        assert_holds(played, degree, None, merged)
+    layout = Programs(Admissible.of(played.network), 1, None, merged=merged).layout
+    assert layout.pieces == (1 if merged else 25)
+
+
+def test_merged_pieces_are_as_tight() -> None:
+    """One piece for an interval of 25 substeps proves nearly what 25 pieces prove, with a tenth of the variables."""
+    admissible = Admissible.of(cycle(hoarded=500.0))
+    start = admissible.network.initial.mean(axis=0)
+    fine, merged = (Programs(admissible, 2, None, merged=each).program(start, 0.8) for each in (False, True))
+    proved = [-float(problem.cost @ solve(problem).plan) for problem in (fine, merged)]
+    assert len(merged.cost) < 0.1 * len(fine.cost)
+    assert proved[1] == pytest.approx(proved[0], rel=0.05)

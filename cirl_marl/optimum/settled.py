@@ -15,6 +15,7 @@ and g, and for (w − w̲) and (w̄ − w) times what a factor w acts on. Of x_j
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +82,7 @@ def settled(admissible: Admissible, layout: Layout, step: int, linear: Linear, r
     stores = len(network.stores)
     least, most = admissible.exits(step)[:, :stores]
     ordered = np.bincount(network.donors[admissible.scheduled], minlength=stores)[:stores] > 0
+    _held_factors(admissible, layout, step, rows, ~ordered)
     known: set[bytes] = set()
     for turnover in FAST:
         fast = (least * layout.length >= turnover) & ~ordered
@@ -89,6 +91,25 @@ def settled(admissible: Admissible, layout: Layout, step: int, linear: Linear, r
             slow = ~fast & ~ordered
             writer = _Follows(admissible, layout, step, linear, rows, len(known), fast)
             writer.write(float(most[slow].max(initial=0.0)), least)
+
+
+def _held_factors(admissible: Admissible, layout: Layout, step: int, rows: Rows, usable: NDArray[np.bool_]) -> None:
+    """Add that (w − w̲)·x and (w̄ − w)·x fall at most as x does; keys (2, 0, piece, arc and side, i)."""
+    (low, high), piece = admissible.rate(step), np.arange(layout.pieces)[:, None]
+    fastest = admissible.exits(step)[1]
+    known = np.append(usable & (fastest[: len(usable)] * layout.length < FAST[-1]), False)
+    arcs = np.flatnonzero((low < high) & known[np.minimum(admissible.driver, len(usable))] & ~admissible.scheduled)
+    arcs = np.setdiff1d(arcs, followers(admissible, step))
+    driver = admissible.driver[arcs]
+    for i in range(layout.degree + 1):
+        moment = piece * (layout.degree + 1) + i
+        growth = _growth(fastest[driver], layout, i)
+        for side, sign, bound in ((0, 1.0, low[arcs]), (1, -1.0, high[arcs])):
+            row = rows.add(2, 0, piece, 2 * arcs + side, i)
+            rows.put(row, layout.flow(moment) + arcs, sign)
+            rows.put(row, layout.stock(moment) + driver, -sign * bound)
+            rows.put(row, layout.end_flow(piece) + arcs, -sign * growth)
+            rows.put(row, layout.end(piece) + driver, sign * bound * growth)
 
 
 class _Follows:
@@ -144,23 +165,22 @@ class _Follows:
         """Write all rows, with κ = ``slowest`` and the least rates at which stocks are left."""
         layout, network, piece = self.layout, self.network, np.arange(self.layout.pieces)[:, None]
         nodes = np.flatnonzero(self.covered)
-        growth = _growth(slowest, layout.length, layout.degree)
         arcs = np.flatnonzero((self.low < self.high) & ~self.admissible.scheduled)
         arcs = np.setdiff1d(arcs, self.followers)
         arcs = arcs[self.covered[self.admissible.driver[arcs]]]
         for i in range(layout.degree + 1):
-            moment = piece * (layout.degree + 1) + i
+            moment, growth = piece * (layout.degree + 1) + i, _growth(slowest, layout, i)
             row = self.rows.add(2, self.choice, piece, nodes, i)
             self.rows.put(row, layout.stock(moment) + nodes, 1.0)
-            self.rows.put(row, layout.end(piece) + nodes, -growth[i])
+            self.rows.put(row, layout.end(piece) + nodes, -growth)
             self._allow(row, piece, nodes, i, np.ones(len(nodes)))
             driver, spread = self.admissible.driver[arcs], self.high[arcs] - self.low[arcs]
             for side, sign, bound in ((0, 1.0, self.low[arcs]), (1, -1.0, self.high[arcs])):
                 row = self.rows.add(2, self.choice, piece, len(network.nodes) + 2 * arcs + side, i)
                 self.rows.put(row, layout.flow(moment) + arcs, sign)
                 self.rows.put(row, layout.stock(moment) + driver, -sign * bound)
-                self.rows.put(row, layout.end_flow(piece) + arcs, -sign * growth[i])
-                self.rows.put(row, layout.end(piece) + driver, sign * bound * growth[i])
+                self.rows.put(row, layout.end_flow(piece) + arcs, -sign * growth)
+                self.rows.put(row, layout.end(piece) + driver, sign * bound * growth)
                 self._allow(row, piece, driver, i, spread)
         fast = nodes[nodes < self.stores]
         row = np.full((layout.pieces, len(network.nodes)), -1)
@@ -188,10 +208,9 @@ class _Follows:
         self.rows.loosen(row[:, place], arcs, self.loose * factor[place])
 
 
-def _growth(rate: float, length: float, degree: int) -> Floats:
-    """Return the means of e^{κ(δ−s)} under B_0 … B_d."""
-    means: Floats = special.hyp1f1(degree - np.arange(degree + 1) + 1, degree + 2, rate * length) * WIDER
-    return means
+def _growth(rate: float | Floats, layout: Layout, i: int) -> Any:
+    """Return the mean of e^{κ(δ−s)} under B_i."""
+    return special.hyp1f1(layout.degree - i + 1, layout.degree + 2, rate * layout.length) * WIDER
 
 
 def _transients(matrix: Floats, length: float, degree: int) -> Floats:
