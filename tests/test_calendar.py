@@ -126,14 +126,14 @@ def test_tables_have_years_or_dates(
     text = text.replace('time = "year"', f'time = "{unit}"').replace('1, unit = "year"', f'1, unit = "{unit}"')
     path = written(tmp_path, text)
     simulate(str(path), out=tmp_path)
-    found = rows(tmp_path / "ores_neutral.csv", [f"time ({unit})", header])
+    found = rows(tmp_path / "ores_neutral.csv", [f"time ({unit})", f"{header} at the end"])
     assert found == [[f"{float(i)}", each] for i, each in enumerate(dates)]
     plan(str(path), control="neutral", out=tmp_path / "plan.csv")
     begins = [[f"{i}", f"{i + 1}", each] for i, each in enumerate(dates[:-1])]
-    assert rows(tmp_path / "plan.csv", [f"from ({unit})", f"to ({unit})", header]) == begins
+    assert rows(tmp_path / "plan.csv", [f"from ({unit})", f"to ({unit})", f"{header} at the start"]) == begins
     written(tmp_path, definition(sold=SOLD))
     simulate(str(path), out=tmp_path)
-    assert "year" not in (tmp_path / "ores_neutral.csv").read_text().splitlines()[0].split(",")
+    assert "year at the end" not in (tmp_path / "ores_neutral.csv").read_text().splitlines()[0].split(",")
 
 
 def test_axes_show_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

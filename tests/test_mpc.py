@@ -93,7 +93,7 @@ def test_a_short_window_sees_what_comes_after_where_the_service_is_out_of_reach(
         name="chain",
         nodes=(
             replace(RESERVE, initial=(1e3, 1e3), control=valve),
-            *(replace(USE, id=name, initial=(0.0, 0.0)) for name in (*steps, "use")),
+            *(Node(id=name, initial=(0.0, 0.0)) for name in (*steps, "use")),
             TIP,
         ),
         arcs=(

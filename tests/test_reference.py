@@ -117,7 +117,8 @@ def test_one_agent_is_all_agents_with_the_others_neutral(network: str, agent: st
     first, _ = one.reset(seed=5)
     np.testing.assert_array_equal(first, all_.reset(seed=5)[0][agent])
     rng = np.random.default_rng(0)
-    neutral = VectorEnv(network, num_envs=1).neutral_action  # in float64, as nobody acting holds it
+    held = VectorEnv(network, num_envs=1).neutral_action  # in float64, as nobody acting holds it
+    neutral = {each: action[0] for each, action in held.items()}
     for _ in range(30):
         action = rng.uniform(-1, 1, one.action_space.shape).astype(np.float32)
         observation, reward, *_ = one.step(action)

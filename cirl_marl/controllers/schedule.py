@@ -38,7 +38,8 @@ class Schedule:
             raise CirlError(f"{path}: the folder {path.parent} does not exist")
         calendar, dates = labels(self.network, interval_ends(self.network) - self.network.episode.control_interval)
         texts = [[f"{value:.10g}" for value in column] for column in self.columns]
-        header, rows = (*self.header[:2], *calendar, *self.header[2:]), zip(*texts[:2], *dates, *texts[2:], strict=True)
+        header = (*self.header[:2], *(f"{each} at the start" for each in calendar), *self.header[2:])
+        rows = zip(*texts[:2], *dates, *texts[2:], strict=True)
         write_atomically(path, lambda partial: write_table(partial, header, list(rows)))
 
 
