@@ -18,7 +18,7 @@ from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.network import Floats
-from cirl_marl.optimum import NoCertificate, Plan, achieved, bound, improved, search, solver
+from cirl_marl.optimum import NoCertificate, Plan, achieved, bound, improved, program, search, solver
 from cirl_marl.optimum.mpc import MPC
 from cirl_marl.optimum.population import starting_states
 
@@ -206,3 +206,18 @@ def test_controllers_that_plan_set_shares() -> None:
     assert neutral < min(planned, controlled, by_search)
     assert max(planned, controlled, by_search) <= found.objective + 1e-9
     assert planned >= found.objective - 0.02 * abs(found.objective)
+
+
+def test_multipliers_of_merged_pieces_bound_other_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a schedule may be cut from one start and not from the other."""
+    monkeypatch.setattr(program, "LARGE", 0)
+    network = cycle(hoarded=500.0)
+    found = bound(network)
+    assert found.problem.layout.merged
+    poor = found.initial.copy()
+    poor[network.node_index["hoard"]] = 1.0
+    proved, solved = float(found.at(poor)), bound(network, poor)
+    assert proved >= solved.objective - 1e-6 * abs(solved.objective)
+    assert solved.at(found.initial) >= found.objective - 1e-6 * abs(found.objective)
+    run = achieved(solved)
+    assert run.episode_circularity[0] <= solved.objective

@@ -14,7 +14,7 @@ from cirl_marl import Law, Network
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.passes import Passes
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.routes import Routes
+from cirl_marl.optimum.routes import RouteBounds
 
 
 @given(network=st.from_type(Network), seed=st.integers(0, 1000))
@@ -45,7 +45,7 @@ def test_routes_bound_what_passes(seed: int) -> None:
     """Throughputs and arrivals under random shares lie within their bounds."""
     network = yearly_network(seed)
     admissible, laws, stores = Admissible.of(network), FlowLaws(network), len(network.stores)
-    routes = Routes(admissible, Passes(network), 0)
+    routes = RouteBounds(admissible, Passes(network), 0)
     low, _, high = network.control_bounds[:, :, 0]
     rng = np.random.default_rng(seed)
     for _ in range(50):

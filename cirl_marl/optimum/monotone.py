@@ -18,11 +18,11 @@ from scipy import special
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
-from cirl_marl.optimum.rows import Rows
+from cirl_marl.optimum.rows import ProgramRows
 from cirl_marl.optimum.shared import followers
 
 
-def falls(admissible: Admissible, layout: Layout, step: int, rows: Rows) -> None:
+def falls(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) -> None:
     """Add the rows of an interval, each at most 0; their keys are (1, node, piece, what, i)."""
     network = admissible.network
     pulled = network.donors[~admissible.scheduled & (admissible.driver != network.donors)]
@@ -65,7 +65,9 @@ def _decay(rate: Floats, length: float, degree: int) -> tuple[Floats, Floats]:
 class _Chains:
     """Writes that weighted means of something which falls at most like e^{−ks}, but for U, rise with i."""
 
-    def __init__(self, admissible: Admissible, layout: Layout, rows: Rows, means: Floats, delays: Floats) -> None:
+    def __init__(
+        self, admissible: Admissible, layout: Layout, rows: ProgramRows, means: Floats, delays: Floats
+    ) -> None:
         self.layout, self.rows, self.means, self.delays = layout, rows, means, delays
         self.first = np.arange(layout.pieces) * (layout.degree + 1)  # moment of each piece
         donors = np.where(admissible.scheduled, admissible.network.donors, len(means))

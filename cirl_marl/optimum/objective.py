@@ -6,10 +6,10 @@ import numpy as np
 
 from cirl_marl.network import Floats
 from cirl_marl.optimum.layout import Layout
-from cirl_marl.optimum.rows import Rows
+from cirl_marl.optimum.rows import ProgramRows
 
 
-def measures(layout: Layout, low: Floats, rows: Rows) -> None:
+def measures(layout: Layout, low: Floats, rows: ProgramRows) -> None:
     """Add low·level − q ≤ 0 for each service and ±Δ·σ_env·f̄ − imbalance ≤ 0; their keys are (1, …).
 
     The level is at most min(1, q/low): a finite upper end of the band could only lower it further.

@@ -19,7 +19,7 @@ from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.monotone import falls
 from cirl_marl.optimum.objective import measures, objective
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
-from cirl_marl.optimum.rows import Chained, Rows
+from cirl_marl.optimum.rows import Chained, ProgramRows
 from cirl_marl.optimum.scheduled import deliveries, openings, orders
 from cirl_marl.optimum.settled import ends, settled
 from cirl_marl.optimum.shared import followers, passing
@@ -101,7 +101,7 @@ class Programs:
         self.layout = layout = _layout(admissible, self._system.substeps, merged, degree)
         self._equal, self._under = Chained(layout), Chained(layout)
         for kind in np.unique(admissible.kinds).tolist():
-            linked_equal, equal, linked_under, under = (Rows(layout) for _ in range(4))
+            linked_equal, equal, linked_under, under = (ProgramRows(layout) for _ in range(4))
             _balances(layout, linked_equal)
             orders(admissible, layout, equal, under)
             _laws(admissible, layout, kind, equal, under)
@@ -173,7 +173,7 @@ def _layout(admissible: Admissible, substeps: int, merged: bool | None, degree: 
     return fine
 
 
-def _balances(layout: Layout, rows: Rows) -> None:
+def _balances(layout: Layout, rows: ProgramRows) -> None:
     """Add Y_i − Y_{i−1} − δ/(d + 1)·S F_i, which is 0, for i = 0 … d (theorem 1); keys (moment, node).
 
     Y_i = ((d − i) X_i + (i + 1) X_{i+1})/(d + 1) are the means weighted with the polynomials of degree d − 1;
@@ -199,7 +199,7 @@ def _balances(layout: Layout, rows: Rows) -> None:
             rows.at_start(row[j], piece, node, -1.0)
 
 
-def _laws(admissible: Admissible, layout: Layout, step: int, equal: Rows, under: Rows) -> None:
+def _laws(admissible: Admissible, layout: Layout, step: int, equal: ProgramRows, under: ProgramRows) -> None:
     """Add the flow laws of an interval: rows that are 0 and rows at most 0; keys (0, moment, what, which, side)."""
     network, moment = admissible.network, layout.moment_column
 
@@ -227,7 +227,7 @@ def _laws(admissible: Admissible, layout: Layout, step: int, equal: Rows, under:
     hold(2, arcs, layout.flow(moment) + arcs, column, factor * admissible.base[step, arcs])
 
 
-def _held(admissible: Admissible, layout: Layout, step: int, rows: Rows) -> None:
+def _held(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) -> None:
     """Add F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z; keys (1, moment, what, which).
 
     For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.

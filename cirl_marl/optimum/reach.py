@@ -20,7 +20,7 @@ from cirl_marl.dynamics.passes import Passes
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
 from cirl_marl.optimum.held import Held
-from cirl_marl.optimum.routes import ROUNDING, Routes
+from cirl_marl.optimum.routes import ROUNDING, RouteBounds
 
 ROUND_OFF = 1e-13
 """Mass by which bounds are widened in each substep, relative to the mass in the network."""
@@ -53,7 +53,7 @@ class ComparisonSystem:
         dynamics = Dynamics(admissible.network)
         self.substeps, self.substep = dynamics.substeps, dynamics.substep
         self._passes = Passes(admissible.network)
-        self._routes: dict[bytes, Routes] = {}
+        self._routes: dict[bytes, RouteBounds] = {}
         self._linear: dict[int, Linear] = {}
 
     def reach(self, initial: Floats, intervals: range) -> Reach:
@@ -109,7 +109,7 @@ class ComparisonSystem:
             passed_on = self.network.donors >= len(self.network.stores)
             key = self.admissible.rate(kind)[:, passed_on].tobytes()
             if key not in self._routes:
-                self._routes[key] = Routes(self.admissible, self._passes, kind)
+                self._routes[key] = RouteBounds(self.admissible, self._passes, kind)
             self._linear[kind] = Linear(self.admissible, kind, self._routes[key], self.substep)
         return self._linear[kind]
 
@@ -129,7 +129,7 @@ class Linear:
         share: z/(e^z − 1) for the most that leaves a stock in proportion to it in a substep, z.
     """
 
-    def __init__(self, admissible: Admissible, kind: int, routes: Routes, substep: float) -> None:
+    def __init__(self, admissible: Admissible, kind: int, routes: RouteBounds, substep: float) -> None:
         """Compile it for the intervals like the first of that kind."""
         network, self.routes = admissible.network, routes
         stores, nodes = len(network.stores), len(network.nodes)

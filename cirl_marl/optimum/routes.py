@@ -20,7 +20,7 @@ ROUNDS = 1000
 """Most such rounds."""
 
 
-class Routes:
+class RouteBounds:
     """Bounds of what leaves such nodes in one interval, per mass that enters them.
 
     With the least shares P̲ among these nodes and R̲ into stocks, at least (I − P̲)⁻¹ R̲ = R̲ + P̲ R̲ + … arrives, so any

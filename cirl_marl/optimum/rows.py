@@ -16,7 +16,7 @@ KEYS = 5
 """Whole numbers that say where a row comes."""
 
 
-class Rows:
+class ProgramRows:
     """Rows over the variables of an interval, or of several, and over those of the interval before.
 
     Each row has a key; the rows of the matrices come in the order of their keys, in whatever order they were added.
@@ -97,7 +97,7 @@ class Chained:
         self._looser: tuple[dict[int, Any], dict[int, Any]] = ({}, {})
         self._known: dict[bytes, tuple[Any, Any]] = {}
 
-    def add(self, kind: int, linked: Rows, alone: Rows) -> None:
+    def add(self, kind: int, linked: ProgramRows, alone: ProgramRows) -> None:
         """Take the rows of a kind of interval: those that link it to the one before, and the others."""
         self._now[kind], self._before[kind], self._looser[0][kind] = linked.matrices()
         self._now[kind].eliminate_zeros()

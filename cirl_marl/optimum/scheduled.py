@@ -10,10 +10,10 @@ from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.reach import Reach
-from cirl_marl.optimum.rows import Rows
+from cirl_marl.optimum.rows import ProgramRows
 
 
-def deliveries(admissible: Admissible, layout: Layout, step: int, rows: Rows) -> None:
+def deliveries(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) -> None:
     """Add U·δ − x_start·z/(e^z − 1), at most 0, for the scheduled outflow U of each node; keys (0, piece, node).
 
     This is how the simulator cuts scheduled flows, with z = a·δ for the proportional exits of rate a; the least a gives
@@ -33,7 +33,7 @@ def deliveries(admissible: Admissible, layout: Layout, step: int, rows: Rows) ->
     rows.at_start(row, piece, nodes, -share[nodes] / layout.length)
 
 
-def orders(admissible: Admissible, layout: Layout, equal: Rows, under: Rows) -> None:
+def orders(admissible: Admissible, layout: Layout, equal: ProgramRows, under: ProgramRows) -> None:
     """Add that a scheduled flow is constant in its piece, F_i = F_0; keys (0, moment, 0, arc, side).
 
     If pieces are merged, a flow that nothing can cut is constant in the interval.
@@ -58,7 +58,7 @@ def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: 
     network, steps = admissible.network, len(intervals)
     when = slice(intervals.start, intervals.stop)
     t = np.arange(steps)[:, None]
-    rows = Rows(layout, steps)
+    rows = ProgramRows(layout, steps)
     limits: list[Floats] = []
     nodes, opening = layout.openings, layout.opening + np.arange(len(layout.openings))
     through, most = np.searchsorted(layout.valves, nodes), reached.upper[:, nodes]

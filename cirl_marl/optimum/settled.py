@@ -25,7 +25,7 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.reach import Linear
-from cirl_marl.optimum.rows import Rows
+from cirl_marl.optimum.rows import ProgramRows
 from cirl_marl.optimum.shared import followers, leader
 
 FAST = (0.5, 2.0, 8.0)
@@ -34,7 +34,7 @@ WIDER, ROUND_OFF = 1.0 + 1e-9, 1e-12
 """Factor and allowance by which transients are widened; rounding errors are far smaller."""
 
 
-def ends(admissible: Admissible, layout: Layout, step: int, equal: Rows, under: Rows) -> None:
+def ends(admissible: Admissible, layout: Layout, step: int, equal: ProgramRows, under: ProgramRows) -> None:
     """Add the flow laws at the end of merged pieces; keys (3, piece, what, which, side)."""
     network, piece = admissible.network, np.arange(layout.pieces)[:, None]
     stores, nodes, arcs = len(network.stores), len(network.nodes), np.arange(len(network.arcs))
@@ -74,7 +74,7 @@ def ends(admissible: Admissible, layout: Layout, step: int, equal: Rows, under: 
         equal.put(row, layout.end_flow(piece) + lead, -ratio)
 
 
-def settled(admissible: Admissible, layout: Layout, step: int, linear: Linear, rows: Rows) -> None:
+def settled(admissible: Admissible, layout: Layout, step: int, linear: Linear, rows: ProgramRows) -> None:
     """Add the rows of theorem 3, at most 0, on an interval and the stocks before; keys (2, …)."""
     network = admissible.network
     if (admissible.driver[~admissible.scheduled] != network.donors[~admissible.scheduled]).any():
@@ -93,7 +93,9 @@ def settled(admissible: Admissible, layout: Layout, step: int, linear: Linear, r
             writer.write(float(most[slow].max(initial=0.0)), least)
 
 
-def _held_factors(admissible: Admissible, layout: Layout, step: int, rows: Rows, usable: NDArray[np.bool_]) -> None:
+def _held_factors(
+    admissible: Admissible, layout: Layout, step: int, rows: ProgramRows, usable: NDArray[np.bool_]
+) -> None:
     """Add that (w − w̲)·x and (w̄ − w)·x fall at most as x does; keys (2, 0, piece, arc and side, i)."""
     (low, high), piece = admissible.rate(step), np.arange(layout.pieces)[:, None]
     fastest = admissible.exits(step)[1]
@@ -121,7 +123,7 @@ class _Follows:
         layout: Layout,
         step: int,
         linear: Linear,
-        rows: Rows,
+        rows: ProgramRows,
         choice: int,
         fast: NDArray[np.bool_],
     ) -> None:

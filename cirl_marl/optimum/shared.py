@@ -10,10 +10,10 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.network.splits import Split
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
-from cirl_marl.optimum.rows import Rows
+from cirl_marl.optimum.rows import ProgramRows
 
 
-def passing(admissible: Admissible, layout: Layout, step: int, rows: Rows) -> None:
+def passing(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) -> None:
     """Add what holds of shares in an interval, each 0; keys (2, moment, what, which).
 
     What enters a node that stores nothing is its throughput Q, and so is what leaves it. The shares of what a stock
