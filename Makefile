@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo check test test-all written lint types wheel fast unit every study speed clean
+.PHONY: demo check test test-all written lint types wheel fast unit every study planner speed clean
 
 demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
 	rm -rf runs/demo
@@ -45,6 +45,9 @@ written: $(VENV)/.runtime  ## the JSON schema of networks and docs/format.md, fr
 
 study: $(VENV)/.runtime  ## every recipe and controller on every network, against the bound (hours; it can be stopped)
 	$(BIN)/python benchmarks/study.py
+
+planner: $(VENV)/.runtime  ## plans for 200 generated networks, and how far they are from the bound (half an hour)
+	$(BIN)/python -m benchmarks.yearly
 
 speed: $(VENV)/.runtime  ## table of speed ratios
 	$(PIP) install --quiet -c constraints.txt -e '.[benchmarks]'

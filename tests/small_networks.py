@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl import Arc, Episode, Network, Node
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, Service
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network.series import Value
 
@@ -61,3 +61,56 @@ def advanced(network: Network, steps: int = 1) -> Floats:
     for step in range(steps):
         stock = dynamics.advance(stock, NO_STATES, dynamics.neutral[:, [step]], np.array([step])).stock
     return stock[:-1, 0]
+
+
+def cycle(interval: float = 1.0, hoarded: float = 40.0) -> Network:
+    """Return a cycle whose plants hold metal for weeks, with strong loops of markets and a hoard that may run empty."""
+
+    def share(name: str, donor: str, recipient: str, low: float, high: float) -> Arc:
+        control = Control(kind=ControlKind.SHARE, low=low, neutral=low + 0.1 * (high - low), high=high)
+        return Arc(id=name, donor=donor, recipient=recipient, law=Law.SHARE, control=control)
+
+    def order(name: str, donor: str, recipient: str, high: float) -> Arc:
+        control = Control(kind=ControlKind.FLOW, low=0.1 * high, neutral=0.5 * high, high=high)
+        return Arc(id=name, donor=donor, recipient=recipient, law=Law.CONTROLLED, control=control)
+
+    def rest(name: str, donor: str, recipient: str, given: float | Series | None = None) -> Arc:
+        return Arc(id=name, donor=donor, recipient=recipient, law=Law.SHARE, share=given)
+
+    valve = Control(kind=ControlKind.RATE, low=0.5, neutral=1.0, high=1.5)
+    changing = Series(times=(0.0, 4.0), values=(0.1, 0.3), interpolation="linear")
+    nodes = (
+        Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR),
+        Node(id="market", stores=False),
+        Node(id="use", initial=(100.0, 100.0), rate=0.3, control=valve),
+        Node(id="cans", initial=(20.0, 20.0), rate=2.5),
+        Node(id="trade", stores=False),
+        Node(id="waste", initial=(3.0, 3.0), rate=18.0),
+        Node(id="plant", initial=(1.0, 1.0), rate=25.0),
+        Node(id="hoard", initial=(hoarded, hoarded)),
+        Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0)),
+    )
+    arcs = (
+        order("mining", "mine", "market", 20.0),
+        share("to_cans", "market", "cans", 0.1, 0.7),
+        share("abroad", "market", "trade", 0.05, 0.9),
+        rest("to_use", "market", "use"),
+        share("back", "trade", "market", 0.3, 0.95),
+        rest("lost", "trade", "tip"),
+        rest("cans_waste", "cans", "waste"),
+        rest("use_loss", "use", "tip", changing),
+        rest("use_waste", "use", "waste"),
+        share("recycling", "waste", "plant", 0.2, 0.8),
+        share("hoarding", "waste", "hoard", 0.0, 0.5),
+        rest("dumping", "waste", "tip", 0.2),
+        rest("burning", "waste", "tip"),
+        rest("slag", "plant", "tip", 0.1),
+        rest("metal", "plant", "market"),
+        order("release", "hoard", "plant", 30.0),
+    )
+    services = (
+        Service(id="housed", provider="use", quantity="stock", low=90.0),
+        Service(id="traded", provider="trade", quantity="outflow", low=Series(times=(0.0, 2.0), values=(5.0, 9.0))),
+    )
+    episode = Episode(control_interval=interval, horizon=4)
+    return Network(name="cycle", nodes=nodes, arcs=arcs, services=services, episode=episode)

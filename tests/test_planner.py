@@ -10,15 +10,17 @@ from typing import Any, cast
 import highspy
 import numpy as np
 import pytest
+from small_networks import cycle
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, load_network
 from cirl_marl.controllers.basic import Neutral
-from cirl_marl.controllers.rollout import rollout
+from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.network import Floats
-from cirl_marl.optimum import NoCertificate, achieved, bound, improved, solver
+from cirl_marl.optimum import NoCertificate, Plan, achieved, bound, improved, program, search, solver
 from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.population import starting_states
 
 KILOTONNES = {"kg": 1e6, "kt": 1.0, "Gt": 1e-6}
 
@@ -183,3 +185,39 @@ def test_a_plan_lies_within_its_boxes_too() -> None:
     assert feasible(plan)
     plan[layout.imbalance] = 1.0
     assert not feasible(plan)
+
+
+@pytest.mark.medium
+def test_controllers_that_plan_set_shares() -> None:
+    """MPC, the improved plan and the plan found by search beat neutral control where shares are set; none the bound."""
+    network = cycle(hoarded=500.0)
+    found = bound(network, service_weight=1.0)
+    env = VectorEnv(network, num_envs=2)
+    starts = starting_states(env) if env.reset(seed=0) else np.empty(0)
+    assert starts[0] == pytest.approx(found.initial)
+
+    def objective(run: Rollout) -> float:
+        return float((run.episode_circularity / network.objective.circularity_scale + run.episode_service)[0])
+
+    neutral, planned = objective(rollout(env, Neutral())), objective(achieved(improved(found, rounds=6)))
+    controlled = objective(rollout(env, MPC(service_weight=1.0, replan=1)))
+    searched = search(network, service_weight=1.0, population=16, iterations=4, knots=2)
+    by_search = objective(rollout(env, Plan(searched)))
+    assert neutral < min(planned, controlled, by_search)
+    assert max(planned, controlled, by_search) <= found.objective + 1e-9
+    assert planned >= found.objective - 0.02 * abs(found.objective)
+
+
+def test_multipliers_of_merged_pieces_bound_other_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a schedule may be cut from one start and not from the other."""
+    monkeypatch.setattr(program, "LARGE", 0)
+    network = cycle(hoarded=500.0)
+    found = bound(network)
+    assert found.problem.layout.merged
+    poor = found.initial.copy()
+    poor[network.node_index["hoard"]] = 1.0
+    proved, solved = float(found.at(poor)), bound(network, poor)
+    assert proved >= solved.objective - 1e-6 * abs(solved.objective)
+    assert solved.at(found.initial) >= found.objective - 1e-6 * abs(found.objective)
+    run = achieved(solved)
+    assert run.episode_circularity[0] <= solved.objective

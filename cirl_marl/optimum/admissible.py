@@ -4,38 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.dynamics.laws import LAWS, FlowLaws
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
-
-MOST_NODES = 1000
-"""Nodes of the largest network that is bounded; memory grows with their square, time faster."""
+from cirl_marl.network.splits import Split, splits
 
 
 class NoCertificate(CirlError):
     """A network for which no upper bound is proved; the message says why."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Admissible:
-    """The ranges of the factors of every flow, f_k = v·w_k·a_k·x_p for stock-driven flows, u_k·v for scheduled ones.
+    """The ranges of the factors of every flow, f_k = v·w_k·a_k·y_p for driven flows, u_k·v for scheduled ones.
 
-    v is the valve of the donor and w_k or u_k the arc's own control; each is a single value if nobody acts on it.
+    y_p is a stock or, of what leaves a node that stores nothing, its throughput; v is the valve of the donor and w_k or
+    u_k the arc's own control or share. Each factor is a single value if nobody acts on it, and may differ from interval
+    to interval.
 
     Attributes:
         network: whose flows they are.
         agents: who acts.
-        driver: node p whose stock drives each arc; −1 for scheduled flows, shape (arcs,).
-        base: a_k, 1/time, or the mean of the schedule over each interval, mass/time (1 if a control sets the flow),
-            shape (steps, arcs).
-        own: lowest and highest w_k or u_k, shape (2, arcs).
-        valve: lowest and highest v of each node, shape (2, nodes).
+        driver: node p that drives each arc; −1 for scheduled flows, shape (arcs,).
+        base: a_k, 1/time (1 for what a node passes on), or the mean of the schedule over each interval, mass/time (1
+            if a control sets the flow), shape (steps, arcs).
+        own: lowest and highest w_k or u_k, shape (2, steps, arcs).
+        valve: lowest and highest v of each node, shape (2, steps, nodes).
+        neutral_own: w_k or u_k while nobody acts, shape (steps, arcs).
+        neutral_valve: v while nobody acts, shape (steps, nodes).
+        served: lower end of the band of each service, shape (steps, services).
+        splits: the arcs that share what leaves a node.
     """
 
     network: Network
@@ -44,6 +49,10 @@ class Admissible:
     base: Floats
     own: Floats
     valve: Floats
+    neutral_own: Floats
+    neutral_valve: Floats
+    served: Floats
+    splits: tuple[Split, ...]
 
     @classmethod
     def of(cls, network: Network, agents: Sequence[str] | None = None) -> Admissible:
@@ -57,24 +66,37 @@ class Admissible:
         if reasons:
             named = f"network '{network.name}', scenario '{network.scenario_name}'"
             raise NoCertificate(f"{named}: no bound is proved: {'; '.join(reasons)}")
-        laws = FlowLaws(network)
+        laws, divided = FlowLaws(network), tuple(splits(network))
         acting = Actuators(laws, agents, 1).agents
         steps = network.episode.horizon
-        own, valve = np.ones((2, len(network.arcs))), np.ones((2, len(network.nodes)))
+        # lowest, neutral and highest
+        own, valve = np.ones((3, steps, len(network.arcs))), np.ones((3, steps, len(network.nodes)))
         for i, node in enumerate(network.nodes):
             if node.control is not None and node.control.kind is ControlKind.RATE:
-                valve[:, i] = _range(node, acting)
+                valve[:, :, i] = _range(network, node, acting)
         for k, arc in enumerate(network.arcs):
             setter = _setter(network, arc)
             if setter is not None:
-                own[:, k] = _range(setter, acting)
+                own[:, :, k] = _range(network, setter, acting)
+        for split in divided:
+            arcs = [*split.controlled, *split.others]
+            asked = own[:, :, list(split.controlled)].transpose(0, 2, 1)
+            (low, high), (neutral, _) = shares(split, asked[[0, 2]]), shares(split, asked[[1, 1]])
+            own[:, :, arcs] = np.stack([low.T, neutral.T, high.T])
+        share = np.array([arc.law is Law.SHARE for arc in network.arcs], dtype=bool)
+        base = [network.held(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
+        served = [network.held(service.low) for service in network.services]
         return cls(
             network=network,
             agents=acting,
-            driver=np.where(laws.scheduled, -1, laws.driver),
-            base=laws.rate(np.ones((len(laws.neutral), steps)), np.arange(steps)).T,
-            own=own,
-            valve=valve,
+            driver=np.where(laws.scheduled, -1, np.where(share, network.donors, laws.driver)),
+            base=np.array(base, dtype=float).reshape(-1, steps).T,
+            own=own[::2],
+            valve=valve[::2],
+            neutral_own=own[1],
+            neutral_valve=valve[1],
+            served=np.array(served, dtype=float).reshape(-1, steps).T,
+            splits=divided,
         )
 
     @property
@@ -82,24 +104,82 @@ class Admissible:
         """Arcs that flow by schedule, as far as their donor holds enough, shape (arcs,)."""
         return self.driver < 0
 
-    @property
+    @cached_property
     def factor(self) -> Floats:
-        """Lowest and highest v·w_k or v·u_k, shape (2, arcs)."""
-        return self.own * self.valve[:, self.network.donors]
+        """Lowest and highest v·w_k or v·u_k, shape (2, steps, arcs)."""
+        return self.own * self.valve[:, :, self.network.donors]
+
+    @cached_property
+    def neutral_rate(self) -> Floats:
+        """v·w_k·a_k or u_k·v while nobody acts, shape (steps, arcs)."""
+        return self.neutral_own * self.base * self.neutral_valve[:, self.network.donors]
+
+    @cached_property
+    def kinds(self) -> Integers:
+        """For each interval the first that is like it but for what flows by schedule, shape (steps,)."""
+        driven = ~self.scheduled
+        parts = [*self.own[:, :, driven], self.base[:, driven], *self.valve, self.neutral_rate[:, driven], self.served]
+        parts += [split.proportions.T for split in self.splits]
+        _, first, kind = np.unique(np.concatenate(parts, axis=1), axis=0, return_index=True, return_inverse=True)
+        kinds: Integers = first[kind.ravel()]
+        return kinds
 
     def rate(self, step: int) -> Floats:
         """Return the lowest and highest coefficient of each arc in one interval, shape (2, arcs).
 
-        1/time for stock-driven arcs, mass/time for scheduled ones.
+        1/time for stock-driven arcs, a share for what a node passes on, mass/time for scheduled arcs.
         """
-        rate: Floats = self.factor * self.base[step]
+        rate: Floats = self.factor[:, step] * self.base[step]
         return rate
 
+    def released(self, step: int) -> Floats:
+        """Return the lowest and highest rate at which each stock is released to be shared out, shape (2, nodes)."""
+        released = np.zeros((2, len(self.network.nodes)))
+        for split in self.splits:
+            i = self.network.node_index[split.donor]
+            released[:, i] = self.valve[:, step, i] * self.base[step, split.others[0]]
+        return released
 
-def _range(compartment: Compartment, acting: Sequence[str]) -> tuple[float, float]:
-    control = compartment.control
-    assert control is not None
-    return (control.low, control.high) if compartment.id in acting else (control.neutral, control.neutral)
+    def exits(self, step: int) -> Floats:
+        """Return the lowest and highest rate at which each stock leaves in proportion to itself, shape (2, nodes)."""
+        donors, nodes = self.network.donors, len(self.network.nodes)
+        rates = self.rate(step) * ((self.driver == donors) & ~self.shared)
+        return np.array([np.bincount(donors, each, nodes) for each in rates], dtype=float) + self.released(step)
+
+    @cached_property
+    def shared(self) -> NDArray[np.bool_]:
+        """Arcs that share what leaves their donor, shape (arcs,)."""
+        return np.array([arc.law is Law.SHARE for arc in self.network.arcs], dtype=bool)
+
+    def divided(self, step: int) -> list[Split]:
+        """Return the splits in which some share can be chosen in an interval."""
+        free = self.own[0, step] < self.own[1, step]
+        return [split for split in self.splits if free[[*split.controlled, *split.others]].any()]
+
+
+def shares(split: Split, asked: Floats) -> Floats:
+    """Return the lowest and highest share of each arc, first of those with a control, shape (2, arcs, steps).
+
+    A share rises with what its own arc asks for and falls with what the others do.
+
+    Args:
+        split: the arcs.
+        asked: least and most that each control asks for, shape (2, controlled, steps).
+    """
+    low = split.bounds[0]
+    room = np.maximum(1.0 - low.sum(axis=0), 0.0)
+    over = np.maximum(asked - low, 0.0)
+    others = (over.sum(axis=1, keepdims=True) - over)[::-1]
+    wanted = over + others
+    kept = np.divide(room, wanted, out=np.ones_like(wanted), where=wanted > room)
+    left = room - np.minimum(over.sum(axis=1), room)[::-1]
+    return np.concatenate([low + over * kept, left[:, None] * split.proportions], axis=1)
+
+
+def _range(network: Network, compartment: Compartment, acting: Sequence[str]) -> Floats:
+    """Return the lowest, neutral and highest value of a control, shape (3, steps)."""
+    bounds = network.control_bounds[:, network.control_rows[compartment.id].start]
+    return bounds if compartment.id in acting else bounds[[1, 1, 1]]
 
 
 def _setter(network: Network, arc: Arc) -> Arc | Node | None:
@@ -111,9 +191,7 @@ def _setter(network: Network, arc: Arc) -> Arc | Node | None:
 
 
 def _uncertified(network: Network) -> Iterator[str]:
-    """Yield why the theorem does not hold for the flows of ``network``, or its system would not fit into memory."""
-    if len(network.nodes) > MOST_NODES:
-        yield f"{len(network.nodes):,} nodes are more than the {MOST_NODES:,} whose products in pairs are kept"
+    """Yield why the theorem does not hold for the flows of ``network``."""
     if network.episode.solver != "exact":
         yield f"solver '{network.episode.solver}' is not exact within a control interval"
     modelled = [c.id for c in network.compartments.values() if c.model is not None]

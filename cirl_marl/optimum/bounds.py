@@ -39,7 +39,7 @@ class Bound:
     Attributes:
         network: the network, under the scenario and horizon that the bound is for.
         agents: who acts; the others are neutral.
-        initial: stocks at the start, shape (nodes,), mass.
+        initial: stocks at the start, shape (stores,), mass.
         objective: the bound, proved by ``verify()``: of λ̄ (mass), or of λ̄/scale + w·service with a service weight.
         value: the bound on λ̄, or with a service weight λ̄ of the plan, mass.
         service: mean service level of the plan.
@@ -48,7 +48,7 @@ class Bound:
         min_service: mean level demanded of each service, shape (services,); None for none.
         degree: degree of the test polynomials.
         circularity: mean of λ over each interval under the plan, shape (steps,), mass.
-        stock: planned stocks at the start and after each interval, shape (steps + 1, nodes), mass.
+        stock: planned stocks at the start and after each interval, shape (steps + 1, stores), mass.
         flow: planned mean flows, shape (steps, arcs), mass/time.
         actions: normalised actions that come closest to the plan, shape (steps, entries).
         problem: the linear program.
@@ -100,7 +100,7 @@ class Bound:
         has to be solved. The further from the start solved for, the weaker the bound may be.
 
         Args:
-            initial: stocks at the start, shape (..., nodes), mass; None is the bound's own.
+            initial: stocks at the start, shape (..., stores), mass; None is the bound's own.
             min_service: demanded mean levels in [0, 1], of each service, shape (..., services), or one for all of them,
                 a number or shape (..., 1); None is the bound's own.
 
@@ -156,14 +156,14 @@ class Envelope:
 
 
 def check_stocks(network: Network, stocks: Floats) -> None:
-    """Refuse stocks, shape (nodes,), that no episode can start from.
+    """Refuse stocks, shape (stores,), that no episode can start from.
 
     Raises:
         CirlError: naming a stock that is negative or not finite.
     """
-    for node, stock in zip(network.node_index, stocks.tolist(), strict=True):
+    for node, stock in zip(network.stores, stocks.tolist(), strict=True):
         if not 0 <= stock < math.inf:
-            raise CirlError(f"initial: the stock of '{node}' is {stock}; it must be finite and not negative")
+            raise CirlError(f"initial: the stock of '{node.id}' is {stock}; it must be finite and not negative")
 
 
 def check_service(min_service: ArrayLike) -> None:

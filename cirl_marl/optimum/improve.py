@@ -31,7 +31,13 @@ TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions."""
 
 
-def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None] = lambda share: None) -> Bound:
+def improved(
+    bound: Bound,
+    *,
+    rounds: int = 20,
+    enough: Callable[[Rollout], bool] = lambda run: False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Bound:
     """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
 
     The merit is the objective of the bound; what each service lacks of ``min_service`` is charged PENALTY times what
@@ -41,15 +47,17 @@ def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None
     Args:
         bound: with the actions to start from.
         rounds: most linear programs to solve.
+        enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
     prices = _prices(bound)
     best, run = bound, achieved(bound)
-    merit, trust = _merit(bound, run, prices), TRUST
+    merit, trust, slopes = _merit(bound, run, prices), TRUST, None
     for done in range(rounds):
-        if trust < SMALLEST:
+        if trust < SMALLEST or enough(run):
             break
-        step = _step(best, run, prices, trust)
+        slopes = _jacobians(best, run) if slopes is None else slopes
+        step = _step(best, run, prices, trust, slopes)
         progress((done + 1) / rounds)
         if step is None:  # a smaller region is another program
             trust /= 4
@@ -58,7 +66,7 @@ def improved(bound: Bound, *, rounds: int = 20, progress: Callable[[float], None
         tried = achieved(candidate)
         gained = _merit(bound, tried, prices) - merit
         if gained > 0:
-            best, run, merit, trust = candidate, tried, merit + gained, min(1.0, 2 * trust)
+            best, run, merit, trust, slopes = candidate, tried, merit + gained, min(1.0, 2 * trust), None
         else:
             trust /= 4
     progress(1.0)
@@ -90,14 +98,14 @@ def _demanded(bound: Bound) -> Floats:
 
 
 def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
-    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, shape (steps, nodes + arcs, nodes | entries)."""
+    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, shape (steps, stores + arcs, stores | entries)."""
     network = bound.network
     steps, entries = bound.actions.shape
-    nodes = len(network.nodes)
+    nodes = len(network.stores)
     dynamics = Dynamics(network)
     stock = np.concatenate([bound.initial[None], run.stock[:-1]])
     inputs = np.concatenate([stock, bound.actions], axis=1)
-    scale = np.array([node.scale for node in network.nodes])
+    scale = np.array([node.scale for node in network.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
@@ -115,17 +123,17 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     return slopes[:, :, :nodes], slopes[:, :, nodes:]
 
 
-def _step(bound: Bound, run: Rollout, prices: Floats, trust: float) -> Floats | None:
+def _step(bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tuple[Floats, Floats]) -> Floats | None:
     """Return the best change of the actions within the trust region to first order, shape (steps, entries).
 
-    None if HiGHS finds none.
+    None if HiGHS finds none; ``slopes`` are the Jacobians around the episode.
 
     Variables of an interval: δx', δf̄, δa, the levels, the imbalance; after the last, what each service lacks.
     """
     network = bound.network
     steps, entries = bound.actions.shape
-    nodes, arcs, services = len(network.nodes), len(network.arcs), len(network.services)
-    by_stock, by_action = _jacobians(bound, run)
+    nodes, arcs, services = len(network.stores), len(network.arcs), len(network.services)
+    by_stock, by_action = slopes
     outputs = nodes + arcs
     size = outputs + entries + services + 1
     level, imbalance = outputs + entries, size - 1
@@ -139,15 +147,17 @@ def _step(bound: Bound, run: Rollout, prices: Floats, trust: float) -> Floats | 
     )
     measure, imbalances = _measures(bound)
     realised = np.concatenate([run.stock, run.flow], axis=1)
-    low = np.array([service.low for service in network.services])
+    low = np.array([network.held(service.low) for service in network.services]).reshape(services, steps)
     # low·level − δq ≤ q, and ±(φ + δφ) ≤ imbalance, with q and φ those of the simulated episode
-    rows = np.zeros((services + 2, size))
-    rows[:services, :outputs], rows[:services, level:imbalance] = -measure, np.diag(low)
-    rows[services:, :outputs], rows[services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0
+    rows = np.zeros((steps, services + 2, size))
+    rows[:, :services, :outputs] = -measure
+    rows[:, np.arange(services), level + np.arange(services)] = low.T
+    rows[:, services:, :outputs], rows[:, services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0
     limits = np.concatenate([realised @ measure.T, -(realised @ imbalances)[:, None] * [1.0, -1.0]], axis=1)
     # mean level + lack ≥ demanded level
     means = sparse.kron(np.full((1, steps), -1.0 / steps), sparse.eye_array(services, size, k=level))
-    under = sparse.block_array([[sparse.kron(once, rows), None], [means, -sparse.eye_array(services)]], format="csr")
+    per_interval = _diagonal(rows, rows.shape[1:])
+    under = sparse.block_array([[per_interval, None], [means, -sparse.eye_array(services)]], format="csr")
     bounds = np.tile(np.array([-np.inf, np.inf]), (steps, size, 1))
     bounds[:, :nodes, 0] = -run.stock
     bounds[:, outputs:level] = np.stack(
@@ -166,7 +176,8 @@ def _step(bound: Bound, run: Rollout, prices: Floats, trust: float) -> Floats | 
         high=high,
     )
     # states and flows change by shares of their largest values, the others by shares of 1
-    largest = np.maximum(np.abs(realised).max(axis=0), [c.scale for c in network.compartments.values()])
+    parts = (*network.stores, *network.arcs)
+    largest = np.maximum(np.abs(realised).max(axis=0), [part.scale for part in parts])
     net = max(float(np.abs(realised @ imbalances).max()), network.objective.circularity_scale)
     sizes = np.concatenate([largest, np.ones(entries + services), [net]])
     found = best_values(problem, np.append(np.tile(sizes, steps), np.ones(services)))
@@ -178,9 +189,9 @@ def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:
 
 
 def _measures(bound: Bound) -> tuple[Floats, Floats]:
-    """Return what each service reads off (x', f̄), shape (services, nodes + arcs), and Δ·σ_env padded with zeros."""
+    """Return what each service reads off (x', f̄), shape (services, stores + arcs), and Δ·σ_env padded with zeros."""
     network = bound.network
-    nodes = len(network.nodes)
+    nodes = len(network.stores)
     measure = np.zeros((len(network.services), nodes + len(network.arcs)))
     for s, service in enumerate(network.services):
         if service.quantity == "stock":
@@ -193,7 +204,7 @@ def _measures(bound: Bound) -> tuple[Floats, Floats]:
 def _cost(bound: Bound, size: int, level: int) -> Floats:
     """Return the cost of the variables of one interval: minus the share in λ̄, or in the weighted objective."""
     network, steps = bound.network, len(bound.actions)
-    nodes, services = len(network.nodes), len(network.services)
+    nodes, services = len(network.stores), len(network.services)
     cost = np.zeros(size)
     counted = network.circularity_weights.sum(axis=0)
     if network.objective.net_zero == "abs":

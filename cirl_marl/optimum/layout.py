@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
-from scipy import sparse
 
 from cirl_marl.network import Floats, Integers, Network
 
-MatrixRow = list[tuple[int, float]]
-Link = tuple[MatrixRow, MatrixRow]
+Place = TypeVar("Place", int, Integers)
 
 
 @dataclass(frozen=True)
@@ -21,12 +18,14 @@ class Layout:
     """Where the variables of one interval lie.
 
     For each piece X_i, F_i and Z_i for i = 0 … d, then the stocks at its end; after the last piece, the levels, the
-    imbalance and the valves.
+    imbalance and the valves. Of a node that stores nothing X_i is its throughput, and there is no stock at the end. At
+    the end of merged pieces are throughputs and flows, too, under the controls of their interval.
     Z_i = v·X_i is what the valve of a node lets through to several outflows. Moments are counted through all pieces.
 
     Attributes:
         network: whose variables they are.
-        pieces: substeps of the simulator in an interval; scheduled flows are constant within each.
+        pieces: equal parts of an interval.
+        merged: whether pieces are longer than the substeps of the simulator, within which scheduled flows are constant.
         degree: d.
         valves: nodes that have a Z.
         openings: nodes of these with scheduled outflows, on which the valve acts as well; v is then a variable.
@@ -34,6 +33,7 @@ class Layout:
 
     network: Network
     pieces: int
+    merged: bool
     degree: int
     valves: Integers
     openings: Integers
@@ -44,10 +44,20 @@ class Layout:
         return range(self.pieces * (self.degree + 1))
 
     @cached_property
+    def moment_column(self) -> Integers:
+        """The same as an array of shape (moments, 1), to be laid against nodes or arcs."""
+        return np.arange(len(self.moments))[:, None]
+
+    @cached_property
     def piece(self) -> int:
         """Variables of a piece."""
-        nodes = len(self.network.nodes)
-        return (self.degree + 1) * (nodes + len(self.network.arcs) + len(self.valves)) + nodes
+        means = len(self.network.nodes) + len(self.network.arcs) + len(self.valves)
+        return (self.degree + 1) * means + self._ends
+
+    @cached_property
+    def _ends(self) -> int:
+        """Variables about the end of a piece."""
+        return len(self.network.nodes) + len(self.network.arcs) if self.merged else len(self.network.stores)
 
     @property
     def length(self) -> float:
@@ -59,23 +69,32 @@ class Layout:
         """Length of a piece over d + 1, the integral of each test polynomial."""
         return self.network.episode.control_interval / len(self.moments)
 
-    def stock(self, moment: int) -> int:
-        """Return the first of the weighted mean stocks X."""
+    def stock(self, moment: Place) -> Place:
+        """Return the first of the weighted mean stocks X, then throughputs."""
         # each piece: d + 1 blocks of (X, F, Z), equally long, then the stocks at its end
         piece, i = divmod(moment, self.degree + 1)
-        return piece * self.piece + i * ((self.piece - len(self.network.nodes)) // (self.degree + 1))
+        return piece * self.piece + i * ((self.piece - self._ends) // (self.degree + 1))
 
-    def flow(self, moment: int) -> int:
+    def flow(self, moment: Place) -> Place:
         """Return the first of the weighted mean flows F."""
         return self.stock(moment) + len(self.network.nodes)
 
-    def valve(self, moment: int) -> int:
+    def valve(self, moment: Place) -> Place:
         """Return the first of Z."""
         return self.flow(moment) + len(self.network.arcs)
 
-    def end(self, piece: int) -> int:
+    def end(self, piece: Place) -> Place:
         """Return the first of the stocks at the end of a piece; −1 is the last."""
-        return (piece % self.pieces + 1) * self.piece - len(self.network.nodes)
+        return (piece % self.pieces + 1) * self.piece - self._ends
+
+    @property
+    def last(self) -> slice:
+        """The stocks at the end of the interval."""
+        return slice(self.end(-1), self.end(-1) + len(self.network.stores))
+
+    def end_flow(self, piece: Place) -> Place:
+        """Return the first of the flows at the end of a merged piece, which stand behind the throughputs."""
+        return self.end(piece) + len(self.network.nodes)
 
     @property
     def level(self) -> int:
@@ -104,18 +123,3 @@ class Layout:
         for first, count in zip((self.stock, self.flow, self.valve), counts, strict=True):
             parts.append(np.mean([planned[:, first(j) : first(j) + count] for j in self.moments], axis=0))
         return parts[0], parts[1], parts[2]
-
-
-def start_of(layout: Layout, piece: int, node: int, factor: float) -> Link:
-    """Return the entry of a stock at the start of a piece, in this interval or in the one before."""
-    entry = [(layout.end(piece - 1) + node, factor)]
-    return (entry, []) if piece > 0 else ([], entry)
-
-
-def matrix_of(rows: Sequence[MatrixRow], layout: Layout) -> Any:
-    """Return the sparse matrix of rows over the variables of one interval."""
-    entries = [(i, column, value) for i, row in enumerate(rows) for column, value in row]
-    if not entries:
-        return sparse.csr_array((len(rows), layout.size))
-    i, columns, values = zip(*entries, strict=True)
-    return sparse.csr_array((values, (i, columns)), shape=(len(rows), layout.size))

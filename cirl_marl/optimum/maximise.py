@@ -48,8 +48,8 @@ def bound(
 
     Args:
         network: catalogue name, path of a definition file, or a network.
-        initial: stocks at the start: node → stock, the rest in the middle of their ranges; or shape (nodes,). None: all
-            in the middle.
+        initial: stocks at the start: node → stock, the rest in the middle of their ranges; or shape (stores,). None:
+            all in the middle.
         service_weight: w ≥ 0; excludes ``min_service``.
         min_service: in [0, 1], for every service, or one for each, shape (services,).
         agents: who acts; None is the network's own choice.
@@ -90,7 +90,7 @@ def envelope(
     The first is for the mean of the starts, each further one for the start where those before prove least: the best
     objective is a nearly concave function of the start, so what is proved from elsewhere is weakest where it is worst.
 
-    Arguments and errors are those of ``bound``, but for ``initial``, stocks of shape (episodes, nodes), mass;
+    Arguments and errors are those of ``bound``, but for ``initial``, stocks of shape (episodes, stores), mass;
     ``min_service``, of each service in each episode, shape (episodes, services), or what can be broadcast to it, such
     as (episodes, 1); ``solves``, how many programs to solve, at most 1 + episodes; and ``progress``, called with the
     number of those that are solved.
@@ -98,7 +98,7 @@ def envelope(
     if not isinstance(solves, int | np.integer) or isinstance(solves, bool) or solves < 1:
         raise CirlError(f"solves must be a whole number of at least 1, got {solves!r}")
     admissible = Admissible.of(_found(network, scenario, horizon), agents)
-    nodes = len(admissible.network.nodes)
+    nodes = len(admissible.network.stores)
     starts = np.asarray(initial, dtype=float)
     if starts.ndim != 2 or starts.shape[1] != nodes or not len(starts):
         raise CirlError(f"initial has shape {starts.shape}, expected (episodes, {nodes})")
@@ -124,17 +124,18 @@ def envelope(
 
 
 def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike | None) -> Floats:
-    """Return the stocks that ``initial`` describes (see ``bound``), shape (nodes,), mass.
+    """Return the stocks that ``initial`` describes (see ``bound``), shape (stores,), mass.
 
     Raises:
         CirlError: for an unknown node, a wrong shape, or a stock that is negative or not finite.
     """
     start: Floats = network.initial.mean(axis=0)
+    stores = {node.id: i for i, node in enumerate(network.stores)}
     if isinstance(initial, Mapping):
         for node, stock in initial.items():
-            if node not in network.node_index:
-                raise CirlError(f"initial: {unknown('node', node, network.node_index)}")
-            start[network.node_index[node]] = stock
+            if node not in stores:
+                raise CirlError(f"initial: {unknown('node', node, stores)}")
+            start[stores[node]] = stock
     elif initial is not None:
         given = np.asarray(initial, dtype=float)
         if given.shape != start.shape:
@@ -206,7 +207,7 @@ def _bounded(
         min_service=min_service,
         degree=layout.degree,
         circularity=circularity,
-        stock=np.concatenate([start[None], planned[:, layout.end(-1) : layout.level]]),
+        stock=np.concatenate([start[None], planned[:, layout.last]]),
         flow=layout.means(planned)[1],
         actions=normalised_actions(admissible, layout, planned),
         problem=problem,

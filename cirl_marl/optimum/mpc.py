@@ -89,9 +89,9 @@ class _Plan:
             own = entries.col // layout.size
             ends = entries.col - own * layout.size
             later = problem.interval_of_rows(matrix)[entries.row] > own
-            later &= (ends >= layout.end(-1)) & (ends < layout.level)
+            later &= (ends >= layout.last.start) & (ends < layout.last.stop)
             np.subtract.at(charged, entries.col[later], (entries.data * multipliers[entries.row])[later])
-        priced: Floats = charged.reshape(-1, layout.size)[:, layout.end(-1) : layout.level]
+        priced: Floats = charged.reshape(-1, layout.size)[:, layout.last]
         return priced * self.unit
 
 
@@ -216,8 +216,7 @@ class MPC(Planner):
 
     def _actions(self, problem: Program, intervals: range, planned: Floats) -> Floats:
         """Return the actions of planned intervals, the first of ``intervals``, shape (decisions, entries)."""
-        base = self._admissible.base[intervals.start : intervals.stop][: len(planned)]
-        return normalised_actions(replace(self._admissible, base=base), problem.layout, planned)
+        return normalised_actions(self._admissible, problem.layout, planned, intervals)
 
     def _plan(
         self,
@@ -265,7 +264,7 @@ class MPC(Planner):
         layout = problem.layout
         cost = problem.cost.reshape(len(intervals), -1) * (len(intervals) / self._env.network.episode.horizon)
         if prices is not None:
-            cost[-1, layout.end(-1) : layout.level] += prices
+            cost[-1, layout.last] += prices
         return replace(problem, cost=cost.ravel())
 
 

@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from cirl_marl.network import Floats
-from cirl_marl.optimum.layout import Layout, MatrixRow
+from cirl_marl.optimum.layout import Layout
+from cirl_marl.optimum.rows import ProgramRows
 
 
-def measures(layout: Layout) -> Iterator[MatrixRow]:
-    """Yield low·level − q ≤ 0 for each service, and ±Δ·σ_env·f̄ − imbalance ≤ 0.
+def measures(layout: Layout, low: Floats, rows: ProgramRows) -> None:
+    """Add low·level − q ≤ 0 for each service and ±Δ·σ_env·f̄ − imbalance ≤ 0; their keys are (1, …).
 
     The level is at most min(1, q/low): a finite upper end of the band could only lower it further.
     """
     network, count = layout.network, len(layout.moments)
     for s, service in enumerate(network.services):
+        row = rows.add(1, s)
+        rows.put(row, layout.level + s, low[s])  # level ≤ q/low; level ≤ 1 is a box
         if service.quantity == "stock":
-            measured = [(layout.end(-1) + network.node_index[service.provider], -1.0)]
+            rows.put(row, layout.end(-1) + network.node_index[service.provider], -1.0)
         else:
-            arcs = network.metered(service)
-            measured = [(layout.flow(i) + int(k), -1.0 / count) for i in layout.moments for k in arcs]
-        yield [(layout.level + s, service.low), *measured]  # level ≤ q/low; level ≤ 1 is a box
+            rows.put(row, layout.flow(layout.moment_column) + network.metered(service), -1.0 / count)
     weights = -network.circularity_weights[1]
-    counted = [(i, int(k)) for i in layout.moments for k in np.flatnonzero(weights)]
-    for sign in (1.0, -1.0):
-        flows = [(layout.flow(i) + k, sign * float(weights[k]) / count) for i, k in counted]
-        yield [*flows, (layout.imbalance, -1.0)]
+    counted = np.flatnonzero(weights)
+    row = rows.add(1, len(network.services), [0, 1])
+    for each, sign in zip(row, (1.0, -1.0), strict=True):
+        rows.put(each, layout.flow(layout.moment_column) + counted, sign * weights[counted] / count)
+    rows.put(row, layout.imbalance, -1.0)
 
 
 def circularity_weights(layout: Layout) -> Floats:

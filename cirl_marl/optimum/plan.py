@@ -95,7 +95,8 @@ class Plan(Controller):
 
 def achieved(bound: Bound) -> Rollout:
     """Return the episode that the plan of ``bound`` makes in the simulator."""
-    nodes = zip(bound.network.nodes, bound.initial.tolist(), strict=True)
-    pinned = replace(bound.network, nodes=tuple(replace(node, initial=(stock, stock)) for node, stock in nodes))
+    network = bound.network
+    stores = [replace(n, initial=(x, x)) for n, x in zip(network.stores, bound.initial.tolist(), strict=True)]
+    pinned = replace(network, nodes=(*stores, *network.nodes[len(stores) :]))
     env = VectorEnv(pinned, num_envs=1, agents=bound.agents or None)
     return rollout(env, Plan(replace(bound, network=pinned)))

@@ -6,22 +6,26 @@ flows weighted with B_i. Integration by parts and the flow laws hold for them ex
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 
-from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout, Link, MatrixRow, matrix_of, start_of
+from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.monotone import falls
 from cirl_marl.optimum.objective import measures, objective
 from cirl_marl.optimum.reach import ComparisonSystem, Reach
-from cirl_marl.optimum.scheduled import deliveries, openings
+from cirl_marl.optimum.rows import Chained, ProgramRows
+from cirl_marl.optimum.scheduled import deliveries, openings, orders
+from cirl_marl.optimum.settled import ends, settled
+from cirl_marl.optimum.shared import followers, passing
+
+LARGE = 30_000
+"""Variables beyond which the substeps of an interval, if there are several, are merged into one piece."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +77,13 @@ class Programs:
     """
 
     def __init__(
-        self, admissible: Admissible, degree: int, service_weight: float | None, *, held: bool = False
+        self,
+        admissible: Admissible,
+        degree: int,
+        service_weight: float | None,
+        *,
+        held: bool = False,
+        merged: bool | None = None,
     ) -> None:
         """Write down what does not depend on the start.
 
@@ -83,20 +93,33 @@ class Programs:
             service_weight: w of λ̄/circularity_scale + w·service; None if λ̄ is maximised.
             held: whether controls are constant within an interval to first order; the program then makes better plans
                 and bounds nothing.
+            merged: whether an interval is one piece, though the simulator has substeps; None: if the program were large
+                otherwise.
         """
         self.admissible = admissible
         self._system = ComparisonSystem(admissible)
-        self.layout = layout = _layout(admissible, self._system.substeps, degree)
-        equal, under = _laws(admissible, layout)
-        if held:
-            equal += _held(admissible, layout)
-        self._equal = _Chained(_balances(layout), equal, layout)
-        falling = [*deliveries(admissible, layout), *falls(admissible, layout)]
-        self._under = _Chained(falling, [*under, *measures(layout)], layout)
+        self.layout = layout = _layout(admissible, self._system.substeps, merged, degree)
+        self._equal, self._under = Chained(layout), Chained(layout)
+        for kind in np.unique(admissible.kinds).tolist():
+            linked_equal, equal, linked_under, under = (ProgramRows(layout) for _ in range(4))
+            _balances(layout, linked_equal)
+            orders(admissible, layout, equal, under)
+            _laws(admissible, layout, kind, equal, under)
+            passing(admissible, layout, kind, equal)
+            if held:
+                _held(admissible, layout, kind, equal)
+            deliveries(admissible, layout, kind, linked_under)
+            falls(admissible, layout, kind, linked_under)
+            if layout.merged:
+                ends(admissible, layout, kind, equal, under)
+                settled(admissible, layout, kind, self._system.of_kind(kind), linked_under)
+            measures(layout, admissible.served[kind], under)
+            self._equal.add(kind, linked_equal, equal)
+            self._under.add(kind, linked_under, under)
         self._weights, self._constant = objective(layout, service_weight)
 
     def program(self, initial: Floats, min_service: ArrayLike | None = None, intervals: range | None = None) -> Program:
-        """Return the program from ``initial``, shape (nodes,), that gives each service the mean level demanded of it.
+        """Return the program from ``initial``, shape (stores,), that gives each service the mean level demanded of it.
 
         Args:
             initial: stocks at the start, mass.
@@ -109,10 +132,12 @@ class Programs:
         """
         layout, network = self.layout, self.admissible.network
         when = range(network.episode.horizon) if intervals is None else intervals
-        steps = len(when)
+        steps, kinds = len(when), self.admissible.kinds[when.start : when.stop]
         reached = self._system.reach(initial, when)
-        equal, equal_to = self._equal.over(steps, initial)
-        under, under_to = self._under.over(steps, initial)
+        asked = self.admissible.factor[1] * self.admissible.base
+        cut = np.where(self.admissible.scheduled & ~reached.uncut, asked[when.start : when.stop], 0.0)
+        equal, equal_to = self._equal.over(kinds, initial, cut)
+        under, under_to = self._under.over(kinds, initial, cut)
         opened, opened_to = openings(self.admissible, reached, layout, when)
         blocks, limits = [under, opened], [under_to, opened_to]
         if min_service is not None:
@@ -134,136 +159,92 @@ class Programs:
         )
 
 
-def _layout(admissible: Admissible, pieces: int, degree: int) -> Layout:
+def _layout(admissible: Admissible, substeps: int, merged: bool | None, degree: int) -> Layout:
     network = admissible.network
     nodes = len(network.nodes)
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
     orders = np.bincount(network.donors[admissible.scheduled], minlength=nodes)
-    movable = admissible.valve[0] < admissible.valve[1]
+    movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
-    return Layout(network, pieces, degree, valves, openings)
+    fine = Layout(network, substeps, False, degree, valves, openings)
+    if substeps > 1 and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
+        return replace(fine, pieces=1, merged=True)
+    return fine
 
 
-class _Chained:
-    """Rows that are repeated in every interval, some of which link it to the interval before."""
-
-    def __init__(self, linked: Sequence[Link], alone: Sequence[MatrixRow], layout: Layout) -> None:
-        """Take the rows of an interval.
-
-        Args:
-            linked: pairs of rows on this interval's variables and on those of the one before, of which only the stocks
-                at the end are used.
-            alone: rows on this interval's variables.
-            layout: of an interval.
-        """
-        self._layout = layout
-        self._now, self._before = (matrix_of([link[side] for link in linked], layout) for side in (0, 1))
-        self._alone = matrix_of(alone, layout)
-        self._known: dict[int, Any] = {}
-
-    def over(self, steps: int, initial: Floats) -> tuple[Any, Floats]:
-        """Return the matrix over ``steps`` intervals, interval after interval, and the right-hand side."""
-        if steps not in self._known:
-            # block (t, t) holds the rows of interval t, block (t, t − 1) reaches back for the stocks it starts from
-            once, shifted = sparse.eye_array(steps), sparse.eye_array(steps, k=-1)
-            linked = sparse.kron(once, self._now) + sparse.kron(shifted, self._before)
-            self._known[steps] = sparse.vstack([linked, sparse.kron(once, self._alone)], format="csr")
-        # there is no interval before the first: its entries meet known stocks and go to the right-hand side
-        layout, matrix = self._layout, self._known[steps]
-        first = np.zeros(layout.size)
-        first[layout.end(-1) : layout.level] = initial
-        to = np.zeros(matrix.shape[0])
-        to[: self._before.shape[0]] = -(self._before @ first)
-        return matrix, to
-
-
-def _balances(layout: Layout) -> list[Link]:
-    """Return Y_i − Y_{i−1} − δ/(d + 1)·S F_i, which is 0, for i = 0 … d.
+def _balances(layout: Layout, rows: ProgramRows) -> None:
+    """Add Y_i − Y_{i−1} − δ/(d + 1)·S F_i, which is 0, for i = 0 … d (theorem 1); keys (moment, node).
 
     Y_i = ((d − i) X_i + (i + 1) X_{i+1})/(d + 1) are the means weighted with the polynomials of degree d − 1;
     Y_{−1} and Y_d are the stocks at the two ends of the piece, δ its length.
     """
     network, d = layout.network, layout.degree
-    links: list[Link] = []
+    moment, node = layout.moment_column, np.arange(len(network.stores))
+    row = rows.add(moment, node)
+    for side, sign in ((network.donors, 1.0), (network.recipients, -1.0)):
+        arcs = np.flatnonzero(side < len(node))
+        rows.put(row[:, side[arcs]], layout.flow(moment) + arcs, sign * layout.portion)
     for j in layout.moments:
         piece, i = divmod(j, d + 1)
-        for node in range(len(network.nodes)):
-            row = _lower_degree(layout, j, node, 1.0)  # Y_i − Y_{i−1} = δ/(d + 1)·S F_i (theorem 1)
-            before: MatrixRow = []
-            if i > 0:
-                row += _lower_degree(layout, j - 1, node, -1.0)
-            else:
-                start, before = start_of(layout, piece, node, -1.0)
-                row += start
-            row += [(layout.flow(j) + int(k), layout.portion) for k in np.flatnonzero(network.donors == node)]
-            row += [(layout.flow(j) + int(k), -layout.portion) for k in np.flatnonzero(network.recipients == node)]
-            links.append((row, before))
-    return links
-
-
-def _lower_degree(layout: Layout, moment: int, node: int, sign: float) -> list[tuple[int, float]]:
-    """Return sign·Y_i, the mean weighted with B_i^{d−1}, raised to degree d; Y_d is the stock at the end."""
-    d = layout.degree
-    piece, i = divmod(moment, d + 1)
-    if i == d:
-        return [(layout.end(piece) + node, sign)]
-    return [
-        (layout.stock(moment) + node, sign * (d - i) / (d + 1)),
-        (layout.stock(moment + 1) + node, sign * (i + 1) / (d + 1)),
-    ]
-
-
-def _laws(admissible: Admissible, layout: Layout) -> tuple[list[MatrixRow], list[MatrixRow]]:
-    """Return the rows of the flow laws: those equal to 0 and those at most 0."""
-    network = admissible.network
-    position = {int(node): z for z, node in enumerate(layout.valves)}
-    equal: list[MatrixRow] = []
-    under: list[MatrixRow] = []
-
-    def hold(column: int, driver: int, low: float, high: float) -> None:
-        """Hold low·driver ≤ column ≤ high·driver."""
-        if low == high:
-            equal.append([(column, 1.0), (driver, -low)])
+        if i < d:  # Y_i
+            rows.put(row[j], layout.stock(j) + node, (d - i) / (d + 1))
+            rows.put(row[j], layout.stock(j + 1) + node, (i + 1) / (d + 1))
         else:
-            under.extend(([(column, 1.0), (driver, -high)], [(column, -1.0), (driver, low)]))
-
-    for i in layout.moments:
-        first = i - i % (layout.degree + 1)
-        if i > first:  # a scheduled flow is constant in its piece: F_i = F_0
-            for k in np.flatnonzero(admissible.scheduled):
-                equal.append([(layout.flow(i) + int(k), 1.0), (layout.flow(first) + int(k), -1.0)])
-        for node, z in position.items():
-            hold(layout.valve(i) + z, layout.stock(i) + node, *admissible.valve[:, node])
-        for k in np.flatnonzero(~admissible.scheduled):
-            donor, driver = int(network.donors[k]), int(admissible.driver[k])
-            # behind a valve that several outflows share F_i = w·a·Z_i with Z_i = v·X_i; else F_i = v·w·a·X_i
-            through_valve = donor == driver and donor in position
-            factor = admissible.own[:, k] if through_valve else admissible.factor[:, k]
-            column = layout.valve(i) + position[donor] if through_valve else layout.stock(i) + driver
-            hold(layout.flow(i) + int(k), column, *(factor * admissible.base[0, k]))
-    return equal, under
+            rows.put(row[j], layout.end(piece) + node, 1.0)
+        if i > 0:  # − Y_{i−1}
+            rows.put(row[j], layout.stock(j - 1) + node, -(d - i + 1) / (d + 1))
+            rows.put(row[j], layout.stock(j) + node, -i / (d + 1))
+        else:
+            rows.at_start(row[j], piece, node, -1.0)
 
 
-def _held(admissible: Admissible, layout: Layout) -> list[MatrixRow]:
-    """Return F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z.
+def _laws(admissible: Admissible, layout: Layout, step: int, equal: ProgramRows, under: ProgramRows) -> None:
+    """Add the flow laws of an interval: rows that are 0 and rows at most 0; keys (0, moment, what, which, side)."""
+    network, moment = admissible.network, layout.moment_column
+
+    def hold(what: int, which: Integers, column: Integers, driver: Integers, factor: Floats) -> None:
+        """Hold low·driver ≤ column ≤ high·driver, with columns of shape (moments, which)."""
+        low, high = factor
+        given = low == high
+        row = equal.add(0, moment, what, which[given])
+        equal.put(row, column[:, given], 1.0)
+        equal.put(row, driver[:, given], -low[given])
+        for side, sign, bound in ((0, 1.0, high), (1, -1.0, low)):
+            row = under.add(0, moment, what, which[~given], side)
+            under.put(row, column[:, ~given], sign)
+            under.put(row, driver[:, ~given], -sign * bound[~given])
+
+    valves, arcs = layout.valves, np.setdiff1d(np.flatnonzero(~admissible.scheduled), followers(admissible, step))
+    place = np.arange(len(valves))
+    hold(1, place, layout.valve(moment) + place, layout.stock(moment) + valves, admissible.valve[:, step, valves])
+    # behind a valve that several outflows share F_i = w·a·Z_i with Z_i = v·X_i; else F_i = v·w·a·X_i
+    driver = admissible.driver[arcs]
+    through = (network.donors[arcs] == driver) & np.isin(driver, valves)
+    factor = np.where(through, admissible.own[:, step, arcs], admissible.factor[:, step, arcs])
+    behind = layout.valve(moment) + np.searchsorted(valves, driver)
+    column = np.where(through, behind, layout.stock(moment) + driver)
+    hold(2, arcs, layout.flow(moment) + arcs, column, factor * admissible.base[step, arcs])
+
+
+def _held(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) -> None:
+    """Add F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z; keys (1, moment, what, which).
 
     For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.
     """
-    network = admissible.network
-    neutral = FlowLaws(network)
-    rate = neutral.rate(neutral.neutral[:, :1])[:, 0]
-    free = ~admissible.scheduled & (admissible.factor[0] < admissible.factor[1])
-    pairs = [(layout.flow, int(k), int(admissible.driver[k]), float(rate[k])) for k in np.flatnonzero(free)]
-    for z, node in enumerate(layout.valves):
-        control = network.nodes[node].control
-        assert control is not None
-        pairs.append((layout.valve, z, int(node), control.neutral))
-    return [
-        [(first(i) + place, 1.0), (first(i - 1) + place, -1.0), (layout.stock(i) + p, -r), (layout.stock(i - 1) + p, r)]
-        for i in layout.moments[1:]
-        for first, place, p, r in pairs
-    ]
+    moment = layout.moment_column[1:]
+    free = ~admissible.scheduled & (admissible.factor[0, step] < admissible.factor[1, step])
+    arcs, valves = np.flatnonzero(free), np.arange(len(layout.valves))
+    opened = admissible.neutral_valve[step, layout.valves]
+    parts = (
+        (0, arcs, layout.flow, arcs, admissible.driver[arcs], admissible.neutral_rate[step, arcs]),
+        (1, valves, layout.valve, valves, layout.valves, opened),
+    )
+    for what, which, first, place, driver, rate in parts:
+        row = rows.add(1, moment, what, which)
+        for at, sign in ((moment, 1.0), (moment - 1, -1.0)):
+            rows.put(row, first(at) + place, sign)
+            rows.put(row, layout.stock(at) + driver, -sign * rate)
 
 
 def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: range) -> tuple[Floats, Floats]:
@@ -271,7 +252,8 @@ def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: rang
     network = admissible.network
     low, high = np.zeros((2, len(intervals), layout.size))
     scheduled = admissible.scheduled
-    rates = admissible.factor[:, None] * admissible.base[intervals.start : intervals.stop]
+    during = slice(intervals.start, intervals.stop)
+    rates, valve = (admissible.factor * admissible.base)[:, during], admissible.valve[:, during]
     # no weighted mean exceeds the supremum: F ≤ r̄·x̄_p, and U ≤ ū; U ≥ u̲ only where nothing is ever cut
     most = rates[1] * np.where(scheduled, 1.0, reached.upper[:, admissible.driver])
     least = np.where(scheduled & reached.uncut, rates[0], 0.0)
@@ -279,11 +261,16 @@ def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: rang
         high[:, layout.stock(i) : layout.flow(i)] = reached.upper
         high[:, layout.flow(i) : layout.valve(i)] = most
         low[:, layout.flow(i) : layout.valve(i)] = least
-        high[:, layout.valve(i) :][:, : len(layout.valves)] = (reached.upper * admissible.valve[1])[:, layout.valves]
+        high[:, layout.valve(i) :][:, : len(layout.valves)] = (reached.upper * valve[1])[:, layout.valves]
     for piece in range(layout.pieces):
-        high[:, layout.end(piece) : layout.end(piece) + len(network.nodes)] = reached.upper
+        last = layout.end(piece)
+        high[:, last : last + len(network.stores)] = reached.upper[:, : len(network.stores)]
+        if layout.merged:
+            high[:, last : last + len(network.nodes)] = reached.upper
+            high[:, layout.end_flow(piece) :][:, : len(network.arcs)] = most
+            low[:, layout.end_flow(piece) :][:, : len(network.arcs)] = least
     high[:, layout.level : layout.imbalance] = 1.0
     weights = network.objective.reference_interval * np.abs(network.sustainability * network.environmental)
     high[:, layout.imbalance] = most @ weights
-    low[:, layout.opening :], high[:, layout.opening :] = admissible.valve[:, None, layout.openings]
+    low[:, layout.opening :], high[:, layout.opening :] = valve[:, :, layout.openings]
     return low.ravel(), high.ravel()

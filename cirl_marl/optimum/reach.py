@@ -9,17 +9,19 @@ flow realised.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import sparse
 
 from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.passes import Passes
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
+from cirl_marl.optimum.held import Held
+from cirl_marl.optimum.routes import ROUNDING, RouteBounds
 
-ROUNDING = 1e-9
-"""Relative widening of every bound; rounding errors are far smaller."""
 ROUND_OFF = 1e-13
 """Mass by which bounds are widened in each substep, relative to the mass in the network."""
 
@@ -29,7 +31,8 @@ class Reach:
     """What the stocks can be.
 
     Attributes:
-        upper: bound of each stock within each interval, shape (steps, nodes), mass.
+        upper: bound of each stock within each interval, mass, and of what passes through each node that stores
+            nothing, mass/time, shape (steps, nodes).
         uncut: whether the donor of each arc delivers all that is asked, whatever the actions, shape (steps, arcs).
     """
 
@@ -46,84 +49,126 @@ class ComparisonSystem:
 
     def __init__(self, admissible: Admissible) -> None:
         """Compile the system for the ranges of ``admissible``."""
-        network = admissible.network
-        self.admissible, self.network = admissible, network
-        dynamics = Dynamics(network)
+        self.admissible, self.network = admissible, admissible.network
+        dynamics = Dynamics(admissible.network)
         self.substeps, self.substep = dynamics.substeps, dynamics.substep
-        nodes, arcs = len(network.nodes), np.arange(len(network.arcs))
-        self.outgoing, self.incoming = np.zeros((2, nodes, len(arcs)))
-        self.outgoing[network.donors, arcs] = 1.0
-        self.incoming[network.recipients, arcs] = 1.0
-        low, high = admissible.rate(0)
-        driven = ~admissible.scheduled
-        self.pulled = driven & (admissible.driver != network.donors)
-        # rows and columns: x̲ of all nodes, then x̄. x̲ gains the least inflow and loses the greatest outflow, x̄ the
-        # opposite; growth has no outflow at all
-        system, growth = np.zeros((2 * nodes, 2 * nodes)), np.zeros((nodes, nodes))
-        self.pull = np.zeros((nodes, nodes))
-        for k in np.flatnonzero(driven):
-            donor, recipient, p = network.donors[k], network.recipients[k], admissible.driver[k]
-            system[recipient, p] += low[k]
-            system[nodes + recipient, nodes + p] += high[k]
-            growth[recipient, p] += high[k]
-            other = nodes if self.pulled[k] else 0  # what leaves at the least x̲ is driven by x̲ itself or by x̄ elsewhere
-            system[donor, other + p] -= high[k]
-            system[nodes + donor, nodes - other + p] -= low[k]
-            if self.pulled[k]:
-                self.pull[donor, p] += high[k]
-        self.solution, self.response = _held(system, self.substep)
-        self.growth, self.surge = _held(growth, self.substep)
-        turned_over = self.outgoing @ (high * (driven & ~self.pulled)) * self.substep
-        self.share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(nodes), where=turned_over > ROUNDING)
+        self._passes = Passes(admissible.network)
+        self._routes: dict[bytes, RouteBounds] = {}
+        self._linear: dict[int, Linear] = {}
 
     def reach(self, initial: Floats, intervals: range) -> Reach:
-        """Bound the stocks from ``initial``, shape (nodes,), on, over the given intervals of the episode.
+        """Bound the stocks from ``initial``, shape (stores,), on, over the given intervals of the episode.
 
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds: the solver then departs from the laws.
         """
         network, scheduled = self.network, self.admissible.scheduled
-        nodes, steps = len(network.nodes), len(intervals)
+        nodes, stores, steps = len(network.nodes), len(network.stores), len(intervals)
         mass = float(initial.sum()) * (1 + ROUNDING)
         lower, upper = initial.copy(), initial.copy()
         highest = np.zeros((steps, nodes))
         uncut = np.ones((steps, len(network.arcs)), dtype=bool)
-        pulled_from = self.outgoing @ self.pulled > 0
         for step, interval in enumerate(intervals):
             least, most = np.where(scheduled, self.admissible.rate(interval), 0.0)
+            linear = self.of_kind(int(self.admissible.kinds[interval]))
+            entering, outgoing = self._by_node(most)
+            incoming = linear.routes.most(entering)
             for _ in range(self.substeps):
                 # without any outflow no stock ends a substep lower than it began, so this bounds it throughout
-                peak = np.minimum(self.growth @ upper + self.surge @ (self.incoming @ most), mass) * (1 + ROUNDING)
-                highest[step] = np.maximum(highest[step], peak)
+                peak, missed = linear.growth(upper, incoming)
+                peak = np.minimum(peak + missed, mass) * (1 + ROUNDING)
+                highest[step, :stores] = np.maximum(highest[step, :stores], peak)
                 # what may be asked in this piece, against what is left at the least: nothing is cut where it suffices
-                asked = (self.outgoing @ most + self.pull @ peak) * self.substep
-                enough = asked <= lower * self.share * (1 - ROUNDING)
-                if (pulled_from & ~enough).any():
-                    node = network.nodes[int((pulled_from & ~enough).argmax())].id
+                enough = (outgoing + linear.pull @ peak) * self.substep <= lower * linear.share * (1 - ROUNDING)
+                if (linear.pulled & ~enough).any():
+                    node = network.nodes[int((linear.pulled & ~enough).argmax())].id
                     raise NoCertificate(
                         f"network '{network.name}': recipients may pull more from node '{node}' than it holds in "
                         f"interval {interval}; no bound is proved for what the solver then does"
                     )
-                delivered = enough[network.donors]
+                delivered = np.append(enough, True)[np.minimum(network.donors, stores)]
                 uncut[step] &= delivered
-                sure = least * delivered
-                constant = np.concatenate(
-                    [
-                        self.incoming @ sure - self.outgoing @ most,
-                        self.incoming @ most - self.outgoing @ sure,
-                    ]
-                )
-                bounds = self.solution @ np.concatenate([lower, upper]) + self.response @ constant
-                lower = np.maximum(bounds[:nodes] - mass * ROUND_OFF, 0.0)
-                upper = np.minimum(bounds[nodes:] + mass * ROUND_OFF, mass)
+                gained, lost = self._by_node(least * delivered)
+                constant = np.concatenate([linear.routes.least(gained) - outgoing, incoming - lost])
+                bounds, missed = linear.solution(np.concatenate([lower, upper]), constant)
+                missed += mass * ROUND_OFF
+                lower = np.maximum(bounds[:stores] - missed, 0.0)
+                upper = np.minimum(bounds[stores:] + missed, mass)
+            highest[step, stores:] = linear.routes.through(entering[stores:] + linear.sent @ highest[step, :stores])
         return Reach(highest, uncut)
 
+    def _by_node(self, flow: Floats) -> tuple[Floats, Floats]:
+        """Return the sums of flows into each node, shape (nodes,), and out of each stock, shape (stores,)."""
+        network, nodes = self.network, len(self.network.nodes)
+        gained, lost = (np.bincount(ends, flow, nodes).astype(float) for ends in (network.recipients, network.donors))
+        return gained, lost[: len(network.stores)]
 
-def _held(matrix: Floats, interval: float) -> tuple[Floats, Floats]:
-    """Return exp(M h) and its integral over [0, h], which answer the state and a constant input."""
-    size = len(matrix)
-    # exp of [[M, I], [0, 0]]·h has both in its upper blocks (Van Loan 1978)
-    extended = np.zeros((2 * size, 2 * size))
-    extended[:size, :size], extended[:size, size:] = matrix, np.eye(size)
-    solved = linalg.expm(extended * interval)
-    return solved[:size, :size], solved[:size, size:]
+    def of_kind(self, kind: int) -> Linear:
+        """Return what is proportional to stocks in a kind of interval."""
+        if kind not in self._linear:
+            passed_on = self.network.donors >= len(self.network.stores)
+            key = self.admissible.rate(kind)[:, passed_on].tobytes()
+            if key not in self._routes:
+                self._routes[key] = RouteBounds(self.admissible, self._passes, kind)
+            self._linear[kind] = Linear(self.admissible, kind, self._routes[key], self.substep)
+        return self._linear[kind]
+
+
+class Linear:
+    """What is proportional to stocks in a kind of interval.
+
+    Attributes:
+        routes: what passes through nodes that store nothing.
+        solution: of the lowest and the highest stocks after a substep, shape (2 stores,).
+        gains: most that each stock gets, per stock, sparse, 1/time.
+        growth: the highest stocks after a substep, had they no outflow, shape (stores,).
+        sent: most that enters each node that stores nothing, per stock, sparse, 1/time.
+        thrown: most that passes through these, likewise.
+        pull: most that recipients pull from each stock, per stock, sparse, 1/time.
+        pulled: stocks from which they do.
+        share: z/(e^z − 1) for the most that leaves a stock in proportion to it in a substep, z.
+    """
+
+    def __init__(self, admissible: Admissible, kind: int, routes: RouteBounds, substep: float) -> None:
+        """Compile it for the intervals like the first of that kind."""
+        network, self.routes = admissible.network, routes
+        stores, nodes = len(network.stores), len(network.nodes)
+        driven = ~admissible.scheduled & (network.donors < stores)
+        low, high = admissible.rate(kind)[:, driven]
+        donor, recipient, p = network.donors[driven], network.recipients[driven], admissible.driver[driven]
+        pulled, split = donor != p, admissible.shared[driven]
+        released, exits = admissible.released(kind)[:, :stores], admissible.exits(kind)[:, :stores]
+
+        def entering(rate: Floats, where: NDArray[np.bool_]) -> Any:
+            return sparse.csr_array((rate[where], (recipient[where], p[where])), shape=(nodes, stores))
+
+        # what a stock releases in shares arrives once, at once or past nodes that store nothing
+        past = ~split & (recipient >= stores)
+        least = sparse.coo_array(routes.least(entering(low, past | split)))
+        once = sparse.coo_array(routes.most(entering(high, split)))
+        once.data = np.minimum(once.data, released[1, once.col])
+        most = sparse.coo_array(routes.most(entering(high, past)) + once)
+        # rows and columns: x̲ of all stocks, then x̄. x̲ gains the least inflow and loses the greatest outflow, x̄ the
+        # opposite; growth has no outflow at all
+        other = np.where(pulled, stores, 0)  # what leaves at the least x̲ is driven by x̲ itself or by x̄ elsewhere
+        straight = ~split & ~past
+        kept = np.stack([straight, straight, ~split, ~split], axis=1)
+        own = np.arange(stores)
+        rows = np.stack([recipient, stores + recipient, donor, stores + donor], axis=1)[kept]
+        columns = np.stack([p, stores + p, other + p, stores - other + p], axis=1)[kept]
+        values = np.stack([low, high, -high, -low], axis=1)[kept]
+        rows = np.concatenate([rows, least.row, stores + most.row, own, stores + own])
+        columns = np.concatenate([columns, least.col, stores + most.col, own, stores + own])
+        values = np.concatenate([values, least.data, most.data, -released[1], -released[0]])
+        self.solution = Held(sparse.coo_array((values, (rows, columns)), shape=(2 * stores, 2 * stores)), substep)
+        gains = (np.append(recipient[straight], most.row), np.append(p[straight], most.col))
+        values = np.append(high[straight], most.data)
+        self.gains = sparse.csr_array(sparse.coo_array((values, gains), shape=(stores, stores)))
+        self.growth = Held(self.gains, substep)
+        self.sent = entering(high, past | split)[stores:]
+        self.thrown = routes.through(self.sent)
+        taken = (high[pulled], (donor[pulled], p[pulled]))
+        self.pull = sparse.csr_array(sparse.coo_array(taken, shape=(stores, stores)))
+        self.pulled = np.bincount(donor[pulled], minlength=stores) > 0
+        z = exits[1] * substep
+        self.share = np.divide(z, np.expm1(z), out=np.ones(stores), where=z > ROUNDING)

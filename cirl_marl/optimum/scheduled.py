@@ -5,34 +5,48 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import sparse
 
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout, Link, MatrixRow, matrix_of, start_of
+from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.reach import Reach
+from cirl_marl.optimum.rows import ProgramRows
 
 
-def deliveries(admissible: Admissible, layout: Layout) -> list[Link]:
-    """Return U·δ − x_start·z/(e^z − 1), which is at most 0, for the scheduled outflow U of each node in each piece.
+def deliveries(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) -> None:
+    """Add U·δ − x_start·z/(e^z − 1), at most 0, for the scheduled outflow U of each node; keys (0, piece, node).
 
     This is how the simulator cuts scheduled flows, with z = a·δ for the proportional exits of rate a; the least a gives
-    the most. What flows in during the piece is not available to them.
+    the most. What flows in during the piece is not available to them. Of merged pieces nothing is said.
     """
+    if layout.merged:
+        return
     network = admissible.network
-    by_donor = admissible.driver == network.donors
-    least = np.bincount(network.donors, weights=admissible.rate(0)[0] * by_donor, minlength=len(network.nodes))
-    turned_over = least * layout.length
+    turned_over = admissible.exits(step)[0] * layout.length
     # U·δ ≤ x_start·z/(e^z − 1); the factor falls with z, so the least rate of the exits gives the weakest, valid row
-    share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(len(least)), where=turned_over > 1e-9)
-    links: list[Link] = []
-    for piece in range(layout.pieces):
-        first = layout.flow(piece * (layout.degree + 1))
-        for node in np.unique(network.donors[admissible.scheduled]):
-            orders = np.flatnonzero((network.donors == node) & admissible.scheduled)
-            now, before = start_of(layout, piece, int(node), -float(share[node]) / (layout.length))
-            links.append(([*((first + int(k), 1.0) for k in orders), *now], before))
-    return links
+    share = np.divide(turned_over, np.expm1(turned_over), out=np.ones(len(turned_over)), where=turned_over > 1e-9)
+    arcs = np.flatnonzero(admissible.scheduled)
+    nodes, place = np.unique(network.donors[arcs], return_inverse=True)
+    piece = np.arange(layout.pieces)[:, None]
+    row = rows.add(0, piece, nodes)
+    rows.put(row[:, place], layout.flow(piece * (layout.degree + 1)) + arcs, 1.0)
+    rows.at_start(row, piece, nodes, -share[nodes] / layout.length)
+
+
+def orders(admissible: Admissible, layout: Layout, equal: ProgramRows, under: ProgramRows) -> None:
+    """Add that a scheduled flow is constant in its piece, F_i = F_0; keys (0, moment, 0, arc, side).
+
+    If pieces are merged, a flow that nothing can cut is constant in the interval.
+    """
+    moment, arcs = layout.moment_column, np.flatnonzero(admissible.scheduled)
+    first = 0 * moment if layout.merged else moment - moment % (layout.degree + 1)
+    later = (moment > first).ravel()
+    for rows, side, sign in ((under, 0, 1.0), (under, 1, -1.0)) if layout.merged else ((equal, 0, 1.0),):
+        row = rows.add(0, moment[later], 0, arcs, side)
+        rows.put(row, layout.flow(moment[later]) + arcs, sign)
+        rows.put(row, layout.flow(first[later]) + arcs, -sign)
+        if layout.merged:
+            rows.loosen(row, arcs, 1.0)
 
 
 def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: range) -> tuple[Any, Floats]:
@@ -42,35 +56,28 @@ def openings(admissible: Admissible, reached: Reach, layout: Layout, intervals: 
     (v − v̲)(x̄ − X) ≥ 0 gives Z − v̲ X − x̄ v ≤ −v̲ x̄ (McCormick 1976).
     """
     network, steps = admissible.network, len(intervals)
-    fixed: list[MatrixRow] = []
-    columns: list[int] = []
-    weights, limits = [np.zeros((steps, 0))], [np.zeros((steps, 0))]
-
-    def hold(row: MatrixRow, opening: int, weight: Floats, to: Floats) -> None:
-        """Hold row + weight_t·v ≤ to_t in each interval t."""
-        fixed.append(row)
-        columns.append(opening)
-        weights.append(weight[:, None])
-        limits.append(to[:, None])
-
-    for place, node in enumerate(layout.openings):
-        opening, z = layout.opening + place, int(np.flatnonzero(layout.valves == node)[0])
-        low, high = admissible.valve[:, node]
-        most = reached.upper[:, node]
-        for i in layout.moments:
-            stock, through = layout.stock(i) + int(node), layout.valve(i) + z
-            hold([(stock, high), (through, -1.0)], opening, most, high * most)
-            hold([(through, 1.0), (stock, -low)], opening, -most, -low * most)
-        for k in np.flatnonzero(admissible.scheduled & (network.donors == node)):
-            capacity = admissible.own[1, k] * admissible.base[intervals.start : intervals.stop, k]
-            for piece in range(layout.pieces):
-                flow = layout.flow(piece * (layout.degree + 1)) + int(k)
-                hold([(flow, 1.0)], opening, -capacity, np.zeros(steps))
-    # x̄ and ū differ from interval to interval: the entries of v are laid in one by one, row (t, r), column of v in t
-    varying = np.concatenate(weights, axis=1)
-    entries = layout.size * np.arange(steps)[:, None] + np.array(columns, dtype=np.intp)
-    shape = (varying.size, steps * layout.size)
-    moving = sparse.csr_array((varying.ravel(), (np.arange(varying.size), entries.ravel())), shape=shape)
-    return sparse.kron(sparse.eye_array(steps), matrix_of(fixed, layout), format="csr") + moving, np.concatenate(
-        limits, axis=1
-    ).ravel()
+    when = slice(intervals.start, intervals.stop)
+    t = np.arange(steps)[:, None]
+    rows = ProgramRows(layout, steps)
+    limits: list[Floats] = []
+    nodes, opening = layout.openings, layout.opening + np.arange(len(layout.openings))
+    through, most = np.searchsorted(layout.valves, nodes), reached.upper[:, nodes]
+    low, high = admissible.valve[:, when, nodes]
+    for i in layout.moments:
+        for side, (x, z, v, to) in enumerate(((high, -1.0, most, high * most), (-low, 1.0, -most, -low * most))):
+            row = rows.add(t, nodes, 0, i, side)
+            rows.put(row, t * layout.size + layout.stock(i) + nodes, x)
+            rows.put(row, t * layout.size + layout.valve(i) + through, z)
+            rows.put(row, t * layout.size + opening, v)
+            limits.append(to.ravel())
+    arcs = np.flatnonzero(admissible.scheduled & np.isin(network.donors, nodes))
+    donors = network.donors[arcs]
+    capacity = admissible.own[1, when, arcs].T * admissible.base[when, arcs]
+    for piece in range(layout.pieces):
+        row = rows.add(t, donors, 1 + arcs, piece)
+        rows.put(row, t * layout.size + layout.flow(piece * (layout.degree + 1)) + arcs, 1.0)
+        rows.put(row, t * layout.size + opening[np.searchsorted(nodes, donors)], -capacity)
+        limits.append(np.zeros(row.size))
+    opened = rows.matrices()[0]
+    opened.eliminate_zeros()
+    return opened, rows.in_order(limits)

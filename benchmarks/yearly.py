@@ -1,0 +1,338 @@
+"""How often the planner closes the gap on generated cycles of a material with yearly decisions (``make planner``).
+
+A cycle has 1 to 5 regions. In each, a mine is dug by order, a market without stock shares metal out to products in use,
+waste is gathered from these, recycled or lost, and goes round: residence times from a week to a century, some furnaces
+and dumps of waste with stock and some without, trade between markets, numbers that change with the years.
+
+For each network the command bounds λ̄ with every service met at 95 %, verifies the certificate, and improves the plan
+until it keeps the services and comes within 1 % of the bound, or a minute has passed.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    Network,
+    Node,
+    Objective,
+    Role,
+    Series,
+    Service,
+)
+from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.optimum import achieved, bound, improved
+
+WEEK = 1 / 52
+DURABLE = 4.0
+"""Life in years from which on a stock in use is what is needed; of what is used up sooner it is the supply."""
+SEEDS = 200
+LIMIT = 60.0
+"""Seconds of processor time for each network."""
+SERVICE, MISSED = 0.95, 1e-4
+"""Mean level demanded of each service, and how much of it a plan may miss."""
+GAP = 0.01
+"""Of the bound, within which a plan counts as close."""
+DEGREES = (2, 3, 4)
+"""Degrees of the test polynomials, tried in turn while there is time."""
+ROUNDS, STALLED = 20, 5
+"""Most linear programs of an improvement, and after how many of them it has to have got closer."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one network.
+
+    Attributes:
+        seed: of the network.
+        nodes: how many it has.
+        years: of an episode.
+        proved: the bound on λ̄, in shares of the scale of circularity; the lowest of those proved.
+        gap: of the best plan that keeps the services; NaN without one.
+        degree: at which the bound was proved.
+        seconds: of processor time that it took.
+        reason: why it does not count as closed; empty if it does.
+    """
+
+    seed: int
+    nodes: int
+    years: int
+    proved: float = np.nan
+    gap: float = np.nan
+    degree: int = 0
+    seconds: float = 0.0
+    reason: str = ""
+
+
+def planned(seed: int) -> Outcome:
+    """Bound the network of a seed, and improve its plan while there is time."""
+    begun = time.process_time()
+    network = yearly_network(seed)
+    size = len(network.nodes), network.episode.horizon
+    scale = network.objective.circularity_scale
+    best, proved, degree, reason, plan = -np.inf, np.inf, 0, "", None
+
+    def seconds() -> float:
+        return time.process_time() - begun
+
+    def enough(run: Rollout) -> bool:
+        """Remember an episode that keeps the services; say whether it is close, hardly better, or time is over."""
+        nonlocal best
+        if float(run.episode_levels.min(initial=1.0)) >= SERVICE - MISSED:
+            best = max(best, float(run.episode_circularity[0]))
+        reached.append(best)
+        earlier = reached[-STALLED] if len(reached) >= STALLED else -np.inf
+        stalled = np.isfinite(earlier) and best - earlier < 0.05 * GAP * abs(proved)
+        return best >= proved - GAP * abs(proved) or bool(stalled) or seconds() > LIMIT
+
+    for degree in DEGREES:
+        if degree > DEGREES[0] and seconds() > LIMIT / 2:  # the next bound takes longer than the last one did
+            break
+        try:
+            found = bound(network, min_service=SERVICE if network.services else None, degree=degree)
+        except CirlError as missing:
+            reason = str(missing)
+            break
+        if found.verify().bound != found.objective:
+            reason = "the certificate does not prove the bound"
+            break
+        proved = min(proved, found.objective)
+        reached: list[float] = []
+        plan = improved(found if plan is None else plan, rounds=ROUNDS, enough=enough)
+        enough(achieved(plan))
+        if best >= proved - GAP * abs(proved):
+            break
+    gap = (proved - best) / abs(proved) if np.isfinite(best) else np.nan
+    if not reason and not np.isfinite(best):
+        reason = "the plan misses services"
+    elif not reason and gap > GAP:
+        reason = f"a gap of {gap:.2%}"
+    return Outcome(seed, *size, proved / scale, gap, degree, seconds(), reason)
+
+
+def yearly_network(seed: int) -> Network:
+    """Return the network of a seed: 10 to 40 years, 5 to 60 nodes."""
+    rng = np.random.default_rng(seed)
+    years = int(rng.integers(10, 41))
+    cycle = _Cycle(rng, years)
+    regions = int(rng.integers(1, 6))
+    for region in range(regions):
+        cycle.region(region, regions)
+    return Network(
+        name=f"yearly_{seed}",
+        nodes=tuple(cycle.nodes),
+        arcs=tuple(cycle.arcs),
+        services=tuple(cycle.services),
+        episode=Episode(control_interval=1.0, horizon=years),
+        objective=Objective(circularity_scale=cycle.demand),
+        mass_unit="kt",
+        time_unit="year",
+    )
+
+
+@dataclass
+class _Cycle:
+    """The parts drawn so far.
+
+    Attributes:
+        rng: of the draws.
+        years: of an episode.
+        demand: metal that all regions take up in a year, kt.
+    """
+
+    rng: np.random.Generator
+    years: int
+    nodes: list[Node] = field(default_factory=list)
+    arcs: list[Arc] = field(default_factory=list)
+    services: list[Service] = field(default_factory=list)
+    demand: float = 0.0
+
+    def region(self, region: int, regions: int) -> None:
+        """Draw the nodes and arcs of a region; those of the next one are known by name."""
+        rng, size = self.rng, float(10 ** self.rng.uniform(1, 3))
+        self.demand += size
+        name = f"r{region}"
+        abroad = f"r{(region + 1) % regions}"
+        self._mine(name, size)
+        products = int(rng.integers(1, 6))
+        weights = rng.dirichlet(np.full(products, 3.0))
+        self._furnace(f"{name}_smelter", size, f"{name}_market")
+        self._node(f"{name}_market", None)
+        lives = 10 ** rng.uniform(0, 2, products)
+        if rng.random() < 0.3:
+            lives[0] = 10 ** rng.uniform(np.log10(WEEK), 0)  # packaging
+        for p, (weight, life) in enumerate(zip(weights.tolist(), lives.tolist(), strict=True)):
+            self._product(name, p, size * weight, weight, life)
+        trade = float(rng.uniform(0.01, 0.2)) if regions > 1 else 0.0
+        rest = 1.0 - trade
+        for p in range(1, products):
+            if rng.random() < 0.5:
+                self._share(f"{name}_to_{p}", f"{name}_market", f"{name}_use_{p}", rest * weights[p], True)
+            else:
+                self._share(
+                    f"{name}_to_{p}", f"{name}_market", f"{name}_use_{p}", self._changing(rest * weights[p], 1.0), False
+                )
+        self.arcs.append(Arc(id=f"{name}_to_0", donor=f"{name}_market", recipient=f"{name}_use_0", law=Law.SHARE))
+        if trade:
+            self._share(f"{name}_export", f"{name}_market", f"{abroad}_market", trade, bool(rng.integers(2)))
+        self._waste(name, abroad if regions > 1 and rng.random() < 0.5 else "", size)
+
+    def _mine(self, name: str, size: float) -> None:
+        reserve = size * float(self.rng.uniform(60, 200))
+        known = self.rng.random() < 0.7
+        self.nodes.append(
+            Node(
+                id=f"{name}_mine",
+                role=Role.NONRENEWABLE_RESERVOIR,
+                initial=(reserve, reserve) if known else None,
+                scale=reserve,
+            )
+        )
+        control = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.6 * size, high=2.0 * size)
+        self.arcs.append(
+            Arc(
+                id=f"{name}_mining",
+                donor=f"{name}_mine",
+                recipient=f"{name}_smelter",
+                law=Law.CONTROLLED,
+                control=control,
+                scale=size,
+            )
+        )
+
+    def _furnace(self, node: str, size: float, to: str) -> None:
+        """Draw what passes metal on with a loss, within weeks or at once."""
+        loss, tip = float(self.rng.uniform(0.01, 0.1)), node.split("_")[0] + "_tip"
+        residence = float(10 ** self.rng.uniform(np.log10(WEEK), 0)) if self.rng.random() < 0.4 else None
+        self._node(node, residence, size)
+        self._share(f"{node}_loss", node, tip, loss, False)
+        self.arcs.append(Arc(id=f"{node}_out", donor=node, recipient=to, law=Law.SHARE))
+
+    def _product(self, name: str, p: int, flow: float, weight: float, life: float) -> None:
+        """Draw a product in use, in balance at first, of which a service asks for about as much as there is."""
+        rng, node = self.rng, f"{name}_use_{p}"
+        stock = flow * life
+        rate = self._changing(1.0 / life) if rng.random() < 0.3 else 1.0 / life
+        self.nodes.append(Node(id=node, initial=(stock, stock), rate=rate, scale=stock))
+        self._share(f"{node}_loss", node, f"{name}_tip", float(rng.uniform(0.05, 0.3)), bool(rng.integers(2)))
+        self.arcs.append(Arc(id=f"{node}_end", donor=node, recipient=f"{name}_waste", law=Law.SHARE))
+        if rng.random() < 0.6 or p == 0:
+            growth = float(rng.uniform(-0.01, 0.02))
+            durable = life >= DURABLE
+            needed = 0.9 * (stock if durable else flow)
+            ends = (needed, needed * (1 + growth) ** self.years)
+            low: float | Series = needed
+            if rng.random() < 0.7:
+                low = Series(times=(0.0, float(self.years)), values=ends, interpolation="linear")
+            provider, quantity = (node, "stock") if durable else (f"{name}_to_{p}", "flow")
+            self.services.append(Service(id=f"{node}_needed", provider=provider, quantity=quantity, low=low))
+
+    def _waste(self, name: str, abroad: str, size: float) -> None:
+        """Draw what becomes of waste: recycled, exported, hoarded or lost."""
+        rng, waste = self.rng, f"{name}_waste"
+        self._node(waste, float(10 ** rng.uniform(np.log10(WEEK), 0.3)) if rng.random() < 0.4 else None, size)
+        self._furnace(f"{name}_recycler", size, f"{name}_market")
+        self._share(f"{name}_recycling", waste, f"{name}_recycler", float(rng.uniform(0.3, 0.6)), True)
+        if abroad:
+            self._share(f"{name}_scrap_export", waste, f"{abroad}_waste", float(rng.uniform(0.01, 0.1)), False)
+        if rng.random() < 0.3:
+            hoard = f"{name}_hoard"
+            self._share(f"{name}_hoarding", waste, hoard, float(rng.uniform(0.02, 0.1)), bool(rng.integers(2)))
+            self.nodes.append(Node(id=hoard, initial=(size, size), scale=size))
+            control = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.05 * size, high=0.3 * size)
+            self.arcs.append(
+                Arc(
+                    id=f"{name}_release",
+                    donor=hoard,
+                    recipient=f"{name}_recycler",
+                    law=Law.CONTROLLED,
+                    control=control,
+                    scale=size,
+                )
+            )
+        self.arcs.append(Arc(id=f"{name}_dumping", donor=waste, recipient=f"{name}_tip", law=Law.SHARE))
+        self.nodes.append(Node(id=f"{name}_tip", role=Role.LANDFILL, initial=(size, size), scale=size))
+        if rng.random() < 0.3:
+            control = Control(kind=ControlKind.RATE, low=0.0, neutral=0.0, high=1.0)
+            rate = float(10 ** rng.uniform(-2.5, -1.3))
+            self.arcs.append(
+                Arc(
+                    id=f"{name}_urban_mining",
+                    donor=f"{name}_tip",
+                    recipient=waste,
+                    rate=rate,
+                    control=control,
+                    scale=size,
+                )
+            )
+
+    def _node(self, name: str, residence: float | None, size: float = 1.0) -> None:
+        """Add a node whose outflows are shares: without stock, or with one that holds metal for so long."""
+        if residence is None:
+            self.nodes.append(Node(id=name, stores=False, scale=max(size, 1.0)))
+        else:
+            held = size * residence
+            self.nodes.append(Node(id=name, initial=(held, held), rate=1.0 / residence, scale=held))
+
+    def _share(self, name: str, donor: str, recipient: str, share: float | Series, controlled: bool) -> None:
+        if controlled and isinstance(share, float):
+            control = Control(kind=ControlKind.SHARE, low=0.3 * share, neutral=share, high=min(1.0, 1.7 * share))
+            self.arcs.append(Arc(id=name, donor=donor, recipient=recipient, law=Law.SHARE, control=control))
+        else:
+            self.arcs.append(Arc(id=name, donor=donor, recipient=recipient, law=Law.SHARE, share=share))
+
+    def _changing(self, value: float, most: float = 1.2) -> Series:
+        """Return a value that comes to 80 % or more of what it begins with, and at most to ``most``."""
+        times = (0.0, self.years / 2, float(self.years))
+        ends = value * np.array([1.0, *self.rng.uniform(0.8, most, 2)])
+        return Series(times=times, values=tuple(ends.tolist()), interpolation="linear")
+
+
+def main(
+    seeds: Annotated[int, typer.Option(help="How many networks, from the first seed on.")] = SEEDS,
+    first: Annotated[int, typer.Option(help="First seed.")] = 0,
+    jobs: Annotated[int, typer.Option(help="Networks planned side by side.")] = 1,
+) -> None:
+    """Plan generated networks, and tell which gaps do not close."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    outcomes: list[Outcome] = []
+    with ProcessPoolExecutor(jobs) as pool, Progress(console=console) as progress:
+        task = progress.add_task("networks", total=seeds)
+        for outcome in pool.map(planned, range(first, first + seeds)):
+            outcomes.append(outcome)
+            closed = sum(not each.reason for each in outcomes)
+            progress.update(task, advance=1, description=f"{closed} of {len(outcomes)} closed")
+            if outcome.reason:
+                console.print(f"{outcome.seed}: {outcome.reason}")
+    gaps, times = (np.array([getattr(each, name) for each in outcomes]) for name in ("gap", "seconds"))
+    table = Table("networks", "closed", "median gap", "largest gap", "median s", "largest s")
+    closed = sum(not each.reason for each in outcomes)
+    shown = [f"{np.nanmedian(gaps):.2%}", f"{np.nanmax(gaps):.2%}", f"{np.median(times):.1f}", f"{times.max():.1f}"]
+    table.add_row(str(len(outcomes)), str(closed), *shown)
+    console.print(table)
+    rest = Table("seed", "nodes", "years", "bound/scale", "gap", "degree", "s", "reason")
+    for each in outcomes:
+        if each.reason:
+            figures = [f"{each.proved:.4f}", f"{each.gap:.2%}", str(each.degree), f"{each.seconds:.0f}"]
+            rest.add_row(str(each.seed), str(each.nodes), str(each.years), *figures, each.reason)
+    console.print(rest)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,74 @@
+"""What passes through nodes that store nothing, at the least and at the most, whatever shares are chosen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from cirl_marl.dynamics.passes import Passes
+from cirl_marl.optimum.admissible import Admissible
+
+ROUNDING = 1e-9
+"""Relative widening of every bound; rounding errors are far smaller."""
+DOUBLINGS = 40
+"""2 to their power are the passes that are counted at the least."""
+SETTLED = 1e-3
+"""Relative fall of an upper bound in a round below which no further is made."""
+ROUNDS = 1000
+"""Most such rounds."""
+
+
+class RouteBounds:
+    """Bounds of what leaves such nodes in one interval, per mass that enters them.
+
+    With the least shares P̲ among these nodes and R̲ into stocks, at least (I − P̲)⁻¹ R̲ = R̲ + P̲ R̲ + … arrives, so any
+    sum of first terms bounds it. The greatest number of visits V_ij to node j by what enters i solves
+    V = I + max_s P(s) V, a Markov decision process; from a V that is too large this iteration falls towards it, so
+    any iterate bounds it. What enters i reaches a stock in a share of at most V_i R̄, and of at most 1.
+
+    Attributes:
+        longest: most visits of all nodes together, at least 1.
+    """
+
+    def __init__(self, admissible: Admissible, passes: Passes, step: int) -> None:
+        """Take the ranges of shares in interval ``step``."""
+        network = admissible.network
+        stores, nodes = len(network.stores), len(network.nodes)
+        self._stores, inner = stores, nodes - stores
+        arcs = np.flatnonzero(network.donors >= stores)
+        places = (network.donors[arcs] - stores, network.recipients[arcs])
+        low, high = (
+            sparse.csr_array((rate, places), shape=(inner, nodes)).toarray() for rate in admissible.rate(step)[:, arcs]
+        )
+        arrives, passed = low[:, :stores], low[:, stores:]
+        for _ in range(DOUBLINGS):  # the first 2ⁿ terms, and P̲ to that power
+            arrives, passed = arrives + passed @ arrives, passed @ passed
+            if passed.max(initial=0.0) < ROUNDING:
+                break
+        total = passes.total(step)
+        self.longest = float(total.max(initial=1.0))
+        visits = np.repeat(total[:, None], inner, axis=1)
+        for _ in range(ROUNDS if inner else 0):
+            fewer = np.minimum(visits, np.eye(inner) + passes.best(visits, step))
+            fallen = (visits - fewer).max()
+            visits = fewer
+            if fallen <= SETTLED * visits.max():
+                break
+        most = np.minimum(visits @ high[:, :stores], 1.0)
+        self._least = sparse.csr_array(arrives.T * (1 - ROUNDING))
+        self._most = sparse.csr_array(most.T * (1 + ROUNDING))
+        self._visits = sparse.csr_array(visits.T * (1 + ROUNDING))
+
+    def least(self, entering: Any) -> Any:
+        """Return the least that stocks get of what enters nodes, shape (nodes, …) → (stores, …)."""
+        return entering[: self._stores] + self._least @ entering[self._stores :]
+
+    def most(self, entering: Any) -> Any:
+        """Return the most that stocks get, likewise."""
+        return entering[: self._stores] + self._most @ entering[self._stores :]
+
+    def through(self, entering: Any) -> Any:
+        """Return the most that passes through the nodes that store nothing, given what enters these from elsewhere."""
+        return self._visits @ entering
