@@ -107,8 +107,8 @@ def yearly_network(*, monthly: bool = False, regions: int = 33, seed: int = 0) -
     for i in range(regions):
         for name, shares in CHAIN.items():
             years = random.uniform(*IN_USE.get(name, (1.0, 1.0)))
-            options = {"initial": (50.0, 150.0), "rate": 1.0 / years} if name in IN_USE else held
-            nodes.append(Node(id=f"{name}_{i}", **options))
+            used: dict[str, Any] = {"initial": (50.0, 150.0), "rate": 1.0 / years}
+            nodes.append(Node(id=f"{name}_{i}", **(used if name in IN_USE else held)))
             for end, value in shares.items():
                 recipient = end.replace(" ", "_") if end.startswith("world") or end == "landfill" else f"{end}_{i}"
                 chosen: dict[str, Any] = {"share": value}
@@ -124,11 +124,11 @@ def yearly_network(*, monthly: bool = False, regions: int = 33, seed: int = 0) -
         nodes.append(Node(id=f"world_{good}", **held))
         parts = 0.6 * random.dirichlet(np.full(regions, 5.0))
         for i, part in enumerate(parts.tolist()):
-            chosen = {"share": part} if i + 1 < regions else {}
+            chosen = {"share": part if i + 1 < regions else None}
             if good == "scrap" and i == 0:
                 chosen = {"control": asked}
-            ends = {"donor": f"world_{good}", "recipient": f"{buyer}_{i}"}
-            arcs.append(Arc(id=f"world_{good}_to_{i}", **ends, law=Law.SHARE, **chosen))
+            name, buys = f"world_{good}", f"{buyer}_{i}"
+            arcs.append(Arc(id=f"{name}_to_{i}", donor=name, recipient=buys, law=Law.SHARE, **chosen))
     return Network(
         name="yearly",
         nodes=tuple(nodes),
