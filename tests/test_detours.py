@@ -25,11 +25,12 @@ Floats = NDArray[np.float64]
 def cycle(seed: int, stores: int, passing: int, leak: float = 0.1, **episode: Any) -> Network:
     """Return stocks and markets that pass to each other at random; a third of the markets have shares that change."""
     rng = np.random.default_rng(seed)
-    nodes = [Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR)]
-    nodes += [Node(id=f"s{i}", initial=(1.0, 90.0), rate=float(rng.uniform(0.02, 1.0))) for i in range(stores)]
+    nodes = [Node(id=f"s{i}", initial=(1.0, 90.0), rate=float(rng.uniform(0.02, 1.0))) for i in range(stores)]
     nodes += [Node(id=f"m{i}", stores=False) for i in range(passing)]
-    names = [node.id for node in nodes[1:]]
+    names = [node.id for node in nodes]
+    nodes.append(Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR))
     arcs = [Arc(id="feed", donor="mine", recipient=names[-1], law=Law.EXOGENOUS, flow=7.0)]
+    arcs.append(Arc(id="ship", donor="s0", recipient="s1", law=Law.BATCH, batches=((0.0, 0.5),), delay=1.0))
     for donor in names:
         ends = [str(end) for end in rng.permutation([name for name in names if name != donor])[: rng.integers(1, 5)]]
         parts = (rng.dirichlet(np.ones(len(ends))) * (1 - leak)).tolist()

@@ -24,7 +24,7 @@ from cirl_marl.dynamics.shares import Shares
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Arc, ControlKind, Law
-from cirl_marl.network.rowsum import RowSum
+from cirl_marl.network.rowsum import RowSum, narrowed
 from cirl_marl.network.series import Series, Value
 
 RATE, FLOW = ControlKind.RATE, ControlKind.FLOW
@@ -116,7 +116,7 @@ class FlowLaws:
 
     def _bound_rates(self) -> None:
         """Bound what arcs carry and stocks drive with every control at its upper bound."""
-        self.max_rate: Floats = self._unshared(self.control_high.max(axis=1, keepdims=True))[:, 0]
+        self.max_rate: Floats = self._unshared(narrowed(self.control_high).max(axis=1, keepdims=True))[:, 0]
         if len(self._series_arcs):
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
         # the arcs of a split carry together what one of them would carry alone
@@ -157,6 +157,11 @@ class FlowLaws:
         if step is not None and len(self._series_arcs):
             rate[self._series_arcs] *= self._series[:, step]
         return rate
+
+    def neutral_in(self, step: Integers) -> Floats:
+        """Return the controls while nobody acts, in one interval of each copy, shape (controls, B)."""
+        table = narrowed(self.neutral)  # ``take`` would first write out what is broadcast
+        return table.take(step, axis=1) if table.shape[1] > 1 else np.repeat(table, len(step), axis=1)
 
     def _unshared(self, controls: Floats) -> Floats:
         """Return r, but for shares and time series."""
