@@ -256,7 +256,11 @@ def arcs() -> list[Figure]:
 
 def yearly() -> list[Figure]:
     """Measure a yearly cycle with 400 nodes without stock against the same with stocks in them, and copper_net."""
-    envs: dict[str, Network | str] = {"cycle": yearly_network(), "monthly": yearly_network(monthly=True), "copper_net": "copper_net"}
+    envs: dict[str, Network | str] = {
+        "cycle": yearly_network(),
+        "monthly": yearly_network(monthly=True),
+        "copper_net": "copper_net",
+    }
     found = {name: VectorEnv(network, num_envs=COPIES) for name, network in envs.items()}
     for env in found.values():
         env.reset(seed=0)
