@@ -179,3 +179,24 @@ def test_a_cycle_of_500_nodes_keeps_few() -> None:
     flow, own = env.advance(actions).flow, lone.advance(actions[:, 2:]).flow
     np.testing.assert_array_equal(flow[:, 2:], own)
     np.testing.assert_allclose(env.physical.stock.sum(axis=0), start, rtol=1e-13)
+
+
+def test_a_flow_that_is_cut_in_one_copy_leaves_the_others_as_they_are() -> None:
+    """Where a recipient draws more than there is, the step is taken again: the other copies equal lone ones."""
+    network = cycle(1, 4, 12)
+    pull = Arc(id="pull", donor="pot", recipient="s2", law=Law.RECIPIENT, rate=0.5)
+    nodes = (*network.nodes, Node(id="pot", initial=(0.0, 2e3)))
+    network = Network(name="pulled", nodes=nodes, arcs=(*network.arcs, pull), episode=network.episode)
+    held = np.array([1e3, 1e-3, 1e3])
+    env = VectorEnv(network, num_envs=3)
+    env.reset(seed=0, options={"initial_state": {"pot": held}})
+    actions = np.random.default_rng(0).uniform(-1, 1, (len(env.agents), 3))
+    flow, stock = env.advance(actions).flow, env.physical.stock
+    pulled = flow[network.arc_index["pull"]]
+    assert pulled[1] == pytest.approx(1e-3)
+    assert pulled[[0, 2]].min() > 0.1
+    for i in range(3):
+        lone = VectorEnv(network, num_envs=1)
+        lone.reset(seed=i, options={"initial_state": {"pot": held[i]}})
+        np.testing.assert_array_equal(lone.advance(actions[:, i : i + 1]).flow[:, 0], flow[:, i])
+        np.testing.assert_array_equal(lone.physical.stock[:, 0], stock[:, i])

@@ -67,16 +67,16 @@ class Dynamics(FlowLaws):
         self.inner, self.batches = InnerPhysics(network, rows), BatchTransport(network, rows)
         episode = network.episode
         self.physical = episode.solver != "euler"
-        self._exact = episode.solver == "exact"
         fastest = float(self.turnover.max(initial=0.0))
         self._check_turnover(self.turnover)
-        if self._exact:
+        exact = episode.solver == "exact"
+        if exact:
             self.substeps = max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
         else:
             assert episode.solver_step is not None
             self.substeps = round(episode.control_interval / episode.solver_step)
         self.substep = episode.control_interval / self.substeps
-        self._taylor = Taylor(self, self.substep) if self._exact else None
+        self._taylor = Taylor(self, self.substep) if exact else None
         self.terms = self._taylor.terms if self._taylor is not None else 0
         shape = (rows.masses, len(network.arcs))
         self._outgoing = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
@@ -189,11 +189,13 @@ class Dynamics(FlowLaws):
         return flow
 
     def _flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Routes | None) -> Floats:
+        if self._taylor is not None:
+            return self._taylor.flow(stock, routes, rate)
         return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate), routes)
 
     def _forward(self, flow: Floats, routes: Routes | None) -> Floats:
         """Stop, in place, flows that a model or the stage of a solver would reverse, and pass on what is left."""
-        if self.physical and not self._exact:
+        if self.physical:
             np.maximum(flow, 0.0, out=flow)
         if routes is not None:
             self.routing.pass_on(flow, routes)

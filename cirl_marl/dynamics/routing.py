@@ -29,7 +29,7 @@ from cirl_marl.network.declared import itemised
 class Routes:
     """The shares of one control interval, in each copy."""
 
-    shares: Annotated[Floats, "of the arcs that leave nodes without stock, shape (arcs of ``Routing``, B or 1)"]
+    rate: Annotated[Floats, "of all arcs, which is their share of those that leave nodes without stock, (arcs, B or 1)"]
     kept: Annotated[Eliminated, "the kept nodes, eliminated"]
 
 
@@ -41,6 +41,8 @@ class Routing:
         arcs: the arcs that leave them.
         donors: which of the nodes each leaves.
         ends: what each enters: one of the nodes, or the number of nodes plus a store.
+        places: row of each node among the throughputs before elimination: constant nodes in their order, then the kept.
+        found: row of the donor of each of ``arcs`` among the throughputs.
         fixed: which of ``arcs`` have the same share in all copies and intervals.
         detours: the constant and the kept nodes.
     """
@@ -79,10 +81,10 @@ class Routing:
         early = len(detours.order)
         self._early = slice(0, early)
         place = {i: n for n, i in enumerate((*detours.order, *detours.kept))}
-        self._places = np.array([place[i] for i in range(self.nodes)], dtype=np.intp)
+        self.places: Integers = np.array([place[i] for i in range(self.nodes)], dtype=np.intp)
         entering = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
         shape = (self.nodes, len(network.arcs))
-        self._entering = RowSum(self._places[network.recipients[entering] - stores], entering, 1.0, shape)
+        self._entering = RowSum(self.places[network.recipients[entering] - stores], entering, 1.0, shape)
         gives = dict(zip(detours.order, detours.out, strict=True))
         self._ahead = woven(gives, place, self.nodes)
         self._among = woven(gives, {i: place[i] for i in detours.order}, self.nodes)
@@ -94,11 +96,11 @@ class Routing:
             for j, part in into.items():
                 comes[j][i] = part
         self._back = woven(comes, back, self.nodes)
-        self._found = np.where(self._places < early, early - 1 - self._places, self._places)[self.donors]
-        on = np.flatnonzero((self._places[self.donors] >= early) & (self.ends < self.nodes))
-        on = on[self._places[self.ends[on]] < early]
-        self._on, self._on_from = on, self._places[self.donors[on]] - early
-        self._on_to = RowSum(self._places[self.ends[on]], range(len(on)), 1.0, (self.nodes, len(on)))
+        self.found: Integers = np.where(self.places < early, early - 1 - self.places, self.places)[self.donors]
+        on = np.flatnonzero((self.places[self.donors] >= early) & (self.ends < self.nodes))
+        on = on[self.places[self.ends[on]] < early]
+        self._on, self._on_from = self.arcs[on], self.places[self.donors[on]] - early
+        self._on_to = RowSum(self.places[self.ends[on]], range(len(on)), 1.0, (self.nodes, len(on)))
 
     def _compile_shares(self, shares: Floats) -> None:
         """Write the shares between kept nodes as weighted sums of the shares of arcs."""
@@ -124,27 +126,31 @@ class Routing:
         return (self._constant or self._routes(rate)) if self.nodes else None
 
     def _routes(self, rate: Floats) -> Routes:
-        shares = rate.take(self.arcs, 0)
         values = np.repeat(self._given, rate.shape[1], axis=1)
-        self._entries.add_to(values, shares.take(self._varying, 0))
-        return Routes(shares, Eliminated(self.detours.elimination, values))
+        self._entries.add_to(values, rate.take(self.arcs[self._varying], 0))
+        return Routes(rate, Eliminated(self.detours.elimination, values))
 
     def pass_on(self, flow: Floats, routes: Routes) -> None:
         """Fill in what leaves the nodes without stock, given in place what enters them, shape (arcs, B)."""
+        sent = self.throughputs(self._entering(flow), routes).take(self.found, 0)
+        sent *= routes.rate.take(self.arcs, 0)
+        flow[self.arcs] = sent
+
+    def throughputs(self, through: Floats, routes: Routes) -> Floats:
+        """Return what passes through, in the rows of ``found``, for what enters, in ``places``, which is used up.
+
+        Shapes are (nodes, B).
+        """
         early, late = self._early, slice(self._early.stop, self.nodes)
-        through = self._entering(flow)
         found = np.empty_like(through)
         if late.start < late.stop:
             kept = found[late]
             kept[...] = self._ahead.substitute(through.copy())[late]
             routes.kept.throughput(kept)
-            self._on_to.add_to(through, kept.take(self._on_from, 0) * routes.shares.take(self._on, 0))
+            self._on_to.add_to(through, kept.take(self._on_from, 0) * routes.rate.take(self._on, 0))
         self._among.substitute(through)
         np.multiply(through[early][::-1], self._inverse, out=found[early])
-        self._back.substitute(found)
-        sent = found.take(self._found, 0)
-        sent *= routes.shares
-        flow[self.arcs] = sent
+        return self._back.substitute(found)
 
     def most(self, flow: Floats) -> Floats:
         """Return upper bounds of the throughputs if flows that enter are at most ``flow``, shape (arcs,).
@@ -154,5 +160,5 @@ class Routing:
         """
         passes = Passes(self._network)
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
-        entering = self._entering(flow[:, None])[self._places, 0]
+        entering = self._entering(flow[:, None])[self.places, 0]
         return np.full(self.nodes, float(entering @ total))

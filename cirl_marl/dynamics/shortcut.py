@@ -38,7 +38,7 @@ class Shortcut:
         self._drivers = laws.driver[self._flowing]
         donors = routing.donors.tolist()
         sent = [k for k, same in enumerate(routing.fixed) if donors[k] in place and not same]
-        self._sent = np.array(sent, dtype=np.intp)
+        self._sent = routing.arcs[sent]
         self._senders = np.array([place[donors[k]] for k in sent], dtype=np.intp)
 
         # nodes have the names that they have in ``detours``, and so has what stocks, the first of the masses, get
@@ -61,7 +61,7 @@ class Shortcut:
 
     def mean(self, stock: Floats, routes: Routes, rate: Floats) -> Floats:
         """Return the mean of the masses over the substep for constant ``rate``, shape (masses, B)."""
-        rates, shares = rate.take(self._flowing, 0), routes.shares.take(self._sent, 0)
+        rates, shares = rate.take(self._flowing, 0), routes.rate.take(self._sent, 0)
         work: Floats = np.empty((self._change.stop, stock.shape[1]))
         mean: Floats = work[self._masses]
         flows, kept = work[self._flows], work[self._kept]
