@@ -34,7 +34,8 @@ def cycle(seed: int, stores: int, passing: int, leak: float = 0.1, **episode: An
     for donor in names:
         ends = [str(end) for end in rng.permutation([name for name in names if name != donor])[: rng.integers(1, 5)]]
         parts = (rng.dirichlet(np.ones(len(ends))) * (1 - leak)).tolist()
-        changes = rng.integers(6)
+        parts[-1] *= float(rng.integers(2))
+        changes = rng.integers(6) if len(ends) > 1 else 6
         for k, (end, part) in enumerate(zip(ends, parts, strict=True)):
             options: dict[str, Any] = {"share": part}
             if changes == 0 and k == 0:

@@ -73,20 +73,19 @@ class Detours:
         """Eliminate all constant nodes, the cheapest first, then take back those that were better kept."""
         queue = [(self._cost(i), i) for i in constant]
         heapify(queue)
-        most, last = 0, set[int]()
+        most = entries = 0
         ways: list[tuple[float, int, list[int], Elimination]] = []
-        entries = 0
         while queue:
             cost, i = heappop(queue)
-            if i in last or cost != self._cost(i):
+            if i not in constant or cost != self._cost(i):
                 continue  # out of date: it stands in the queue again
             if cost > THRIFT * most:
                 ways.append(self._way(entries))
             most = max(most, cost)
             near = self._without(i)
-            last.add(i)
+            constant.remove(i)
             entries += len(self.out[-1])
-            for j in near & (constant - last):
+            for j in near & constant:
                 heappush(queue, (self._cost(j), j))
         ways.append(self._way(entries))
         _, count, self.kept, self.elimination = min(ways, key=lambda way: way[:2])

@@ -109,7 +109,7 @@ class Routing:
         same: list[tuple[int, int, float]] = []
         other: list[tuple[int, int, float]] = []
         for k, (i, end) in enumerate(zip(self.donors.tolist(), self.ends.tolist(), strict=True)):
-            if i in place:
+            if i in place and (shares[k] > 0 or not self.fixed[k]):
                 for j, part in reach.get(end, {end if end < self.nodes else -1: 1.0}).items():
                     if j != i:
                         entry = order.entry(place[i], place.get(j, -1))
