@@ -58,33 +58,77 @@ def random_network(arcs: int, seed: int = 0) -> Network:
     )
 
 
-def yearly_network(*, monthly: bool = False, stores: int = 100, passing: int = 400, seed: int = 0) -> Network:
-    """Return a yearly network of stocks with residence times of 5 to 50 years and of markets, most of them in loops.
+CHAIN: Mapping[str, Mapping[str, float | None]] = {
+    "mining": {"world ore": 0.4, "smelting": None},
+    "smelting": {"landfill": 0.03, "refining": None},
+    "refining": {"smelting": 0.05, "world metal": 0.25, "casting": None},
+    "casting": {"remelting": 0.03, "semis": None},
+    "semis": {"remelting": 0.1, "world semis": 0.2, "fabrication": None},
+    "fabrication": {"scrap_market": 0.15, "manufacturing": None},
+    "manufacturing": {"scrap_market": 0.05, "machines": 0.35, "vehicles": 0.25, "buildings": None},
+    "machines": {"landfill": 0.15, "collection": None},
+    "vehicles": {"landfill": 0.1, "collection": None},
+    "buildings": {"landfill": 0.2, "collection": None},
+    "collection": {"landfill": 0.05, "dismantling": None},
+    "dismantling": {"landfill": 0.05, "sorting": None},
+    "sorting": {"dismantling": 0.05, "landfill": 0.05, "scrap_market": None},
+    "scrap_market": {"world scrap": 0.2, "smelting": 0.1, "remelting": None},
+    "remelting": {"landfill": 0.02, "world metal": 0.1, "casting": None},
+}
+"""Where each process and stock of a region sends what share of its outflow, None being the rest."""
 
-    Each market passes what it gets to two others and to a stock, each stock what it releases to two markets; a tenth of
-    the markets have an agent that sets a share, a tenth of the stocks are fed from outside. Markets store nothing; if
-    ``monthly``, they hold what they get for a month instead.
+TRADED = {"ore": "smelting", "metal": "casting", "semis": "fabrication", "scrap": "sorting"}
+"""What world markets trade, and the process of each region that buys it."""
+
+IN_USE = {"machines": (5.0, 15.0), "vehicles": (10.0, 20.0), "buildings": (30.0, 50.0)}
+"""Range of the mean residence time in each stock in use, years."""
+
+
+def yearly_network(*, monthly: bool = False, regions: int = 33, seed: int = 0) -> Network:
+    """Return the cycle of a metal in some regions and on the world market: 500 nodes, 400 of them without stock.
+
+    It is modelled on the published cycles of steel, copper and aluminium (Cullen et al. 2012; Glöser et al. 2013): each
+    region mines, smelts, casts, makes products, collects and remelts them (``CHAIN``), with home scrap, new scrap and
+    the secondary smelter as loops of its own; four world markets join the regions, so that one loop holds ten processes
+    of each and three of the markets, 333 nodes. What is in use stays for 5 to 50 years (``IN_USE``); all the other
+    nodes pass on within the year what they get. Every fifth region has two agents, who set its import share of semis
+    and how much scrap it exports, and one agent sets what part of the world's scrap the first region gets.
+
+    Args:
+        monthly: whether the nodes without stock hold what they get for a month instead.
+        regions: number of regions.
+        seed: of residence times, mines, and shares in the world markets.
     """
     random = np.random.default_rng(seed)
-    asks = Control(kind=ControlKind.SHARE, low=0.1, neutral=0.3, high=0.5)
-    held = {"initial": (0.0, 0.0), "rate": 12.0} if monthly else {"stores": False}
-    years = random.uniform(5.0, 50.0, stores)
-    nodes = [Node(id=f"s{i}", initial=(50.0, 150.0), rate=1.0 / float(years[i])) for i in range(stores)]
-    nodes += [Node(id=f"m{j}", **held) for j in range(passing)]
-    arcs = []
-    for i in range(stores):
-        first, second = random.choice(passing, 2, replace=False)
-        arcs.append(Arc(id=f"s{i}_a", donor=f"s{i}", recipient=f"m{first}", law=Law.SHARE, share=0.6))
-        arcs.append(Arc(id=f"s{i}_b", donor=f"s{i}", recipient=f"m{second}", law=Law.SHARE))
-        if i % 10 == 0:
-            nodes.append(Node(id=f"mine{i}", role=Role.NONRENEWABLE_RESERVOIR))
-            arcs.append(Arc(id=f"feed{i}", donor=f"mine{i}", recipient=f"m{first}", law=Law.EXOGENOUS, flow=5.0))
-    for j in range(passing):
-        first, second = (j + 1 + random.choice(passing - 1, 2, replace=False)) % passing
-        share = {"control": asks} if j % 10 == 0 else {"share": 0.3}
-        arcs.append(Arc(id=f"m{j}_a", donor=f"m{j}", recipient=f"m{first}", law=Law.SHARE, **share))
-        arcs.append(Arc(id=f"m{j}_b", donor=f"m{j}", recipient=f"m{second}", law=Law.SHARE, share=0.2))
-        arcs.append(Arc(id=f"m{j}_c", donor=f"m{j}", recipient=f"s{random.integers(stores)}", law=Law.SHARE))
+    asked = Control(kind=ControlKind.SHARE, low=0.1, neutral=0.2, high=0.4)
+    held: dict[str, Any] = {"initial": (0.0, 0.0), "rate": 12.0} if monthly else {"stores": False}
+    nodes = [Node(id="deposits", role=Role.NONRENEWABLE_RESERVOIR), Node(id="landfill", role=Role.LANDFILL)]
+    arcs: list[Arc] = []
+    for i in range(regions):
+        for name, shares in CHAIN.items():
+            years = random.uniform(*IN_USE.get(name, (1.0, 1.0)))
+            used: dict[str, Any] = {"initial": (50.0, 150.0), "rate": 1.0 / years}
+            nodes.append(Node(id=f"{name}_{i}", **(used if name in IN_USE else held)))
+            for end, value in shares.items():
+                recipient = end.replace(" ", "_") if end.startswith("world") or end == "landfill" else f"{end}_{i}"
+                chosen: dict[str, Any] = {"share": value}
+                if i % 5 == 0 and (name, end) in (("scrap_market", "world scrap"), ("semis", "world semis")):
+                    chosen = {"control": asked}
+                donor = f"{name}_{i}"
+                arcs.append(
+                    Arc(id=f"{donor}_to_{recipient}", donor=donor, recipient=recipient, law=Law.SHARE, **chosen)
+                )
+        mined = float(random.uniform(1.0, 10.0))
+        arcs.append(Arc(id=f"ore_{i}", donor="deposits", recipient=f"mining_{i}", law=Law.EXOGENOUS, flow=mined))
+    for good, buyer in TRADED.items():
+        nodes.append(Node(id=f"world_{good}", **held))
+        parts = 0.6 * random.dirichlet(np.full(regions, 5.0))
+        for i, part in enumerate(parts.tolist()):
+            chosen = {"share": part if i + 1 < regions else None}
+            if good == "scrap" and i == 0:
+                chosen = {"control": asked}
+            name, buys = f"world_{good}", f"{buyer}_{i}"
+            arcs.append(Arc(id=f"{name}_to_{i}", donor=name, recipient=buys, law=Law.SHARE, **chosen))
     return Network(
         name="yearly",
         nodes=tuple(nodes),

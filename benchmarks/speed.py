@@ -26,11 +26,20 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from benchmarks.generated import FreeEnv, Weights, learn_alone, learn_together, random_network, simple_spread
+from benchmarks.generated import (
+    FreeEnv,
+    Weights,
+    learn_alone,
+    learn_together,
+    random_network,
+    simple_spread,
+    yearly_network,
+)
 from cirl_marl import parallel_env
 from cirl_marl.environments.parallel import NetworkParallelEnv
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.learners import load_recipe, train
+from cirl_marl.network import Network
 from cirl_marl.records.machine import processor
 
 console = Console(width=150)
@@ -52,6 +61,7 @@ class Measurement(StrEnum):
     SHARE = "share"
     LOCKSTEP = "lockstep"
     ARCS = "arcs"
+    YEARLY = "yearly"
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,8 +254,51 @@ def arcs() -> list[Figure]:
     return [*figures, Figure(what, f"{ratio:.1f}", "≤ 2", ratio <= 2, remark)]
 
 
+def yearly() -> list[Figure]:
+    """Measure a yearly cycle with 400 nodes without stock against the same with stocks in them, and copper_net."""
+    envs: dict[str, Network | str] = {
+        "cycle": yearly_network(),
+        "monthly": yearly_network(monthly=True),
+        "copper_net": "copper_net",
+    }
+    found = {name: VectorEnv(network, num_envs=COPIES) for name, network in envs.items()}
+    for env in found.values():
+        env.reset(seed=0)
+
+    def cost_of(env: VectorEnv, steps: int) -> Callable[[], float]:
+        actions = _actions(env.agents, (COPIES, 1))
+        return lambda: _seconds(lambda: env.step(actions), steps) / COPIES
+
+    steps = {"cycle": 10, "monthly": 1, "copper_net": 160}
+    cycle, monthly, copper = _interleaved(9, *(cost_of(found[name], steps[name]) for name in found))
+    arcs = len(found["cycle"].network.arcs), len(found["copper_net"].network.arcs)
+    faster = median(b / a for a, b in zip(cycle, monthly, strict=True))
+    dearer = median((a / arcs[0]) / (c / arcs[1]) for a, c in zip(cycle, copper, strict=True))
+    per_arc = [f"{1e9 * min(costs) / count:.0f} ns" for costs, count in zip((cycle, copper), arcs, strict=True)]
+    what = f"yearly cycle, {len(found['cycle'].network.nodes)} nodes, 400 without stock, 1 024 copies"
+    return [
+        Figure(
+            f"{what}: years/s", f"{1 / min(cycle):,.0f} ({1 / median(cycle):,.0f})", remark="best of rounds (median)"
+        ),
+        Figure(
+            "the same / with stocks of a month in the 400",
+            f"{faster:.0f} ×",
+            "≥ 15 ×",
+            faster >= 15,
+            f"with stocks: {1 / min(monthly):,.0f} years/s",
+        ),
+        Figure(
+            "cost per arc and copy, the same / copper_net",
+            f"{dearer:.2f} ×",
+            "≤ 2 ×",
+            dearer <= 2,
+            f"{per_arc[0]} in {arcs[0]:,} arcs, {per_arc[1]} in {arcs[1]}",
+        ),
+    ]
+
+
 MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
-    zip(Measurement, (batched, single, share, lockstep, arcs), strict=True)
+    zip(Measurement, (batched, single, share, lockstep, arcs, yearly), strict=True)
 )
 
 

@@ -185,7 +185,7 @@ class _Values:
         if not self._changing or self.rng.random() < 0.6:
             return value
         inside = np.sort(self.rng.uniform(0, self._length, self.rng.integers(0, 4)))
-        times = [-float(self.rng.integers(2)), *(inside + 1e-3), self._length + 1.0]
+        times = [-float(self.rng.integers(2)), *(inside + 1e-3), self._length + 2.0]  # tests lengthen intervals to 0.5
         values = value * self.rng.uniform(1.0, most, len(times))
         kind = str(self.rng.choice(["step", "linear"]))
         return Series(times=tuple(times), values=tuple(values.tolist()), interpolation=kind)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from fractions import Fraction
 from itertools import product
@@ -229,6 +230,24 @@ def test_series_of_shares_demands_and_bounds() -> None:
         expected = 7 * np.array([neutral, (0.2, 0.4)[step > 1], 1 - neutral - (0.2, 0.4)[step > 1]])
         np.testing.assert_allclose(outcome.flow[1:, 0], expected, rtol=1e-12)
         assert outcome.service_level[0] == pytest.approx(min(1.0, 7 * neutral))
+
+
+def test_what_never_changes_takes_one_column() -> None:
+    """A million intervals, an agent that acts and one that does not: no table of numbers that are all the same."""
+    arcs = [share("m0", "use", asking(0.0, 0.5, 1.0)), share("m0", "mine", 0.2)]
+    arcs += [share("m0", "m1", asking(0.0, 0.1, 0.3)), share("m0", "m2"), share("m1", "use"), share("m2", "use")]
+    network = markets(3, arcs, episode=Episode(horizon=1_000_000))
+    tracemalloc.start()
+    try:
+        env = VectorEnv(network, num_envs=2, agents=["m0_m1"])
+        env.reset(seed=0)
+        tracemalloc.reset_peak()
+        env.advance(env.stack(env.neutral_action))
+        env.local_rewards()
+        held, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < peak < 2_000_000  # a column of a million numbers takes 8 MB
 
 
 LOOP = [share("m0", "m1", asking(0.0, 0.5, 1.0)), share("m0", "use"), share("m1", "m0")]

@@ -24,7 +24,7 @@ from cirl_marl.dynamics.shares import Shares
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Arc, ControlKind, Law
-from cirl_marl.network.rowsum import RowSum
+from cirl_marl.network.rowsum import RowSum, narrowed
 from cirl_marl.network.series import Series, Value
 
 RATE, FLOW = ControlKind.RATE, ControlKind.FLOW
@@ -82,6 +82,7 @@ class FlowLaws:
         driven_to: stock that each of these fills; the number of stores where it is split or passed on.
         driven_rate: upper bound of r of each of these, of a split as a whole.
         turnover: upper bound of what each stock drives, relative to it, shape (stores,), 1/time.
+        fixed: arcs whose r is the same in all copies and intervals, shape (arcs,).
         routing: what passes through nodes that store nothing.
     """
 
@@ -107,14 +108,15 @@ class FlowLaws:
         self._series_arcs: Integers = np.array([k for k, _ in changing], dtype=np.intp)
         self._series = np.array([means for _, means in changing]).reshape(len(changing), network.episode.horizon)
         self._shares = Shares(network)
-        named = [*self._series_arcs, *(self._shares.arcs if self._shares.changing else ())]
+        named = [*self._series_arcs, *(self._shares.varying if self._shares.changing else ())]
         self.timed = tuple(network.arcs[k].id for k in named)
         self._bound_rates()
-        self.routing = Routing(network, self._constant_shares())
+        self._share_out()
+        self.routing = Routing(network, self.rate(self.neutral[:, :1]), self.fixed)
 
     def _bound_rates(self) -> None:
         """Bound what arcs carry and stocks drive with every control at its upper bound."""
-        self.max_rate: Floats = self._unshared(self.control_high.max(axis=1, keepdims=True))[:, 0]
+        self.max_rate: Floats = self._unshared(narrowed(self.control_high).max(axis=1, keepdims=True))[:, 0]
         if len(self._series_arcs):
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
         # the arcs of a split carry together what one of them would carry alone
@@ -128,11 +130,16 @@ class FlowLaws:
         self.turnover: Floats = np.bincount(self.driver[self.driven], self.driven_rate, stores).astype(float)
         self.max_rate[self._shares.arcs] *= self._shares.highest
 
-    def _constant_shares(self) -> Floats | None:
-        """Return the rates of all arcs, shape (arcs, 1), if no share is controlled or changes."""
-        if self._shares.changing or self._shares.controlled:
-            return None
-        return self.rate(self.neutral[:, :1])
+    def _share_out(self) -> None:
+        """Multiply constant shares into r, where no control comes before them, and find out which r never change."""
+        shares = self._shares
+        self.fixed = ~self.scheduled
+        self.fixed[self._acted] = False
+        once = ~np.isin(shares.constant, self._acted)
+        self._base[shares.constant[once]] *= shares.values[once]
+        self._constant_shares = shares.constant[~once], shares.values[~once]
+        self.fixed[self._series_arcs] = False
+        self.fixed[shares.varying] = False
 
     def rate(self, controls: Floats, step: Integers | None = None) -> Floats:
         """Return r of each arc, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
@@ -142,19 +149,35 @@ class FlowLaws:
             step: index of the control interval in each copy, shape (B,); without it time series count as 1.
         """
         rate = self._unshared(controls)
-        if len(self._shares.arcs):
-            rate[self._shares.arcs] *= self._shares(controls, step)
+        if len(self._constant_shares[0]):
+            arcs, shares = self._constant_shares
+            rate[arcs] *= shares
+        if len(self._shares.varying):
+            rate[self._shares.varying] *= self._shares(controls, step)
         if step is not None and len(self._series_arcs):
             rate[self._series_arcs] *= self._series[:, step]
         return rate
+
+    def neutral_in(self, step: Integers) -> Floats:
+        """Return the controls while nobody acts, in one interval of each copy, shape (controls, B)."""
+        table = narrowed(self.neutral)  # ``take`` would first write out what is broadcast
+        return table.take(step, axis=1) if table.shape[1] > 1 else np.repeat(table, len(step), axis=1)
 
     def _unshared(self, controls: Floats) -> Floats:
         """Return r, but for shares and time series."""
         if self._partial:  # some arc lacks a control: let a row of ones stand in for it
             controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
-        rate: Floats = controls.take(self._own_control, axis=0)
-        rate *= self._base
-        rate *= controls.take(self._donor_control, axis=0)
+        own, base, donor = self._own_control, self._base, self._donor_control
+        if sparse := 2 * len(self._acted) < len(base):
+            rate = np.empty((len(base), controls.shape[1]))
+            rate[...] = base
+            own, base, donor = own[self._acted], base[self._acted], donor[self._acted]
+        acted: Floats = controls.take(own, axis=0)
+        acted *= base
+        acted *= controls.take(donor, axis=0)
+        if not sparse:
+            return acted
+        rate[self._acted] = acted
         return rate
 
     def flow(self, stock: Floats, rate: Floats) -> Floats:
@@ -187,3 +210,4 @@ class FlowLaws:
         rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
         self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
         self._partial = bool((rows == none).any())
+        self._acted: Integers = np.flatnonzero((rows < none).any(axis=1))

@@ -13,7 +13,8 @@ import numpy as np
 from cirl_marl.dynamics.batches import BatchTransport
 from cirl_marl.dynamics.inner import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.routing import Eliminated
+from cirl_marl.dynamics.routing import Routes
+from cirl_marl.dynamics.taylor import Taylor
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declared import itemised
@@ -22,9 +23,6 @@ from cirl_marl.network.rowsum import RowSum, disposable
 
 MAX_TURNOVER = 1.0
 """Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
-
-TRUNCATION = 1e-13
-"""Bound on the first neglected term of the exact solver's series, relative to the mass in the network."""
 
 Passing = Callable[..., Floats]
 """``(rate, settled) → moved``: mass that a substep moves along each arc; flows in ``settled`` hold, but for NaN."""
@@ -50,11 +48,9 @@ class Transition:
 class Dynamics(FlowLaws):
     """Moves mass along the arcs and advances the inner physics.
 
-    ``exact`` solves ẋ = S(r ∘ y[driver]) for constant r by its Taylor series, summed in Horner form for the mean of
-    the state over the substep, ȳ = x + (h/2)·ẋ(x + (h/3)·ẋ(x + …)); the mass moved is h·r∘ȳ[driver]. A node turns over
-    at most its stock in a substep, so the series is free of cancellation, and it is cut where the neglected term is
-    below ``TRUNCATION``. ``rk4`` and ``euler`` take stocks and inner states together. In the physical mode (all but
-    ``euler``) no flow is negative or exceeds what its donor holds.
+    ``exact`` solves ẋ = S(r ∘ y[driver]) for constant r by its Taylor series (``taylor``). ``rk4`` and ``euler`` take
+    stocks and inner states together. In the physical mode (all but ``euler``) no flow is negative or exceeds what its
+    donor holds.
 
     Attributes:
         inner: the models of the compartments.
@@ -71,41 +67,24 @@ class Dynamics(FlowLaws):
         self.inner, self.batches = InnerPhysics(network, rows), BatchTransport(network, rows)
         episode = network.episode
         self.physical = episode.solver != "euler"
-        self._exact = episode.solver == "exact"
         fastest = float(self.turnover.max(initial=0.0))
         self._check_turnover(self.turnover)
-        if self._exact:
+        exact = episode.solver == "exact"
+        if exact:
             self.substeps = max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
         else:
             assert episode.solver_step is not None
             self.substeps = round(episode.control_interval / episode.solver_step)
         self.substep = episode.control_interval / self.substeps
-        self.terms = self._series_terms() if self._exact else 0
-        self._horner = [self.incidence.scaled(self.substep / k) for k in range(self.terms, 1, -1)]
+        self._taylor = Taylor(self, self.substep) if exact else None
+        self.terms = self._taylor.terms if self._taylor is not None else 0
         shape = (rows.masses, len(network.arcs))
         self._outgoing = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
-        self._pulls = Law.RECIPIENT in laws
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
         self._timed = (*self.timed, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
         self._compile_orders()
-
-    def _series_terms(self) -> int:
-        """Smallest K ≥ 2 for which the first neglected term of the mean, ‖|A|^K‖₁·h^K/(K + 1)!, is ≤ TRUNCATION.
-
-        A, entry by entry, is largest in absolute value with every control at its upper bound, so that bound serves all.
-        What is split, or enters a node that stores nothing, is taken to go where it drives most.
-        """
-        stores, donors = self.rows.nodes.stop, self.network.donors[self.driven]
-        reach, term, k = np.ones(stores), 1.0, 0
-        while term > TRUNCATION or k < 2:
-            k += 1
-            ends = np.append(reach, reach.max(initial=0.0))[self.driven_to]
-            moved = self.driven_rate * (reach[donors] + ends) * self.substep
-            reach = np.bincount(self.driver[self.driven], weights=moved, minlength=stores) / (k + 1)
-            term = float(reach.max(initial=0.0))
-        return k
 
     def _check_turnover(self, turnover: Floats) -> None:
         """Refuse rates that the solver cannot follow, naming the fastest node, its rate and the largest usable step."""
@@ -165,8 +144,8 @@ class Dynamics(FlowLaws):
         total = None
         for _ in range(self.substeps):
             realised = self._limit_orders(stock, rate) if self.physical else rate
-            if self._exact:
-                stock, moved, realised = self._settle(stock, realised, partial(self._moved_exactly, stock, routes))
+            if self._taylor is not None:
+                stock, moved, realised = self._settle(stock, realised, partial(self._taylor.moved, stock, routes))
             else:
                 stock, inner, moved, realised = self._explicit_step(stock, inner, realised, routes, controls)
             total = moved if total is None else total + moved
@@ -209,21 +188,21 @@ class Dynamics(FlowLaws):
             self.routing.pass_on(flow, routes)
         return flow
 
-    def _flow_at(
-        self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Eliminated | None
-    ) -> Floats:
+    def _flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Routes | None) -> Floats:
+        if self._taylor is not None:
+            return self._taylor.flow(stock, routes, rate)
         return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate), routes)
 
-    def _forward(self, flow: Floats, routes: Eliminated | None) -> Floats:
+    def _forward(self, flow: Floats, routes: Routes | None) -> Floats:
         """Stop, in place, flows that a model or the stage of a solver would reverse, and pass on what is left."""
-        if self.physical and not self._exact:
+        if self.physical:
             np.maximum(flow, 0.0, out=flow)
         if routes is not None:
             self.routing.pass_on(flow, routes)
         return flow
 
     def _explicit_step(
-        self, stock: Floats, inner: Floats, rate: Floats, routes: Eliminated | None, controls: Floats
+        self, stock: Floats, inner: Floats, rate: Floats, routes: Routes | None, controls: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Take one Runge-Kutta step of stocks and inner states together; models with a step of their own go ahead."""
         h = self.substep
@@ -253,29 +232,6 @@ class Dynamics(FlowLaws):
             moved = passing(rate)
             after = self.incidence.add_to(stock.copy(), moved)
         return after, self.inner.moved(ahead, change), moved, rate
-
-    def _moved_exactly(
-        self, stock: Floats, routes: Eliminated | None, rate: Floats, settled: Floats | None = None
-    ) -> Floats:
-        """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep.
-
-        Flows given in ``settled``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
-        """
-        mean, moved = stock.copy(), np.empty_like(rate)
-        for incidence in (*self._horner, None):
-            mean.take(self.driver, axis=0, out=moved, mode="clip")
-            moved *= rate
-            if settled is not None:
-                np.copyto(moved, settled, where=~np.isnan(settled))
-            if routes is not None:
-                self.routing.pass_on(moved, routes)
-            if incidence is not None:
-                mean[...] = stock
-                incidence.add_to(mean, moved)
-        moved *= self.substep
-        if self._pulls:
-            np.maximum(moved, 0.0, out=moved)  # the mean of an overdrawn stock may be negative
-        return moved
 
     def _limit_orders(self, stock: Floats, rate: Floats) -> Floats:
         """Cut scheduled flows so that no donor is overdrawn.
@@ -311,7 +267,7 @@ class Dynamics(FlowLaws):
         if after.min() >= 0:
             return after, moved, rate
         held = disposable(stock, self._busiest)
-        settled = np.full_like(moved, np.nan)
+        settled, cut_copies = np.full_like(moved, np.nan), np.zeros(moved.shape[1], dtype=bool)
         while (after < 0).any():  # asked of every copy, as a NaN in one says nothing of the others
             out = self._outgoing(moved)
             short = (after < 0) & (out > 0)
@@ -320,6 +276,8 @@ class Dynamics(FlowLaws):
             cut = short.take(self.rows.donors, axis=0)
             settled[cut] = (moved * share)[cut] / self.substep
             rate = rate * share
-            moved = passing(rate, settled)
+            # the copies in which nothing was cut keep what they have, to the bit
+            cut_copies |= short.any(axis=0)
+            moved = np.where(cut_copies, passing(rate, settled), moved)
             after = self.incidence.add_to(stock.copy(), moved)
         return after, moved, rate

@@ -38,7 +38,7 @@ class Passes:
         self._splits: list[tuple[int, Split, Integers]] = [
             (i, split, network.recipients[[*split.controlled, *split.others]] - stores) for i, split in found if i >= 0
         ]
-        tables = [np.concatenate([*split.bounds, split.proportions]) for _, split, _ in self._splits]
+        tables = [table for _, split, _ in self._splits if (table := split.table).shape[1] > 1]
         self.kinds: Sequence[int] = [0]
         if tables:
             self.kinds = np.unique(np.concatenate(tables), axis=1, return_index=True)[1].tolist()

@@ -1,75 +1,36 @@
 """What passes through nodes that store nothing: q = (I − Pᵀ)⁻¹ b, with loops, for many copies at once.
 
 b is what enters such nodes from stocks, by schedule or from models, P_ij the share of what passes through i that goes
-on to j. I − P is a singular M-matrix with what leaves the set taken out, so Gaussian elimination needs no pivots; and
-as the shares of a node sum to 1, its pivot 1 − P_ii is the sum of its other shares (Grassmann, Taksar, Heyman 1985):
-nothing is ever subtracted, and every throughput is accurate to a few roundings however much goes round in loops.
+on to j. I − P is a singular M-matrix with what leaves the set taken out, so Gaussian elimination needs no pivots, and
+every throughput is accurate to a few roundings however much goes round in loops (``elimination``).
 
-The order of elimination is found once. Nodes that are not neighbours are eliminated in the same round, a handful of
-array operations over all of them and all copies, so a column's bits do not depend on the batch it is in.
+Most shares are the same in all copies and intervals. Nodes all of whose shares are *constant* are eliminated once
+(``detours``); what is left to do in each copy and interval are the *kept* nodes, whose shares are then those of their
+arcs and of the detours through constant nodes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cirl_marl.dynamics.detours import Detours, Parts, woven
+from cirl_marl.dynamics.elimination import Eliminated
 from cirl_marl.dynamics.passes import Passes
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.declared import itemised
 
-COSTLY = 2
-"""A round eliminates nodes that are at most this many times as costly as the cheapest."""
-
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class _Round:
-    """Nodes that are eliminated together, and the shares of theirs that are left then."""
+class Routes:
+    """The shares of one control interval, in each copy."""
 
-    nodes: Annotated[Integers, "the nodes"]
-    out: Annotated[Integers, "entries of the shares that they give to nodes eliminated later"]
-    giver: Annotated[Integers, "which of ``nodes`` each belongs to"]
-    given: Annotated[RowSum, "sum of ``out`` for each of ``nodes``"]
-    into: Annotated[Integers, "entries of the shares that they get from nodes eliminated later"]
-    getter: Annotated[Integers, "which of ``nodes`` each belongs to"]
-    first: Annotated[Integers, "of each detour past a node of the round, its way in, among ``into``"]
-    second: Annotated[Integers, "and its way out, among ``out`` and then ``nodes`` for what leaves the set"]
-    detours: Annotated[RowSum, "adds the detours to the entries of the shares that they make up"]
-    forward: Annotated[RowSum, "adds what ``out`` carries to the nodes that get it"]
-    donors: Annotated[Integers, "node that gives each of ``out``"]
-    backward: Annotated[RowSum, "adds what ``into`` carries to ``nodes``"]
-    sources: Annotated[Integers, "node that gives each of ``into``"]
-
-
-class Eliminated:
-    """The eliminated shares of one control interval, in each copy."""
-
-    def __init__(self, rounds: Iterable[_Round], values: Floats, shares: Floats, nodes: int) -> None:
-        """Eliminate ``values``, shape (entries, B or 1): of each node what leaves the set, then the shares."""
-        self.shares, self._steps = shares, []
-        self._inverse = np.empty((nodes, values.shape[1]))
-        for each in rounds:
-            out, into, leaving = values.take(each.out, 0), values.take(each.into, 0), values.take(each.nodes, 0)
-            inverse = 1.0 / each.given.add_to(leaving.copy(), out)
-            out *= inverse.take(each.giver, 0)
-            leaving *= inverse
-            each.detours.add_to(values, into.take(each.first, 0) * np.concatenate([out, leaving]).take(each.second, 0))
-            into *= inverse.take(each.getter, 0)
-            self._inverse[each.nodes] = inverse
-            self._steps.append((each, out, into))
-
-    def throughput(self, inflow: Floats) -> Floats:
-        """Return q for what enters from elsewhere, shape (nodes, B), which is used up."""
-        for each, out, _ in self._steps:
-            each.forward.add_to(inflow, inflow.take(each.donors, 0) * out)
-        inflow *= self._inverse
-        for each, _, into in reversed(self._steps):
-            each.backward.add_to(inflow, inflow.take(each.sources, 0) * into)
-        return inflow
+    rate: Annotated[Floats, "of all arcs, which is their share of those that leave nodes without stock, (arcs, B or 1)"]
+    kept: Annotated[Eliminated, "the kept nodes, eliminated"]
 
 
 class Routing:
@@ -77,40 +38,119 @@ class Routing:
 
     Attributes:
         nodes: number of nodes without stock.
-        arcs: the arcs that leave them, in the order of ``shares`` of ``Eliminated``.
+        arcs: the arcs that leave them.
         donors: which of the nodes each leaves.
+        ends: what each enters: one of the nodes, or the number of nodes plus a store.
+        places: row of each node among the throughputs before elimination: constant nodes in their order, then the kept.
+        found: row of the donor of each of ``arcs`` among the throughputs.
+        fixed: which of ``arcs`` have the same share in all copies and intervals.
+        detours: the constant and the kept nodes.
     """
 
-    def __init__(self, network: Network, constant: Floats | None) -> None:
-        """Find the order of elimination.
+    def __init__(self, network: Network, rate: Floats, fixed: NDArray[np.bool_]) -> None:
+        """Eliminate the constant nodes, and find the order of elimination of the others.
 
         Args:
             network: whose nodes they are.
-            constant: rates of all arcs, shape (arcs, 1), if no share of ``arcs`` ever changes.
+            rate: rates of all arcs in one interval, shape (arcs, 1).
+            fixed: whether they are the same in all copies and intervals, shape (arcs,).
         """
         stores, self._network = len(network.stores), network
         self.nodes = len(network.nodes) - stores
         self.arcs: Integers = np.flatnonzero(network.donors >= stores)
         self.donors: Integers = network.donors[self.arcs] - stores
+        ends = network.recipients[self.arcs] - stores
+        self.ends: Integers = np.where(ends < 0, ends + stores + self.nodes, ends)
+        self.fixed = fixed[self.arcs]
+        shares = rate[self.arcs, 0]
+        gives: dict[int, Parts] = {i: {} for i in range(self.nodes)}
+        for i, j, share, same in zip(
+            self.donors.tolist(), self.ends.tolist(), shares.tolist(), self.fixed, strict=True
+        ):
+            if share > 0 or not same:
+                gives[i][j] = gives[i].get(j, 0.0) + share
+        constant = set(range(self.nodes)).difference(self.donors[~self.fixed].tolist())
+        self.detours = Detours(self.nodes, constant, gives)
+        self._compile_passing()
+        self._compile_shares(shares)
+        self._constant = self._routes(rate) if self.fixed.all() else None
+
+    def _compile_passing(self) -> None:
+        """Arrange throughputs in the order in which constant nodes are eliminated; the kept ones follow."""
+        detours, network, stores = self.detours, self._network, len(self._network.stores)
+        early = len(detours.order)
+        self._early = slice(0, early)
+        place = {i: n for n, i in enumerate((*detours.order, *detours.kept))}
+        self.places: Integers = np.array([place[i] for i in range(self.nodes)], dtype=np.intp)
         entering = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
         shape = (self.nodes, len(network.arcs))
-        self._entering = RowSum(network.recipients[entering] - stores, entering, 1.0, shape)
-        pairs = list(zip(self.donors.tolist(), (network.recipients[self.arcs] - stores).tolist(), strict=True))
-        order = _Elimination(self.nodes, pairs)
-        self._rounds = order.rounds
-        columns = np.arange(len(pairs))
-        self._entries = RowSum([order.entry(i, j) for i, j in pairs], columns, 1.0, (order.size, len(pairs)))
-        self._constant = None if constant is None else self._routes(constant)
+        self._entering = RowSum(self.places[network.recipients[entering] - stores], entering, 1.0, shape)
+        gives = dict(zip(detours.order, detours.out, strict=True))
+        self._ahead = woven(gives, place, self.nodes)
+        self._among = woven(gives, {i: place[i] for i in detours.order}, self.nodes)
+        # throughputs follow from the last to the first: their rows are in the opposite order
+        self._inverse = np.array(detours.inverse)[::-1, None]
+        back = {i: early - 1 - place[i] for i in detours.order}
+        comes: dict[int, Parts] = {i: {} for i in detours.order}
+        for i, into in zip(detours.order, detours.into, strict=True):
+            for j, part in into.items():
+                comes[j][i] = part
+        self._back = woven(comes, back, self.nodes)
+        self.found: Integers = np.where(self.places < early, early - 1 - self.places, self.places)[self.donors]
+        on = np.flatnonzero((self.places[self.donors] >= early) & (self.ends < self.nodes))
+        on = on[self.places[self.ends[on]] < early]
+        self._on, self._on_from = self.arcs[on], self.places[self.donors[on]] - early
+        self._on_to = RowSum(self.places[self.ends[on]], range(len(on)), 1.0, (self.nodes, len(on)))
 
-    def routes(self, rate: Floats) -> Eliminated | None:
+    def _compile_shares(self, shares: Floats) -> None:
+        """Write the shares between kept nodes as weighted sums of the shares of arcs."""
+        detours, order = self.detours, self.detours.elimination
+        place, reach = {i: n for n, i in enumerate(detours.kept)}, detours.reach()
+        same: list[tuple[int, int, float]] = []
+        other: list[tuple[int, int, float]] = []
+        for k, (i, end) in enumerate(zip(self.donors.tolist(), self.ends.tolist(), strict=True)):
+            if i in place and (shares[k] > 0 or not self.fixed[k]):
+                for j, part in reach.get(end, {end if end < self.nodes else -1: 1.0}).items():
+                    if j != i:
+                        entry = order.entry(place[i], place.get(j, -1))
+                        (same if self.fixed[k] else other).append((entry, k, part))
+        given = [part * shares[k] for _, k, part in same]
+        self._given = np.bincount([entry for entry, _, _ in same], given, order.size).astype(float)[:, None]
+        self._varying = np.array(sorted({k for _, k, _ in other}), dtype=np.intp)
+        columns = np.searchsorted(self._varying, [k for _, k, _ in other])
+        weights = [part for _, _, part in other]
+        self._entries = RowSum([entry for entry, _, _ in other], columns, weights, (order.size, len(self._varying)))
+
+    def routes(self, rate: Floats) -> Routes | None:
         """Return what to pass flows on with while ``rate``, shape (arcs, B), holds; None if every node stores."""
         return (self._constant or self._routes(rate)) if self.nodes else None
 
-    def pass_on(self, flow: Floats, routes: Eliminated) -> None:
+    def _routes(self, rate: Floats) -> Routes:
+        values = np.repeat(self._given, rate.shape[1], axis=1)
+        self._entries.add_to(values, rate.take(self.arcs[self._varying], 0))
+        return Routes(rate, Eliminated(self.detours.elimination, values))
+
+    def pass_on(self, flow: Floats, routes: Routes) -> None:
         """Fill in what leaves the nodes without stock, given in place what enters them, shape (arcs, B)."""
-        through = routes.throughput(self._entering(flow)).take(self.donors, 0)
-        through *= routes.shares
-        flow[self.arcs] = through
+        sent = self.throughputs(self._entering(flow), routes).take(self.found, 0)
+        sent *= routes.rate.take(self.arcs, 0)
+        flow[self.arcs] = sent
+
+    def throughputs(self, through: Floats, routes: Routes) -> Floats:
+        """Return what passes through, in the rows of ``found``, for what enters, in ``places``, which is used up.
+
+        Shapes are (nodes, B).
+        """
+        early, late = self._early, slice(self._early.stop, self.nodes)
+        found = np.empty_like(through)
+        if late.start < late.stop:
+            kept = found[late]
+            kept[...] = self._ahead.substitute(through.copy())[late]
+            routes.kept.throughput(kept)
+            self._on_to.add_to(through, kept.take(self._on_from, 0) * routes.rate.take(self._on, 0))
+        self._among.substitute(through)
+        np.multiply(through[early][::-1], self._inverse, out=found[early])
+        return self._back.substitute(found)
 
     def most(self, flow: Floats) -> Floats:
         """Return upper bounds of the throughputs if flows that enter are at most ``flow``, shape (arcs,).
@@ -120,88 +160,5 @@ class Routing:
         """
         passes = Passes(self._network)
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
-        return np.full(self.nodes, float(self._entering(flow[:, None])[:, 0] @ total))
-
-    def _routes(self, rate: Floats) -> Eliminated:
-        shares = rate.take(self.arcs, 0)
-        return Eliminated(self._rounds, self._entries(shares), shares, self.nodes)
-
-
-class _Elimination:
-    """Finds a sparse order: in each round nodes that are no neighbours and make few detours."""
-
-    def __init__(self, nodes: int, pairs: Iterable[tuple[int, int]]) -> None:
-        """Take the shares as pairs of nodes (from, to); ``to`` is negative for what leaves the set."""
-        self._place: dict[tuple[int, int], int] = {}
-        self._nodes, self.size = nodes, nodes
-        self._gives: list[set[int]] = [set() for _ in range(nodes)]
-        self._gets: list[set[int]] = [set() for _ in range(nodes)]
-        for i, j in pairs:
-            self._join(i, j)
-        self.rounds: list[_Round] = []
-        left = set(range(nodes))
-        while left:
-            chosen = self._independent(left)
-            self.rounds.append(self._eliminated(chosen))
-            left.difference_update(chosen)
-
-    def entry(self, i: int, j: int) -> int:
-        """Return the entry of the share that i gives to j; the first ones are what leaves the set."""
-        return i if j < 0 else self._place[i, j]
-
-    def _join(self, i: int, j: int) -> int:
-        if j < 0:
-            return i
-        if (i, j) not in self._place:
-            self._place[i, j] = self.size
-            self.size += 1
-            self._gives[i].add(j)
-            self._gets[j].add(i)
-        return self._place[i, j]
-
-    def _independent(self, left: set[int]) -> list[int]:
-        cost = {i: len(self._gives[i]) * len(self._gets[i]) for i in left}
-        most = COSTLY * min(cost.values())
-        chosen: list[int] = []
-        near: set[int] = set()
-        for i in sorted((i for i in left if cost[i] <= most), key=lambda i: (cost[i], i)):
-            if i not in near:
-                chosen.append(i)
-                near |= self._gives[i] | self._gets[i]
-        return chosen
-
-    def _eliminated(self, chosen: list[int]) -> _Round:
-        out = [(n, i, k) for n, i in enumerate(chosen) for k in sorted(self._gives[i])]
-        into = [(n, j, i) for n, i in enumerate(chosen) for j in sorted(self._gets[i])]
-        out_entries = [self.entry(i, k) for _, i, k in out]
-        into_entries = [self.entry(j, i) for _, j, i in into]
-        ways: list[list[tuple[int, int]]] = [[(len(out) + n, -1)] for n in range(len(chosen))]
-        for place, (n, _, k) in enumerate(out):
-            ways[n].append((place, k))
-        detours = [(way_in, way_out, j, k) for way_in, (n, j, _) in enumerate(into) for way_out, k in ways[n] if k != j]
-        for i in chosen:
-            for k in self._gives[i]:
-                self._gets[k].discard(i)
-            for j in self._gets[i]:
-                self._gives[j].discard(i)
-        made = [self._join(j, k) for _, _, j, k in detours]
-        # entries that later rounds add are beyond those of now; the array of values has room for all of them
-        return _Round(
-            nodes=_places(chosen),
-            out=_places(out_entries),
-            giver=_places(n for n, _, _ in out),
-            given=RowSum([n for n, _, _ in out], range(len(out)), 1.0, (len(chosen), len(out))),
-            into=_places(into_entries),
-            getter=_places(n for n, _, _ in into),
-            first=_places(way for way, _, _, _ in detours),
-            second=_places(way for _, way, _, _ in detours),
-            detours=RowSum(made, range(len(made)), 1.0, (self.size, len(made))),
-            forward=RowSum([k for _, _, k in out], range(len(out)), 1.0, (self._nodes, len(out))),
-            donors=_places(i for _, i, _ in out),
-            backward=RowSum([i for _, _, i in into], range(len(into)), 1.0, (self._nodes, len(into))),
-            sources=_places(j for _, j, _ in into),
-        )
-
-
-def _places(numbers: Iterable[int]) -> Integers:
-    return np.array(list(numbers), dtype=np.intp)
+        entering = self._entering(flow[:, None])[self.places, 0]
+        return np.full(self.nodes, float(entering @ total))

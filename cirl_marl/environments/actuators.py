@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.rowsum import spans
+from cirl_marl.network.rowsum import narrowed, spans
 
 BOUND = 1.0 + 1e-6
 """Largest action taken: wrappers that rescale actions do so in single precision and may land a rounding beyond 1."""
@@ -38,18 +38,21 @@ class Actuators:
         self.acting: Integers = np.array(acting, dtype=np.intp)
         self.spaces = {a: Box(-1.0, 1.0, (each.stop - each.start,), np.float32) for a, each in rows.items()}
         self._all_act = self.acting.tolist() == list(range(len(laws.neutral)))
-        self._neutral = laws.neutral
-        low, high = laws.control_low[self.acting], laws.control_high[self.acting]
-        bounds = (low, (high + low) / 2, (high - low) / 2, high)
-        self._varying = any(bool((each != each[:, :1]).any()) for each in (*bounds, laws.neutral))
+        low, neutral, high = (narrowed(each) for each in (laws.control_low, laws.neutral, laws.control_high))
+        low, high = low[self.acting], high[self.acting]
+        tables: tuple[Floats, ...] = (low, (high + low) / 2, (high - low) / 2, high, neutral)
+        self._varying = any(bool((each != each[:, :1]).any()) for each in tables)
         # one value per copy: NumPy takes equal shapes about twice as fast as it broadcasts a column
         first = np.zeros(num_envs, dtype=np.intp)
-        self._bounds = bounds if self._varying else tuple(each.take(first, axis=1) for each in bounds)
+        if not self._varying:
+            tables = tuple(each.take(first, axis=1) for each in tables)
+        *self._bounds, self._neutral = tables
 
     def neutral_action(self, step: Integers) -> dict[str, Floats]:
         """Normalised action of each agent that leaves it neutral, shape (B, entries) each, in an interval of each."""
         _, middle, half, _ = self._held(step)
-        distance = self._neutral.take(step, axis=1)[self.acting] - middle
+        neutral = self._neutral.take(step, axis=1) if self._varying else self._neutral
+        distance = neutral[self.acting] - middle
         neutral = np.divide(distance, half, out=np.zeros_like(distance), where=half > 0)
         np.clip(neutral, -1.0, 1.0, out=neutral)  # rounding may lead beyond a bound
         return self.unstack(neutral)
@@ -98,7 +101,7 @@ class Actuators:
         np.minimum(acting, high, out=acting)
         if self._all_act:
             return acting
-        controls: Floats = self._neutral.take(step, axis=1)
+        controls: Floats = self._neutral.take(step, axis=1) if self._varying else self._neutral.copy()
         controls[self.acting] = acting
         return controls
 

@@ -100,10 +100,10 @@ class Credit:
 
     def _imagined(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
         dynamics, count, batch = self._dynamics, len(agents), controls.shape[1]
-        imagined = np.tile(controls, (1, count))
+        imagined, neutral = np.tile(controls, (1, count)), dynamics.neutral_in(state.step)
         for i, agent in enumerate(agents):
             rows = dynamics.network.control_rows[agent]
-            imagined[rows, i * batch : (i + 1) * batch] = dynamics.neutral[rows].take(state.step, axis=1)
+            imagined[rows, i * batch : (i + 1) * batch] = neutral[rows]
         transition = dynamics.advance(
             np.tile(state.stock, (1, count)), np.tile(state.inner, (1, count)), imagined, np.tile(state.step, count)
         )

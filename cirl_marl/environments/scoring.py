@@ -37,11 +37,10 @@ class Scoring:
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         services = network.services
         self._measure = _measurement(network, layout)
-        bands = [np.array([network.held(getattr(s, end)) for s in services]) for end in ("low", "high")]
-        self._low, self._high = (each.reshape(len(services), network.episode.horizon) for each in bands)
         self._varying = any(isinstance(band, Series) for s in services for band in (s.low, s.high))
-        if not self._varying:
-            self._low, self._high = self._low[:, :1], self._high[:, :1]
+        width = network.episode.horizon if self._varying else 1
+        bands = [np.array([network.held(getattr(s, end))[:width] for s in services]) for end in ("low", "high")]
+        self._low, self._high = (each.reshape(len(services), width) for each in bands)
         self._bounded = bool(np.isfinite(self._high).any())
         modelled = [position[c.id] for c in compartments if c.model is not None]
         count = len(compartments)

@@ -220,7 +220,7 @@ class VectorEnv:
         state = self.physical
         done = np.maximum(state.step - 1, 0)  # the interval that the state is scored in
         quantities = self._quantities(state)
-        inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral.take(done, axis=1))
+        inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral_in(done))
         levels = self.scoring.levels(quantities, done)
         rewards = self.scoring.local_of_all(self.scoring.terms(quantities, levels, inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
@@ -284,7 +284,7 @@ class VectorEnv:
         dynamics, batch = self.dynamics, drawn.shape[1]
         stocks, inner = self.rows.split(drawn)
         stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
-        neutral = dynamics.neutral.take(step, axis=1)
+        neutral = dynamics.neutral_in(step)
         flow, measures = dynamics.start_flow(stock, inner, neutral), dynamics.inner.measures(inner, neutral)
         sums = (np.zeros(shape) for shape in ((2, batch), (batch,), (len(self.network.services), batch)))
         return State(stock, inner, flow, measures, step, *sums)

@@ -30,6 +30,11 @@ def spans(sizes: Iterable[int]) -> list[slice]:
     return [slice(first, last) for first, last in pairwise(np.cumsum([0, *sizes]).tolist())]
 
 
+def narrowed(table: Floats) -> Floats:
+    """Return the one column of a table over intervals that was broadcast to all of them; others as they are."""
+    return table[..., :1] if table.strides[-1] == 0 else table
+
+
 def disposable(stock: Floats, parts: int) -> Floats:
     """Return the mass that a stock can give away in so many parts without their rounding overdrawing it."""
     return np.where(stock > NOTHING, stock * (1.0 - max(1e-12, 4.0 * np.finfo(float).eps * parts)), 0.0)
@@ -62,6 +67,14 @@ class RowSum:
         else:
             csc_matvecs(*self.shape, batch, *entries, values, result)
         return result
+
+    def substitute(self, values: Floats) -> Floats:
+        """Replace ``values``, shape (rows, B), by (I − W)⁻¹ values, for W square and strictly lower triangular.
+
+        The kernels go through the columns in their order and add as they go: when it is a row's turn to be passed on,
+        all that the rows before it pass to it has been added.
+        """
+        return self.add_to(values, values)
 
     def scaled(self, factor: float) -> RowSum:
         """Return factor·W."""

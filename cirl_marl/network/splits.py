@@ -19,7 +19,8 @@ import numpy as np
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Law
 from cirl_marl.network.parts import Parts
-from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.rowsum import Floats, narrowed
+from cirl_marl.network.series import Series
 
 LEAST = 1e-9
 """Share that has to leave a loop in each round at the least; a smaller one is taken for a rounding of none."""
@@ -30,7 +31,7 @@ SUMS = 1e-6
 @itemised
 @dataclass(frozen=True, slots=True)
 class Split:
-    """The arcs that share what leaves one node."""
+    """The arcs that share what leaves one node; where nothing changes its tables are views of one column."""
 
     donor: Annotated[str, "the node"]
     controlled: Annotated[tuple[int, ...], "arcs whose shares controls set, by position"]
@@ -41,13 +42,19 @@ class Split:
     @property
     def proportions(self) -> Floats:
         """Return π of the other arcs, which sum to 1, shape (others, horizon)."""
-        left = np.maximum(1.0 - self.bounds[1].sum(axis=0) - np.nansum(self.given, axis=0), 0.0)
-        weights = np.where(np.isnan(self.given), left, self.given)
+        bounds, given = narrowed(self.bounds), narrowed(self.given)
+        left = np.maximum(1.0 - bounds[1].sum(axis=0) - np.nansum(given, axis=0), 0.0)
+        weights = np.where(np.isnan(given), left, given)
         total = weights.sum(axis=0)
         # where neutral control leaves nothing to them, the one of the rest takes what there may be
-        weights = np.where(total > 0, weights, np.isnan(self.given))
-        proportions: Floats = weights / weights.sum(axis=0)
-        return proportions
+        weights = np.where(total > 0, weights, np.isnan(given))
+        return np.broadcast_to(weights / weights.sum(axis=0), self.given.shape)
+
+    @property
+    def table(self) -> Floats:
+        """Return what there is to know of each interval, one column if nothing changes, shape (numbers, intervals)."""
+        bounds, proportions = narrowed(self.bounds), narrowed(self.proportions)
+        return np.concatenate([bounds.reshape(-1, bounds.shape[-1]), proportions])
 
     def least(self, leaving: Sequence[bool], step: int) -> float:
         """Return the least that the arcs ``leaving``, one truth value for each arc, get together in an interval."""
@@ -60,8 +67,8 @@ class Split:
 
     def problems(self) -> Iterator[str]:
         """Yield why these are no shares of a whole in some interval."""
-        low, neutral, _ = self.bounds.sum(axis=1)
-        given = np.nansum(self.given, axis=0)
+        low, neutral, _ = narrowed(self.bounds).sum(axis=1)
+        given = np.nansum(narrowed(self.given), axis=0)
         rests = int(np.isnan(self.given[:, 0]).sum())
         where = f"node '{self.donor}'"
         if not self.others:
@@ -92,16 +99,22 @@ def splits(network: Parts) -> list[Split]:
         mine = [(k, network.arcs[k]) for k in arcs.get(node.id, ())]
         if mine:
             controls = [arc.control for _, arc in mine if arc.control is not None]
-            rows = [[network.held(getattr(c, side)) for c in controls] for side in ("low", "neutral", "high")]
             others = [(k, arc.share) for k, arc in mine if arc.control is None]
-            given = [np.full(horizon, np.nan) if share is None else network.held(share) for _, share in others]
+            sides = [[getattr(c, side) for c in controls] for side in ("low", "neutral", "high")]
+            shares = [np.nan if share is None else share for _, share in others]
+            values = [*(value for side in sides for value in side), *shares]
+            columns = horizon if any(isinstance(value, Series) for value in values) else 1
+            bounds = [[network.held(value)[:columns] for value in side] for side in sides]
+            given = [network.held(share)[:columns] for share in shares]
             found.append(
                 Split(
                     donor=node.id,
                     controlled=tuple(k for k, arc in mine if arc.control is not None),
                     others=tuple(k for k, _ in others),
-                    bounds=np.array(rows, dtype=float).reshape(3, -1, horizon),
-                    given=np.array(given, dtype=float).reshape(-1, horizon),
+                    bounds=np.broadcast_to(
+                        np.array(bounds, dtype=float).reshape(3, -1, columns), (3, len(controls), horizon)
+                    ),
+                    given=np.broadcast_to(np.array(given, dtype=float).reshape(-1, columns), (len(others), horizon)),
                 )
             )
     return found
@@ -115,14 +128,13 @@ def trap_problems(network: Parts, divided: Sequence[Split]) -> Iterator[str]:
     """
     passing = {node.id for node in network.nodes if not node.stores}
     by_donor = {each.donor: each for each in divided if each.donor in passing}
-    changing = [
-        np.concatenate([each.bounds.reshape(-1, each.bounds.shape[2]), each.proportions]) for each in by_donor.values()
-    ]
-    columns = np.concatenate(changing) if changing else np.empty((0, 1))
+    tables = [each.table for each in by_donor.values()]
+    width = max((table.shape[1] for table in tables), default=1)
+    columns = np.concatenate([np.empty((0, width)), *(np.broadcast_to(t, (len(t), width)) for t in tables)])
     for step in np.unique(columns, axis=1, return_index=True)[1].tolist() if len(columns) else ():
         if trapped := _trapped(network, by_donor, step):
             loop = _loop(network, by_donor, trapped)
-            when = "" if columns.shape[1] == 1 or (columns == columns[:, :1]).all() else f" in interval {step}"
+            when = "" if (columns == columns[:, :1]).all() else f" in interval {step}"
             yield (
                 f"nodes {', '.join(loop)} store nothing and can pass all they get round in a loop{when}: the arcs that "
                 f"leave it need a share, or a lowest share, above {LEAST:g}, or one of the nodes a stock"

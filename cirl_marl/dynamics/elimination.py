@@ -1,0 +1,159 @@
+"""Elimination of nodes that store nothing, for shares that differ from copy to copy.
+
+The order is found once. Nodes that are not neighbours are eliminated in the same round, a handful of array operations
+over all of them and all copies, so a column's bits do not depend on the batch it is in. As the shares of a node sum to
+1, its pivot 1 − P_ii is the sum of its other shares (Grassmann, Taksar, Heyman 1985): nothing is ever subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from cirl_marl.network import Floats, Integers, RowSum
+from cirl_marl.network.declared import itemised
+
+COSTLY = 2
+"""A round eliminates nodes that are at most this many times as costly as the cheapest."""
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """Nodes that are eliminated together, and the shares of theirs that are left then."""
+
+    nodes: Annotated[Integers, "the nodes"]
+    out: Annotated[Integers, "entries of the shares that they give to nodes eliminated later"]
+    giver: Annotated[Integers, "which of ``nodes`` each belongs to"]
+    given: Annotated[RowSum, "sum of ``out`` for each of ``nodes``"]
+    into: Annotated[Integers, "entries of the shares that they get from nodes eliminated later"]
+    getter: Annotated[Integers, "which of ``nodes`` each belongs to"]
+    first: Annotated[Integers, "of each detour past a node of the round, its way in, among ``into``"]
+    second: Annotated[Integers, "and its way out, among ``out`` and then ``nodes`` for what leaves the set"]
+    detours: Annotated[RowSum, "adds the detours to the entries of the shares that they make up"]
+    forward: Annotated[RowSum, "adds what ``out`` carries to the nodes that get it"]
+    donors: Annotated[Integers, "node that gives each of ``out``"]
+    backward: Annotated[RowSum, "adds what ``into`` carries to ``nodes``"]
+    sources: Annotated[Integers, "node that gives each of ``into``"]
+
+
+class Elimination:
+    """A sparse order: in each round nodes that are no neighbours and make few detours.
+
+    Attributes:
+        nodes: number of nodes.
+        size: number of entries.
+        rounds: what each round does.
+    """
+
+    def __init__(self, nodes: int, pairs: Iterable[tuple[int, int]]) -> None:
+        """Take the shares as pairs of nodes (from, to); ``to`` is negative for what leaves the set."""
+        self._place: dict[tuple[int, int], int] = {}
+        self.nodes, self.size = nodes, nodes
+        self._gives: list[set[int]] = [set() for _ in range(nodes)]
+        self._gets: list[set[int]] = [set() for _ in range(nodes)]
+        for i, j in pairs:
+            self._join(i, j)
+        self.rounds: list[_Round] = []
+        left = set(range(nodes))
+        while left:
+            chosen = self._independent(left)
+            self.rounds.append(self._eliminated(chosen))
+            left.difference_update(chosen)
+
+    @property
+    def work(self) -> tuple[int, int]:
+        """Multiplications for every throughput, and for every elimination, in each copy."""
+        passing = sum(len(each.out) + len(each.into) for each in self.rounds)
+        return passing, sum(len(each.first) for each in self.rounds)
+
+    def entry(self, i: int, j: int) -> int:
+        """Return the entry of the share that i gives to j; the first ones are what leaves the set."""
+        return i if j < 0 else self._place[i, j]
+
+    def _join(self, i: int, j: int) -> int:
+        if j < 0:
+            return i
+        if (i, j) not in self._place:
+            self._place[i, j] = self.size
+            self.size += 1
+            self._gives[i].add(j)
+            self._gets[j].add(i)
+        return self._place[i, j]
+
+    def _independent(self, left: set[int]) -> list[int]:
+        cost = {i: len(self._gives[i]) * len(self._gets[i]) for i in left}
+        most = COSTLY * min(cost.values())
+        chosen: list[int] = []
+        near: set[int] = set()
+        for i in sorted((i for i in left if cost[i] <= most), key=lambda i: (cost[i], i)):
+            if i not in near:
+                chosen.append(i)
+                near |= self._gives[i] | self._gets[i]
+        return chosen
+
+    def _eliminated(self, chosen: list[int]) -> _Round:
+        out = [(n, i, k) for n, i in enumerate(chosen) for k in sorted(self._gives[i])]
+        into = [(n, j, i) for n, i in enumerate(chosen) for j in sorted(self._gets[i])]
+        out_entries = [self.entry(i, k) for _, i, k in out]
+        into_entries = [self.entry(j, i) for _, j, i in into]
+        ways: list[list[tuple[int, int]]] = [[(len(out) + n, -1)] for n in range(len(chosen))]
+        for place, (n, _, k) in enumerate(out):
+            ways[n].append((place, k))
+        detours = [(way_in, way_out, j, k) for way_in, (n, j, _) in enumerate(into) for way_out, k in ways[n] if k != j]
+        for i in chosen:
+            for k in self._gives[i]:
+                self._gets[k].discard(i)
+            for j in self._gets[i]:
+                self._gives[j].discard(i)
+        made = [self._join(j, k) for _, _, j, k in detours]
+        # entries that later rounds add are beyond those of now; the array of values has room for all of them
+        return _Round(
+            nodes=_places(chosen),
+            out=_places(out_entries),
+            giver=_places(n for n, _, _ in out),
+            given=RowSum([n for n, _, _ in out], range(len(out)), 1.0, (len(chosen), len(out))),
+            into=_places(into_entries),
+            getter=_places(n for n, _, _ in into),
+            first=_places(way for way, _, _, _ in detours),
+            second=_places(way for _, way, _, _ in detours),
+            detours=RowSum(made, range(len(made)), 1.0, (self.size, len(made))),
+            forward=RowSum([k for _, _, k in out], range(len(out)), 1.0, (self.nodes, len(out))),
+            donors=_places(i for _, i, _ in out),
+            backward=RowSum([i for _, _, i in into], range(len(into)), 1.0, (self.nodes, len(into))),
+            sources=_places(j for _, j, _ in into),
+        )
+
+
+class Eliminated:
+    """The eliminated shares of one control interval, in each copy."""
+
+    def __init__(self, order: Elimination, values: Floats) -> None:
+        """Eliminate ``values``, shape (entries, B or 1): of each node what leaves the set, then the shares."""
+        self._steps = []
+        self._inverse = np.empty((order.nodes, values.shape[1]))
+        for each in order.rounds:
+            out, into, leaving = values.take(each.out, 0), values.take(each.into, 0), values.take(each.nodes, 0)
+            inverse = 1.0 / each.given.add_to(leaving.copy(), out)
+            out *= inverse.take(each.giver, 0)
+            leaving *= inverse
+            each.detours.add_to(values, into.take(each.first, 0) * np.concatenate([out, leaving]).take(each.second, 0))
+            into *= inverse.take(each.getter, 0)
+            self._inverse[each.nodes] = inverse
+            self._steps.append((each, out, into))
+
+    def throughput(self, inflow: Floats) -> Floats:
+        """Return q in place of what enters from elsewhere, shape (nodes, B)."""
+        for each, out, _ in self._steps:
+            each.forward.add_to(inflow, inflow.take(each.donors, 0) * out)
+        inflow *= self._inverse
+        for each, _, into in reversed(self._steps):
+            each.backward.add_to(inflow, inflow.take(each.sources, 0) * into)
+        return inflow
+
+
+def _places(numbers: Iterable[int]) -> Integers:
+    return np.array(list(numbers), dtype=np.intp)

@@ -1,0 +1,99 @@
+"""The exact solver's series: ẋ = S f(x) for constant rates, over one substep."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.dynamics.routing import Routes
+from cirl_marl.dynamics.shortcut import Shortcut
+from cirl_marl.network import Floats, RowSum
+from cirl_marl.network.elements import Law
+
+TRUNCATION = 1e-13
+"""Bound on the first neglected term of the series, relative to the mass in the network."""
+
+
+class Taylor:
+    """Sums the Taylor series in Horner form for the mean of the state, ȳ = x + (h/2)·ẋ(x + (h/3)·ẋ(x + …)).
+
+    A node turns over at most its stock in a substep, so the series is free of cancellation; it is cut where the
+    neglected term is below ``TRUNCATION``.
+
+    Attributes:
+        terms: terms of the series.
+    """
+
+    def __init__(self, laws: FlowLaws, substep: float) -> None:
+        """Find how many terms substeps of this length take."""
+        self._laws, self._substep = laws, substep
+        self.terms = self._number()
+        factors = [substep / k for k in range(self.terms, 1, -1)]
+        self._pulls = any(arc.law is Law.RECIPIENT for arc in laws.network.arcs)
+        self._horner = [laws.incidence.scaled(factor) for factor in factors]
+        self._shortcut = Shortcut(laws, factors) if laws.routing.nodes else None
+        network, routing, stores = laws.network, laws.routing, laws.rows.nodes.stop
+        # throughputs stand below the masses, and drive what leaves nodes without stock
+        self._driver = laws.driver.copy()
+        self._driver[routing.arcs] = laws.rows.masses + routing.found
+        self._entering = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
+        entered = routing.places[network.recipients[self._entering] - stores]
+        self._into = RowSum(entered, range(len(entered)), 1.0, (routing.nodes, len(entered)))
+
+    def _number(self) -> int:
+        """Smallest K ≥ 2 for which the first neglected term of the mean, ‖|A|^K‖₁·h^K/(K + 1)!, is ≤ TRUNCATION.
+
+        A, entry by entry, is largest in absolute value with every control at its upper bound, so that bound serves all.
+        What is split, or enters a node that stores nothing, is taken to go where it drives most.
+        """
+        laws, stores = self._laws, self._laws.rows.nodes.stop
+        donors = laws.network.donors[laws.driven]
+        reach, term, k = np.ones(stores), 1.0, 0
+        while term > TRUNCATION or k < 2:
+            k += 1
+            ends = np.append(reach, reach.max(initial=0.0))[laws.driven_to]
+            moved = laws.driven_rate * (reach[donors] + ends) * self._substep
+            reach = np.bincount(laws.driver[laws.driven], weights=moved, minlength=stores) / (k + 1)
+            term = float(reach.max(initial=0.0))
+        return k
+
+    def moved(self, stock: Floats, routes: Routes | None, rate: Floats, settled: Floats | None = None) -> Floats:
+        """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep, shape (arcs, B).
+
+        Flows given in ``settled``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
+        """
+        if self._shortcut is not None and routes is not None and settled is None:
+            moved = self.flow(self._shortcut.mean(stock, routes, rate), routes, rate)
+        else:
+            moved = self._mean_flow(stock, routes, rate, settled)
+        moved *= self._substep
+        if self._pulls:
+            np.maximum(moved, 0.0, out=moved)  # the mean of an overdrawn stock may be negative
+        return moved
+
+    def flow(self, masses: Floats, routes: Routes | None, rate: Floats) -> Floats:
+        """Return the flows at ``masses``, those that are passed on too, shape (arcs, B)."""
+        laws = self._laws
+        if routes is None:
+            return laws.flow(masses, rate)
+        entering = masses.take(laws.driver[self._entering], 0)
+        entering *= rate.take(self._entering, 0)
+        through = laws.routing.throughputs(self._into(entering), routes)
+        flow: Floats = np.concatenate([masses, through]).take(self._driver, 0)
+        flow *= rate
+        return flow
+
+    def _mean_flow(self, stock: Floats, routes: Routes | None, rate: Floats, settled: Floats | None) -> Floats:
+        """Return r∘ȳ[driver], with the flows of all arcs in each term."""
+        laws, flow, mean = self._laws, np.empty_like(rate), stock.copy()
+        for incidence in (*self._horner, None):
+            mean.take(laws.driver, axis=0, out=flow, mode="clip")
+            flow *= rate
+            if settled is not None:
+                np.copyto(flow, settled, where=~np.isnan(settled))
+            if routes is not None:
+                laws.routing.pass_on(flow, routes)
+            if incidence is not None:
+                mean[...] = stock
+                incidence.add_to(mean, flow)
+        return flow

@@ -1,0 +1,203 @@
+"""Nodes without stock eliminated once and in each copy: the same throughputs, whoever is kept, and the same stocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from benchmarks.generated import yearly_network
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, VectorEnv
+from cirl_marl.dynamics.detours import Detours, Parts, contracted, woven
+from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.network import RowSum
+
+Floats = NDArray[np.float64]
+
+
+def cycle(seed: int, stores: int, passing: int, leak: float = 0.1, **episode: Any) -> Network:
+    """Return stocks and markets that pass to each other at random; a third of the markets have shares that change."""
+    rng = np.random.default_rng(seed)
+    nodes = [Node(id=f"s{i}", initial=(1.0, 90.0), rate=float(rng.uniform(0.02, 1.0))) for i in range(stores)]
+    nodes += [Node(id=f"m{i}", stores=False) for i in range(passing)]
+    names = [node.id for node in nodes]
+    nodes.append(Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR))
+    arcs = [Arc(id="feed", donor="mine", recipient=names[-1], law=Law.EXOGENOUS, flow=7.0)]
+    arcs.append(Arc(id="ship", donor="s0", recipient="s1", law=Law.BATCH, batches=((0.0, 0.5),), delay=1.0))
+    for donor in names:
+        ends = [str(end) for end in rng.permutation([name for name in names if name != donor])[: rng.integers(1, 5)]]
+        parts = (rng.dirichlet(np.ones(len(ends))) * (1 - leak)).tolist()
+        parts[-1] *= float(rng.integers(2))
+        changes = rng.integers(6) if len(ends) > 1 else 6
+        for k, (end, part) in enumerate(zip(ends, parts, strict=True)):
+            options: dict[str, Any] = {"share": part}
+            if changes == 0 and k == 0:
+                options = {"control": Control(kind=ControlKind.SHARE, low=part / 2, neutral=part, high=part)}
+            elif changes == 1 and k == 0:
+                options = {"share": Series(times=(0.0, 1.0), values=(part, part / 3))}
+            arcs.append(Arc(id=f"{donor}_{end}", donor=donor, recipient=end, law=Law.SHARE, **options))
+        rest = str(rng.choice([name for name in names[:stores] if name != donor]))
+        arcs.append(Arc(id=f"{donor}_rest", donor=donor, recipient=rest, law=Law.SHARE))
+    return Network(name="cycle", nodes=tuple(nodes), arcs=tuple(arcs), episode=Episode(horizon=3, **episode))
+
+
+def keeping(kept: Iterable[int]) -> Any:
+    """Return what makes networks keep these nodes, constant or not, and all others that can be eliminated be so."""
+    eliminate, kept = Detours._eliminate, set(kept)
+
+    def chosen(self: Detours, constant: set[int]) -> None:
+        with patch("cirl_marl.dynamics.detours.THRIFT", np.inf):
+            eliminate(self, constant - kept)
+
+    return patch.object(Detours, "_eliminate", chosen)
+
+
+def played(network: Network, seed: int, *, short: bool = True, kept: Iterable[int] | None = None) -> list[Floats]:
+    """Return flows and stocks of an episode of random actions in two copies."""
+    if kept is None:
+        env = VectorEnv(network, num_envs=2)
+    else:
+        with keeping(kept):
+            env = VectorEnv(network, num_envs=2)
+    if not short:
+        assert env.dynamics._taylor is not None
+        env.dynamics._taylor._shortcut = None
+    env.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(network.episode.horizon):
+        outcome = env.advance(rng.uniform(-1, 1, (len(env.agents), 2)))
+        found += [outcome.flow, env.physical.stock]
+    return found
+
+
+@given(seed=st.integers(0, 2**31), stores=st.integers(2, 6), passing=st.integers(1, 25), part=st.floats(0, 1))
+@settings(max_examples=25)
+def test_whoever_is_kept(seed: int, stores: int, passing: int, part: float) -> None:
+    """Everything kept and every flow computed in every term, against some kept, and what the library chooses."""
+    network = cycle(seed, stores, passing)
+    expected = played(network, seed, short=False, kept=range(passing))
+    some = np.flatnonzero(np.random.default_rng(seed).random(passing) < part).tolist()
+    for found in (played(network, seed), played(network, seed, kept=some), played(network, seed, kept=())):
+        for ours, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=1e-13 * np.abs(theirs).max())
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=5)
+def test_explicit_solvers_take_the_same_detours(seed: int) -> None:
+    """rk4 passes flows on in each stage."""
+    network = cycle(seed, 3, 12, solver="rk4", solver_step=0.5)
+    for ours, theirs in zip(played(network, seed), played(network, seed, kept=range(12)), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=1e-13 * np.abs(theirs).max())
+
+
+@given(seed=st.integers(0, 2**31), passing=st.integers(1, 8), exponent=st.integers(1, 14))
+def test_throughputs_past_detours_are_accurate(seed: int, passing: int, exponent: int) -> None:
+    """Against fractions, of the very shares that the simulator has, however small the leak and whoever is kept."""
+    rng = np.random.default_rng(seed)
+    network = cycle(seed, 2, passing, leak=10.0**-exponent)
+    with keeping(np.flatnonzero(rng.random(passing) < 0.3).tolist()):
+        dynamics = Dynamics(network)
+    low, high = dynamics.control_low[:, :1], dynamics.control_high[:, :1]
+    rate = dynamics.rate(low + (high - low) * rng.random(low.shape), np.array([0]))
+    stores = len(network.stores)
+    matrix = [[Fraction(0)] * (passing + 1) for _ in range(passing)]
+    flow = np.zeros_like(rate)
+    for k, (i, j) in enumerate(zip(network.donors - stores, network.recipients - stores, strict=True)):
+        part = Fraction(float(rate[k, 0]))
+        if i < 0 and j >= 0:
+            flow[k] = 1.0
+            matrix[j][passing] += 1
+        elif i >= 0:
+            matrix[i][i] += part
+            if j >= 0:
+                matrix[j][i] -= part
+    for i in range(passing):
+        for j in range(passing):
+            if j != i:
+                factor = matrix[j][i] / matrix[i][i]
+                matrix[j] = [a - factor * b for a, b in zip(matrix[j], matrix[i], strict=True)]
+    exact = [float(matrix[i][passing] / matrix[i][i]) for i in range(passing)]
+    routes = dynamics.routing.routes(rate)
+    assert routes is not None
+    dynamics.routing.pass_on(flow, routes)
+    np.testing.assert_allclose(network.throughput(flow)[:, 0], exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("batch", [1, 2, 33])
+def test_substitution(batch: int) -> None:
+    """(I − W) y = x for strictly lower triangular W, in place, for one column as for many."""
+    rng = np.random.default_rng(0)
+    dense = np.tril(rng.uniform(-1, 1, (9, 9)), -1) * (rng.random((9, 9)) < 0.5)
+    rows, columns = np.nonzero(dense)
+    values = rng.normal(size=(9, batch))
+    found = RowSum(rows, columns, dense[rows, columns], (9, 9)).substitute(values.copy())
+    np.testing.assert_allclose(found - dense @ found, values, atol=1e-13)
+
+
+@given(seed=st.integers(0, 2**31), hubs=st.integers(0, 12))
+def test_contraction_keeps_what_sources_send(seed: int, hubs: int) -> None:
+    """Fewer ways, the same parts from each source to each end."""
+    rng = np.random.default_rng(seed)
+    size = hubs + 6
+    weights = np.tril(rng.random((size, size)), -1) * (rng.random((size, size)) < 0.4)
+    weights[:3], weights[:, -3:] = 0.0, 0.0
+
+    def sent(gives: Mapping[int, Parts]) -> Floats:
+        matrix = woven(gives, {i: i for i in range(size)}, size)
+        return matrix.substitute(np.eye(size))[-3:, :3]
+
+    gives = {i: {int(j): float(weights[j, i]) for j in np.flatnonzero(weights[:, i])} for i in range(size - 3)}
+    expected, before = sent(gives), sum(map(len, gives.values()))
+    left = contracted(gives, range(3, size - 3))
+    assert sum(map(len, gives.values())) <= before
+    assert gives.keys() == {0, 1, 2, *left}
+    np.testing.assert_allclose(sent(gives), expected, rtol=1e-13)
+
+
+def test_a_cycle_of_500_nodes_keeps_few() -> None:
+    """In the network that speed is measured on, the world markets and those who decide; batch = lone, mass kept."""
+    network = yearly_network()
+    env = VectorEnv(network, num_envs=3)
+    passing = network.nodes[len(network.stores) :]
+    assert (len(network.nodes), len(passing)) == (501, 400)
+    kept = {passing[i].id for i in env.dynamics.routing.detours.kept}
+    assert kept >= {arc.donor for arc in network.arcs if arc.control is not None}
+    assert len(kept) <= 20
+    env.reset(seed=4)
+    start = env.physical.stock.sum(axis=0)
+    lone = VectorEnv(network, num_envs=1)
+    lone.reset(seed=6)
+    actions = np.random.default_rng(0).uniform(-1, 1, (len(env.agents), 3))
+    flow, own = env.advance(actions).flow, lone.advance(actions[:, 2:]).flow
+    np.testing.assert_array_equal(flow[:, 2:], own)
+    np.testing.assert_allclose(env.physical.stock.sum(axis=0), start, rtol=1e-13)
+
+
+def test_a_flow_that_is_cut_in_one_copy_leaves_the_others_as_they_are() -> None:
+    """Where a recipient draws more than there is, the step is taken again: the other copies equal lone ones."""
+    network = cycle(1, 4, 12)
+    pull = Arc(id="pull", donor="pot", recipient="s2", law=Law.RECIPIENT, rate=0.5)
+    nodes = (*network.nodes, Node(id="pot", initial=(0.0, 2e3)))
+    network = Network(name="pulled", nodes=nodes, arcs=(*network.arcs, pull), episode=network.episode)
+    held = np.array([1e3, 1e-3, 1e3])
+    env = VectorEnv(network, num_envs=3)
+    env.reset(seed=0, options={"initial_state": {"pot": held}})
+    actions = np.random.default_rng(0).uniform(-1, 1, (len(env.agents), 3))
+    flow, stock = env.advance(actions).flow, env.physical.stock
+    pulled = flow[network.arc_index["pull"]]
+    assert pulled[1] == pytest.approx(1e-3)
+    assert pulled[[0, 2]].min() > 0.1
+    for i in range(3):
+        lone = VectorEnv(network, num_envs=1)
+        lone.reset(seed=i, options={"initial_state": {"pot": held[i]}})
+        np.testing.assert_array_equal(lone.advance(actions[:, i : i + 1]).flow[:, 0], flow[:, i])
+        np.testing.assert_array_equal(lone.physical.stock[:, 0], stock[:, i])
