@@ -86,7 +86,7 @@ def cycle(interval: float = 1.0, hoarded: float = 40.0) -> Network:
         Node(id="cans", initial=(20.0, 20.0), rate=2.5),
         Node(id="trade", stores=False),
         Node(id="waste", initial=(3.0, 3.0), rate=18.0),
-        Node(id="plant", initial=(1.0, 1.0), rate=25.0),
+        Node(id="plant", initial=(1.0, 1.0), rate=24.0),
         Node(id="hoard", initial=(hoarded, hoarded)),
         Node(id="tip", role=Role.LANDFILL, initial=(0.0, 0.0)),
     )

@@ -25,7 +25,7 @@ from cirl_marl.optimum.settled import ends, settled
 from cirl_marl.optimum.shared import followers, passing
 
 LARGE = 30_000
-"""Variables beyond which the substeps of an interval, if there are several, are merged into one piece."""
+"""Variables beyond which the substeps of an interval are merged, into one piece or, from degree 3 on, d − 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,8 +93,8 @@ class Programs:
             service_weight: w of λ̄/circularity_scale + w·service; None if λ̄ is maximised.
             held: whether controls are constant within an interval to first order; the program then makes better plans
                 and bounds nothing.
-            merged: whether an interval is one piece, though the simulator has substeps; None: if the program were large
-                otherwise.
+            merged: whether an interval has fewer pieces than the simulator has substeps; None: if the program were
+                large otherwise.
         """
         self.admissible = admissible
         self._system = ComparisonSystem(admissible)
@@ -168,8 +168,8 @@ def _layout(admissible: Admissible, substeps: int, merged: bool | None, degree: 
     openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
     fine = Layout(network, substeps, False, degree, valves, openings)
-    if substeps > 1 and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
-        return replace(fine, pieces=1, merged=True)
+    if substeps > max(1, degree - 1) and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
+        return replace(fine, pieces=max(1, degree - 1), merged=True)
     return fine
 
 
