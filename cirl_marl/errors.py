@@ -19,6 +19,10 @@ class NetworkError(CirlError):
         self.problems = tuple(problems)
         super().__init__("\n".join(f"{subject}: {problem}" for problem in problems))
 
+    def __reduce__(self) -> tuple[type[NetworkError], tuple[str, tuple[str, ...]]]:
+        """Pickle what it was made of, so that it comes back from other processes."""
+        return type(self), (self.subject, self.problems)
+
 
 class DefinitionError(NetworkError):
     """A definition file that cannot be read; ``problems`` lists every mistake found."""

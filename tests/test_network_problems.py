@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -261,3 +262,10 @@ def test_models_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(NetworkError, match="compartment 'a': parameter 'process' of its model 'digester_published'"):
         write_network(network, tmp_path / "one.toml")
     assert not list(tmp_path.iterdir())
+
+
+def test_errors_come_back_from_other_processes() -> None:
+    """With their kind, subject and problems."""
+    for error in (NetworkError("network 'x'", ["a", "b"]), DefinitionError("x.toml", ["c"])):
+        again = pickle.loads(pickle.dumps(error))
+        assert (type(again), str(again), again.problems) == (type(error), str(error), error.problems)

@@ -22,6 +22,8 @@ from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats, narrowed
 from cirl_marl.network.series import Series
 
+ROUNDING = 1e-12
+"""By how much lowest shares may exceed 1 together, as sums of decimals round."""
 LEAST = 1e-9
 """Share that has to leave a loop in each round at the least; a smaller one is taken for a rounding of none."""
 SUMS = 1e-6
@@ -75,7 +77,7 @@ class Split:
             yield f"{where}: all its shares have controls; one arc without a control has to take what they leave"
         elif rests > 1:
             yield f"{where}: {rests} arcs of law 'share' state no share; only one can take the rest"
-        elif (low > 1 + SUMS).any():
+        elif (low > 1 + ROUNDING).any():
             yield f"{where}: the lowest shares of its arcs sum to {low.max():g}, more than 1"
         elif rests and (neutral + given > 1 + SUMS).any():
             most = (neutral + given).max()
