@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.generated import yearly_network
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, VectorEnv
-from cirl_marl.dynamics.detours import Detours, Parts, contracted, woven
+from cirl_marl.dynamics.detours import Detours, Onward, contracted, woven
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network import RowSum
 
@@ -151,7 +151,7 @@ def test_contraction_keeps_what_sources_send(seed: int, hubs: int) -> None:
     weights = np.tril(rng.random((size, size)), -1) * (rng.random((size, size)) < 0.4)
     weights[:3], weights[:, -3:] = 0.0, 0.0
 
-    def sent(gives: Mapping[int, Parts]) -> Floats:
+    def sent(gives: Mapping[int, Onward]) -> Floats:
         matrix = woven(gives, {i: i for i in range(size)}, size)
         return matrix.substitute(np.eye(size))[-3:, :3]
 

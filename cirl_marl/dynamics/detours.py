@@ -12,7 +12,7 @@ from heapq import heapify, heappop, heappush
 from cirl_marl.dynamics.elimination import Elimination
 from cirl_marl.network import RowSum
 
-Parts = dict[int, float]
+Onward = dict[int, float]
 """End → part of what a node passes on. Node j is end j, stock s is end nodes + s."""
 
 THRIFT = 4
@@ -37,7 +37,7 @@ class Detours:
         elimination: order of elimination of the kept nodes, by their place in ``kept``.
     """
 
-    def __init__(self, nodes: int, constant: Iterable[int], gives: Mapping[int, Parts]) -> None:
+    def __init__(self, nodes: int, constant: Iterable[int], gives: Mapping[int, Onward]) -> None:
         """Eliminate ``constant`` of so many nodes; of the others the ends that each ``gives`` to matter, not how much.
 
         Args:
@@ -54,15 +54,15 @@ class Detours:
                     self._gets[j].add(i)
         self.order: list[int] = []
         self.inverse: list[float] = []
-        self.out: list[Parts] = []
-        self.into: list[Parts] = []
+        self.out: list[Onward] = []
+        self.into: list[Onward] = []
         self._eliminate(set(constant))
 
-    def reach(self) -> dict[int, Parts]:
+    def reach(self) -> dict[int, Onward]:
         """Return in which parts what enters each of ``order`` gets to kept nodes, and past them, end −1."""
-        found: dict[int, Parts] = {}
+        found: dict[int, Onward] = {}
         for i, out in zip(reversed(self.order), reversed(self.out), strict=True):
-            mine: Parts = {}
+            mine: Onward = {}
             for end, part in out.items():
                 for j, further in found.get(end, {end if end < self._nodes else -1: 1.0}).items():
                     mine[j] = mine.get(j, 0.0) + part * further
@@ -112,7 +112,7 @@ class Detours:
         out, sources = self._gives.pop(i), self._gets.pop(i)
         inverse = 1.0 / sum(out.values())
         parts = {end: share * inverse for end, share in out.items()}
-        into: Parts = {}
+        into: Onward = {}
         for j in sources:
             given = self._gives[j].pop(i)
             into[j] = given * inverse
@@ -131,7 +131,7 @@ class Detours:
         return near | sources
 
 
-def contracted(gives: dict[int, Parts], hubs: Iterable[int]) -> list[int]:
+def contracted(gives: dict[int, Onward], hubs: Iterable[int]) -> list[int]:
     """Take hubs out of an acyclic graph, in place, where the ways past them are no more than the ways to and from them.
 
     Args:
@@ -161,7 +161,7 @@ def contracted(gives: dict[int, Parts], hubs: Iterable[int]) -> list[int]:
     return [hub for hub in hubs if hub in gets]
 
 
-def woven(gives: Mapping[int, Parts], row: Mapping[int, int], size: int) -> RowSum:
+def woven(gives: Mapping[int, Onward], row: Mapping[int, int], size: int) -> RowSum:
     """Return the square matrix of the parts whose source and end have a ``row``; the others are left out."""
     ways = [(row[j], row[i], part) for i, parts in gives.items() if i in row for j, part in parts.items() if j in row]
     return RowSum([i for i, _, _ in ways], [j for _, j, _ in ways], [part for _, _, part in ways], (size, size))

@@ -13,7 +13,7 @@ import numpy as np
 from cirl_marl.dynamics.batches import BatchTransport
 from cirl_marl.dynamics.inner import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.routing import Routes
+from cirl_marl.dynamics.routing import Routed
 from cirl_marl.dynamics.taylor import Taylor
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
@@ -188,12 +188,12 @@ class Dynamics(FlowLaws):
             self.routing.pass_on(flow, routes)
         return flow
 
-    def _flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Routes | None) -> Floats:
+    def _flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Routed | None) -> Floats:
         if self._taylor is not None:
             return self._taylor.flow(stock, routes, rate)
         return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate), routes)
 
-    def _forward(self, flow: Floats, routes: Routes | None) -> Floats:
+    def _forward(self, flow: Floats, routes: Routed | None) -> Floats:
         """Stop, in place, flows that a model or the stage of a solver would reverse, and pass on what is left."""
         if self.physical:
             np.maximum(flow, 0.0, out=flow)
@@ -202,7 +202,7 @@ class Dynamics(FlowLaws):
         return flow
 
     def _explicit_step(
-        self, stock: Floats, inner: Floats, rate: Floats, routes: Routes | None, controls: Floats
+        self, stock: Floats, inner: Floats, rate: Floats, routes: Routed | None, controls: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Take one Runge-Kutta step of stocks and inner states together; models with a step of their own go ahead."""
         h = self.substep

@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.dynamics.detours import Detours, Parts, woven
+from cirl_marl.dynamics.detours import Detours, Onward, woven
 from cirl_marl.dynamics.elimination import Eliminated
 from cirl_marl.dynamics.passes import Passes
 from cirl_marl.network import Floats, Integers, Network, RowSum
@@ -26,7 +26,7 @@ from cirl_marl.network.declared import itemised
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class Routes:
+class Routed:
     """The shares of one control interval, in each copy."""
 
     rate: Annotated[Floats, "of all arcs, which is their share of those that leave nodes without stock, (arcs, B or 1)"]
@@ -63,7 +63,7 @@ class Routing:
         self.ends: Integers = np.where(ends < 0, ends + stores + self.nodes, ends)
         self.fixed = fixed[self.arcs]
         shares = rate[self.arcs, 0]
-        gives: dict[int, Parts] = {i: {} for i in range(self.nodes)}
+        gives: dict[int, Onward] = {i: {} for i in range(self.nodes)}
         for i, j, share, same in zip(
             self.donors.tolist(), self.ends.tolist(), shares.tolist(), self.fixed, strict=True
         ):
@@ -91,7 +91,7 @@ class Routing:
         # throughputs follow from the last to the first: their rows are in the opposite order
         self._inverse = np.array(detours.inverse)[::-1, None]
         back = {i: early - 1 - place[i] for i in detours.order}
-        comes: dict[int, Parts] = {i: {} for i in detours.order}
+        comes: dict[int, Onward] = {i: {} for i in detours.order}
         for i, into in zip(detours.order, detours.into, strict=True):
             for j, part in into.items():
                 comes[j][i] = part
@@ -121,22 +121,22 @@ class Routing:
         weights = [part for _, _, part in other]
         self._entries = RowSum([entry for entry, _, _ in other], columns, weights, (order.size, len(self._varying)))
 
-    def routes(self, rate: Floats) -> Routes | None:
+    def routes(self, rate: Floats) -> Routed | None:
         """Return what to pass flows on with while ``rate``, shape (arcs, B), holds; None if every node stores."""
         return (self._constant or self._routes(rate)) if self.nodes else None
 
-    def _routes(self, rate: Floats) -> Routes:
+    def _routes(self, rate: Floats) -> Routed:
         values = np.repeat(self._given, rate.shape[1], axis=1)
         self._entries.add_to(values, rate.take(self.arcs[self._varying], 0))
-        return Routes(rate, Eliminated(self.detours.elimination, values))
+        return Routed(rate, Eliminated(self.detours.elimination, values))
 
-    def pass_on(self, flow: Floats, routes: Routes) -> None:
+    def pass_on(self, flow: Floats, routes: Routed) -> None:
         """Fill in what leaves the nodes without stock, given in place what enters them, shape (arcs, B)."""
         sent = self.throughputs(self._entering(flow), routes).take(self.found, 0)
         sent *= routes.rate.take(self.arcs, 0)
         flow[self.arcs] = sent
 
-    def throughputs(self, through: Floats, routes: Routes) -> Floats:
+    def throughputs(self, through: Floats, routes: Routed) -> Floats:
         """Return what passes through, in the rows of ``found``, for what enters, in ``places``, which is used up.
 
         Shapes are (nodes, B).

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cirl_marl.dynamics.detours import Parts, contracted, woven
+from cirl_marl.dynamics.detours import Onward, contracted, woven
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.routing import Routes, Routing
+from cirl_marl.dynamics.routing import Routed, Routing
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.rowsum import spans
 
@@ -59,7 +59,7 @@ class Shortcut:
         self._gathered = woven(gathered, rows[0] | rows[1] | rows[2] | rows[3] | rows[6], size)
         self._spread = woven(spread, rows[3] | rows[4] | rows[5] | rows[6], size)
 
-    def mean(self, stock: Floats, routes: Routes, rate: Floats) -> Floats:
+    def mean(self, stock: Floats, routes: Routed, rate: Floats) -> Floats:
         """Return the mean of the masses over the substep for constant ``rate``, shape (masses, B)."""
         rates, shares = rate.take(self._flowing, 0), routes.rate.take(self._sent, 0)
         work: Floats = np.empty((self._change.stop, stock.shape[1]))
@@ -81,11 +81,11 @@ class Shortcut:
 
 def _gathered(
     laws: FlowLaws, rates: Floats, masses: Sequence[int], flows: Sequence[int], flowing: Integers
-) -> dict[int, Parts]:
+) -> dict[int, Onward]:
     """Return what masses and ``flowing`` arcs send to stocks, and past constant nodes to stocks and kept nodes."""
     detours, stores, nodes = laws.routing.detours, laws.rows.nodes.stop, laws.routing.nodes
     number = dict(zip(flowing.tolist(), flows, strict=True))
-    gives: dict[int, Parts] = {name: {} for name in (*masses, *flows)}
+    gives: dict[int, Onward] = {name: {} for name in (*masses, *flows)}
     for k in np.flatnonzero(laws.network.donors < stores).tolist():
         source, rate = (number[k], 1.0) if k in number else (masses[laws.driver[k]], float(rates[k]))
         for end, part in ((laws.network.donors[k], -rate), (laws.network.recipients[k], rate)):
@@ -94,13 +94,13 @@ def _gathered(
     return gives | {i: dict(parts) for i, parts in zip(detours.order, detours.out, strict=True)}
 
 
-def _spread(routing: Routing, rates: Floats, shares: Sequence[int], sent: Sequence[int]) -> dict[int, Parts]:
+def _spread(routing: Routing, rates: Floats, shares: Sequence[int], sent: Sequence[int]) -> dict[int, Onward]:
     """Return what kept nodes, and the arcs ``sent`` of theirs, send to stocks.
 
     What comes back to kept nodes is left out: it is in their throughputs already.
     """
     kept, number = set(routing.detours.kept), dict(zip(sent, shares, strict=True))
-    gives: dict[int, Parts] = {name: {} for name in (*kept, *shares)}
+    gives: dict[int, Onward] = {name: {} for name in (*kept, *shares)}
     for k, (i, end) in enumerate(zip(routing.donors.tolist(), routing.ends.tolist(), strict=True)):
         if i in kept and end not in kept:
             source, part = (number[k], 1.0) if k in number else (i, float(rates[routing.arcs[k]]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.routing import Routes
+from cirl_marl.dynamics.routing import Routed
 from cirl_marl.dynamics.shortcut import Shortcut
 from cirl_marl.network import Floats, RowSum
 from cirl_marl.network.elements import Law
@@ -57,7 +57,7 @@ class Taylor:
             term = float(reach.max(initial=0.0))
         return k
 
-    def moved(self, stock: Floats, routes: Routes | None, rate: Floats, settled: Floats | None = None) -> Floats:
+    def moved(self, stock: Floats, routes: Routed | None, rate: Floats, settled: Floats | None = None) -> Floats:
         """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep, shape (arcs, B).
 
         Flows given in ``settled``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
@@ -71,7 +71,7 @@ class Taylor:
             np.maximum(moved, 0.0, out=moved)  # the mean of an overdrawn stock may be negative
         return moved
 
-    def flow(self, masses: Floats, routes: Routes | None, rate: Floats) -> Floats:
+    def flow(self, masses: Floats, routes: Routed | None, rate: Floats) -> Floats:
         """Return the flows at ``masses``, those that are passed on too, shape (arcs, B)."""
         laws = self._laws
         if routes is None:
@@ -83,7 +83,7 @@ class Taylor:
         flow *= rate
         return flow
 
-    def _mean_flow(self, stock: Floats, routes: Routes | None, rate: Floats, settled: Floats | None) -> Floats:
+    def _mean_flow(self, stock: Floats, routes: Routed | None, rate: Floats, settled: Floats | None) -> Floats:
         """Return r∘ȳ[driver], with the flows of all arcs in each term."""
         laws, flow, mean = self._laws, np.empty_like(rate), stock.copy()
         for incidence in (*self._horner, None):
