@@ -87,7 +87,7 @@ IN_USE = {"machines": (5.0, 15.0), "vehicles": (10.0, 20.0), "buildings": (30.0,
 def yearly_network(*, monthly: bool = False, regions: int = 33, seed: int = 0) -> Network:
     """Return the cycle of a metal in some regions and on the world market: 500 nodes, 400 of them without stock.
 
-    It is modelled on the published cycles of steel, copper and aluminium (Cullen et al. 2012; Glöser et al. 2013): each
+    Its numbers are drawn; its stages are those that flow analyses of steel, copper and aluminium tell apart. Each
     region mines, smelts, casts, makes products, collects and remelts them (``CHAIN``), with home scrap, new scrap and
     the secondary smelter as loops of its own; four world markets join the regions, so that one loop holds ten processes
     of each and three of the markets, 333 nodes. What is in use stays for 5 to 50 years (``IN_USE``); all the other
