@@ -349,7 +349,7 @@ def test_multipliers_of_one_start_bound_another(network: Network, seed: int, wei
     proved = found.at(starts)
     solved = np.array([bound(network, start, service_weight=weight).objective for start in starts])
     mass = starts.sum(axis=1).max() * network.objective.reference_interval
-    slack = 1e-6 * np.abs(solved).max() + 1e-9 * mass  # of the solver
+    slack = 1e-6 * np.abs(solved).max() + 1e-7 * mass  # of the solver, whose tolerance is 1e-7 of the scaled rows
     assert (proved >= solved - slack).all()
     together = envelope(network, starts, service_weight=weight)
     assert (together.at(starts) >= solved - slack).all()
