@@ -32,6 +32,7 @@ def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pyt
     assert not job.is_done()
 
 
+@pytest.mark.slow
 def test_a_trial_writes_a_document_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer recipes, seeds or steps than the study has change nothing that is published."""
     monkeypatch.setitem(study.CASES, "net_zero", replace(study.CASES["net_zero"], options={"horizon": 8}))
@@ -43,6 +44,7 @@ def test_a_trial_writes_a_document_of_its_own(tmp_path: Path, monkeypatch: pytes
     assert (tmp_path / "trial" / "pictures" / "study_net_zero.png").is_file()
 
 
+@pytest.mark.slow
 def test_rows_of_the_paper_are_planned_once_and_failures_are_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -658,7 +658,7 @@ def test_sweeps_of_scenarios_have_folders_of_their_own(monkeypatch: pytest.Monke
     assert {path.name for path in Path("runs").iterdir()} == {"pareto-bottles", "pareto-bottles_crisis"}
 
 
-@pytest.mark.parametrize("network", ["bottles.toml", "net_zero"])
+@pytest.mark.parametrize("network", ["bottles.toml", pytest.param("net_zero", marks=pytest.mark.slow)])
 def test_show_simulate_and_plan_start_alike(
     network: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import sparse
@@ -336,6 +336,7 @@ def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float)
 
 
 @pytest.mark.medium
+@settings(max_examples=settings().max_examples // 2)
 @given(network=st.from_type(Network), seed=st.integers(0, 1000), weight=st.sampled_from([None, 0.3]))
 def test_multipliers_of_one_start_bound_another(network: Network, seed: int, weight: float | None) -> None:
     """``at`` is the bound itself at its own start, and nowhere less than what is solved there."""

@@ -184,7 +184,7 @@ def test_weights_that_become_nan_are_a_result(
     assert "nan" not in line
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_saturated_sac_raises_its_entropy_coefficient_without_end() -> None:
     """Its logarithm grows by one learning rate an update on rewards of −10⁶ a step, which ends in NaN."""
     model = SAC("MlpPolicy", gymnasium.make(COPPER.id), seed=0, learning_starts=20).learn(120)

@@ -61,6 +61,7 @@ def test_trainings_are_kept(bottles: Network, tmp_path: Path) -> None:
         swept(bottles, tmp_path)
 
 
+@pytest.mark.slow
 def test_runs_without_a_checkpoint_are_begun_again_by_their_owner_only(bottles: Network, tmp_path: Path) -> None:
     """What another process trains is left alone, even before its first checkpoint; what nobody trains is begun anew."""
     found = swept(bottles, tmp_path)

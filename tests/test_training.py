@@ -340,6 +340,7 @@ def test_torch_threads_and_streams_are_left_alone(ppo_recipe: Recipe) -> None:
     assert torch.equal(torch.rand(2), expected)
 
 
+@pytest.mark.slow
 def test_no_temporary_folders_are_left(
     tmp_path: Path, ppo_recipe: Recipe, mixed_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
 ) -> None:
