@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,8 +24,10 @@ from cirl_marl import (
     VectorEnv,
     load_network,
 )
+from cirl_marl.cli.networks import simulate
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
+from cirl_marl.definitions.reading import write_network
 from cirl_marl.evaluation import compare, yardstick
 from cirl_marl.evaluation.sweep import pareto
 from cirl_marl.optimum import Plan, achieved, bound, envelope, improved, search
@@ -239,3 +242,17 @@ def test_one_service_is_the_mean() -> None:
     assert np.flatnonzero(row[0]).tolist() == [programs.layout.level]
     np.testing.assert_array_equal(row[:, programs.layout.level], -1.0 / 5)
     np.testing.assert_array_equal(held.under_to, np.append(free.under_to, -0.9))
+
+
+def test_a_simulation_says_the_level_of_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside the mean, which hides the one that starves."""
+    monkeypatch.chdir(tmp_path)
+    write_network(town(cars=0.0), Path("town.toml"))
+    simulate("town.toml", set_=[], control="neutral")
+    printed = " ".join(capsys.readouterr().out.split())
+    run = rollout(VectorEnv("town.toml", num_envs=1), Neutral())
+    mobility, housing = run.episode_levels[0]
+    assert f"service levels: mobility {mobility:.4f}, housing {housing:.4f}" in printed
+    assert mobility < housing

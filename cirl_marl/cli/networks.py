@@ -277,6 +277,9 @@ def _say_figures(run: Rollout, network: Network, begun: Beginning) -> None:
     if network.objective.criticality is not None:
         figures.append(f"time-window circularity {float(time_window(network, run)[0]):.5g} {network.mass_unit}")
     console.print(", ".join(figures))
+    if len(network.services) > 1:
+        each = zip(network.services, run.episode_levels[0].tolist(), strict=True)
+        say(f"service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in each)}")
     for short in shortages(run, network):
         say(short.said)
 
