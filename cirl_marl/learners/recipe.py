@@ -30,6 +30,8 @@ from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
 
+Engine = Literal["auto", "lockstep", "stacked"]
+ENGINES: tuple[Engine, ...] = ("auto", "lockstep", "stacked")
 Count = Annotated[int, Field(strict=True, gt=0)]
 Limit = Annotated[Number, Field(gt=0)]
 
@@ -140,10 +142,24 @@ class Match(LearnerSettings):
 
 
 class Run(Settings):
-    """How long and in how many copies; the command line overrides it."""
+    """How long and in how many copies, by which engine, and which checkpoint counts; the command line overrides it."""
 
     steps: Count = Field(200_000, description="environment steps, summed over the copies")
     envs: Count = Field(16, description="copies of the environment")
+    engine: Engine = Field(
+        "auto",
+        description="lockstep: each learner's own learn(), unmodified; stacked: learners of the same settings as one, "
+        "the same algorithm up to rounding and several times as fast; auto: stacks those that can be",
+    )
+    evaluations: Annotated[int, Field(strict=True, ge=0)] = Field(
+        20, description="evaluations during a run, the best of which is the checkpoint that counts; 0: the last one"
+    )
+    episodes: Count = Field(16, description="episodes of an evaluation")
+    min_service: Annotated[Number, Field(ge=0, le=1)] | None = Field(
+        None,
+        description="level that every service must reach for a checkpoint to be the best; of those that do, the best "
+        "has the highest mean circularity. Left out: the best is paid most",
+    )
 
 
 @dataclass(frozen=True, slots=True)
