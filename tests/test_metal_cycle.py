@@ -66,6 +66,34 @@ def test_flows_of_thirty_years_against_closed_forms(action: float | None, mining
     assert (run.service[0].min() == 1.0) == mining
 
 
+@pytest.mark.parametrize("circularity", ["end", "mean"])
+def test_the_difference_is_to_what_is_neutral_that_year(circularity: str) -> None:
+    """λ − λ of a second network, put into the same state, in which that agent did what is neutral in this year."""
+    envs = [
+        VectorEnv(load_network(EXAMPLE), num_envs=2, reward=reward, circularity=circularity)
+        for reward in ("difference", "circularity")
+    ]
+    env, imagined = envs
+    assert env.agents == ("smelting", "old_scrap")
+    for each in envs:
+        each.reset(1)
+    rng = np.random.default_rng(0)
+    years = np.arange(2020, 2050) + 0.5
+    demand = np.interp(years, [2020, 2030, 2040, 2051], [90, 115, 135, 150])
+    highest = np.where(years < 2040, 0.5, 0.9)
+    neutral = np.stack([2 * demand / 160 - 1, 2 * (0.5 - 0.3) / (highest - 0.3) - 1])
+    for year in range(30):
+        actions, here = rng.uniform(-1, 1, (2, 2)), env.snapshot()
+        reward = env.advance(actions).reward
+        imagined.restore(here)
+        actual = imagined.advance(actions).reward[0]
+        for row in range(2):
+            imagined.restore(here)
+            other = actions.copy()
+            other[row] = neutral[row, year]
+            np.testing.assert_allclose(reward[row], actual - imagined.advance(other).reward[0], atol=1e-9)
+
+
 def test_nothing_is_remarked_on() -> None:
     """Neither a source too small nor a valve taken for a share."""
     assert not list(remarks(load_network(EXAMPLE)))
