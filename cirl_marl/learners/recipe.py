@@ -146,6 +146,11 @@ class Run(Settings):
 
     steps: Count = Field(200_000, description="environment steps, summed over the copies")
     envs: Count = Field(16, description="copies of the environment")
+    common_random_numbers: StrictBool = Field(
+        False,
+        description="whether episodes that run side by side begin alike and draw the same, so that they differ by what "
+        "was done alone; the next ones begin elsewhere",
+    )
     engine: Engine = Field(
         "auto",
         description="lockstep: each learner's own learn(), unmodified; stacked: learners of the same settings as one, "

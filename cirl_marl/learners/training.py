@@ -27,8 +27,7 @@ from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, Worl
 from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory
 from cirl_marl.learners.selection import Evaluation, Score, score_of
-from cirl_marl.learners.stacked.conditions import alike, first_obstacle, obstacle
-from cirl_marl.learners.stacked.stack import Stack
+from cirl_marl.learners.stacked.conditions import Stack, first_obstacle, obstacle, stacks
 from cirl_marl.learners.streams import Streams
 
 CHECKPOINTS = 10
@@ -75,7 +74,8 @@ class Training:
         self.done = 0
         if resumed is not None and resumed.status["checkpoint"] is not None:
             checkpoint, self.done = resumed.checkpoint, int(resumed.status["joint_steps"])
-        seeds = [derived_seed(config.seed, "copies", i, self.done) for i in range(config.envs)]
+        alike = config.recipe.run.common_random_numbers
+        seeds = [derived_seed(config.seed, "copies", 0 if alike else i, self.done) for i in range(config.envs)]
         self.groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
         views = {name: group.view(env) for name, group in self.groups.items()}
         self.world = World(env, seeds, views, done=self.done)
@@ -217,11 +217,11 @@ def run_together(
         RecipeError: if the engine cannot stack a learner that it should.
     """
     callbacks = callbacks or {}
-    stacks = [Stack(each, device) for each in alike(x for t in trainings for x in t.stackable(callbacks))]
+    stacked = stacks([each for training in trainings for each in training.stackable(callbacks)], device)
     began = time.perf_counter()
 
     def bring_up_to_date() -> None:
-        for stack in stacks:
+        for stack in stacked:
             stack.give()
 
     for training in trainings:
@@ -230,7 +230,7 @@ def run_together(
     try:
         with one_torch_thread(), _interruption() as interrupted:
             hooks = [partial(t.after_step, began, told) for t, told in zip(trainings, reports, strict=True)]
-            lockstep = Lockstep([t.world for t in trainings], list(_participants(trainings, stacks, callbacks)))
+            lockstep = Lockstep([t.world for t in trainings], list(_participants(trainings, stacked, callbacks)))
             lockstep.run(hooks, interrupted)
             for training in trainings:
                 training.finish()

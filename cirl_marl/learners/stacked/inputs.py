@@ -1,4 +1,4 @@
-"""What stacked learners see and are paid, padded to one shape and normalised as by ``VecNormalize``."""
+"""What stacked learners see, do and are paid, padded to one shape and normalised as by ``VecNormalize``."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from cirl_marl.network import Integers
 
 
 class Inputs:
-    """Observations and rewards of N learners with B rows each.
+    """Observations, actions and rewards of N learners with B rows each.
 
     Observations come first, padded with zeros; where critics see the state, it follows, as in the policies' own order.
 
     Attributes:
+        spaces: of the actions of each learner.
         local: entries of the longest observation.
         entries: with the state.
         seen: columns at which the actor of each learner looks.
@@ -34,6 +35,7 @@ class Inputs:
         """Lay out the inputs and take over what normalisers know."""
         self._members, self._device = members, device
         views = [learner.seat.view for learner in members]
+        self.spaces = [_box(view.action_space) for view in views]
         rows, states = members[0].seat.num_envs, views[0].state_entries
         own = [spaces.flatdim(view.observation_space) - states for view in views]
         self.local, self.entries = max(own), max(own) + states
@@ -53,7 +55,7 @@ class Inputs:
             own_moments.take(i, columns, kept)
 
     def begin(self) -> Tensor:
-        """Begin to learn: return what is seen first, from where discounted returns are counted."""
+        """Return what is seen, as at a reset: it counts in the moments, and discounted returns begin anew."""
         self._returns[:] = 0.0
         return self.observed(learning=True)
 
@@ -85,6 +87,11 @@ class Inputs:
                 rewards = rewards / self._paid_moments.scale(env.epsilon)[..., 0]
                 rewards = np.clip(rewards, -env.clip_reward, env.clip_reward)
         return torch.as_tensor(rewards, dtype=torch.float32, device=self._device), ended
+
+    def hand_in(self, actions: Tensor) -> None:
+        """Hand in actions, shape (N, B, entries), clipped to their bounds."""
+        for own, learner, space in zip(actions.cpu().numpy(), self._members, self.spaces, strict=True):
+            learner.seat.step_async(np.clip(own[:, : space.shape[0]], space.low, space.high))
 
     def give(self) -> None:
         """Give normalisers what they would know by themselves."""
@@ -121,3 +128,8 @@ class Inputs:
             else:
                 parts.append(part)
         return torch.as_tensor(np.concatenate(parts, axis=2), dtype=torch.float32, device=self._device)
+
+
+def _box(space: spaces.Space[Any]) -> spaces.Box:
+    assert isinstance(space, spaces.Box)
+    return space

@@ -39,47 +39,53 @@ ACTIVATIONS: Mapping[type[nn.Module], Activation] = {
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Weights, shape (learners, out, in), and biases, shape (learners, out): views of a stack's parameters."""
+    """Weights, shape (learners, out, in), and biases, shape (learners, out), if there are any; or their gradients."""
 
     weight: Tensor
-    bias: Tensor
+    bias: Tensor | None
 
-    def __getitem__(self, chosen: slice) -> Layer:
+    def __getitem__(self, some: slice) -> Layer:
         """Return the layer of some learners."""
-        return Layer(self.weight[chosen], self.bias[chosen])
+        return Layer(self.weight[some], None if self.bias is None else self.bias[some])
+
+    def of(self, inputs: Tensor) -> Tensor:
+        """Return W x + b, shape (learners, samples, out)."""
+        if self.bias is None:
+            return torch.bmm(inputs, self.weight.mT)
+        return torch.baddbmm(self.bias[:, None], inputs, self.weight.mT)
 
 
 @dataclass(frozen=True, slots=True)
 class Perceptrons:
-    """N perceptrons, each ``x ↦ W_L a(… a(W_1 x + b_1) …) + b_L``, and where their gradients go."""
+    """N perceptrons, each ``x ↦ W_L a(… a(W_1 x + b_1) …) + b_L``, and where their gradients go, if they have any."""
 
     layers: Sequence[Layer]
-    gradients: Sequence[Layer]
     activation: Activation
+    gradients: Sequence[Layer] = ()
 
     @property
     def width(self) -> int:
         """Units of the widest layer."""
-        return max(layer.bias.shape[1] for layer in self.layers)
+        return max(layer.weight.shape[1] for layer in self.layers)
 
-    def forward(self, inputs: Tensor, chosen: slice = slice(None)) -> list[Tensor]:
+    def forward(self, inputs: Tensor, some: slice = slice(None)) -> list[Tensor]:
         """Return the inputs, shape (learners, samples, in), the hidden units of each layer, and the outputs."""
         values = [inputs]
         for layer in self.layers:
-            own = layer[chosen]
-            values.append(torch.baddbmm(own.bias[:, None], values[-1], own.weight.mT))
+            values.append(layer[some].of(values[-1]))
             if layer is not self.layers[-1]:
                 self.activation.value(values[-1])
         return values
 
-    def backward(self, values: Sequence[Tensor], gradient: Tensor, chosen: slice = slice(None)) -> None:
+    def backward(self, values: Sequence[Tensor], gradient: Tensor, some: slice = slice(None)) -> None:
         """Write the gradients of weights and biases, from what ``forward`` gave and the gradient of the outputs."""
         for place in reversed(range(len(self.layers))):
-            into = self.gradients[place][chosen]
+            into = self.gradients[place][some]
             into.weight.copy_(torch.bmm(gradient.mT, values[place]))
-            into.bias.copy_(gradient.sum(dim=1))
+            if into.bias is not None:
+                into.bias.copy_(gradient.sum(dim=1))
             if place:
-                gradient = torch.bmm(gradient, self.layers[place].weight[chosen])
+                gradient = torch.bmm(gradient, self.layers[place].weight[some])
                 gradient = self.activation.gradient(gradient, values[place])
 
 
@@ -90,11 +96,15 @@ def pieces(learners: int, cells: int, device: torch.device) -> Iterator[slice]:
         yield slice(first, min(first + at_once, learners))
 
 
-def hidden_layers(network: nn.Module) -> tuple[list[nn.Linear], type[nn.Module] | None] | None:
-    """Return the linear layers of a sequence that ends in an activation, and the activation; None if it is no such."""
+def linear_layers(network: nn.Module) -> tuple[list[nn.Linear], type[nn.Module] | None]:
+    """Return the linear layers of a sequence, and the one kind of activation that follows each of them, if any.
+
+    Raises:
+        TypeError: if the sequence is no such.
+    """
     modules: list[Any] = list(network.children())
     linear, between = modules[::2], modules[1::2]
     kinds = {type(module) for module in between}
     if len(linear) != len(between) or len(kinds) > 1 or not all(type(module) is nn.Linear for module in linear):
-        return None
+        raise TypeError(f"not linear layers with an activation after each: {network}")
     return linear, kinds.pop() if kinds else None

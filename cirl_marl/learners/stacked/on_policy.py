@@ -1,4 +1,4 @@
-"""Learners as one: rollouts in the joint environment, updates of all at once, and the models brought up to date."""
+"""PPO and A2C of many learners as one: rollouts in the joint environment, and updates of all at once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
@@ -26,8 +25,8 @@ EPISODES = 100
 """Last episodes whose mean return is logged, as Stable-Baselines3 does."""
 
 
-class Stack:
-    """Learners of the same settings, from which it takes everything and to which ``give`` brings it back.
+class RolloutStack:
+    """PPO or A2C learners of the same settings, from which it takes everything and to which ``give`` brings it back.
 
     Attributes:
         members: the learners, whose order is that of all leading axes.
@@ -38,7 +37,6 @@ class Stack:
         self.members = list(members)
         self._device = torch.device(device)
         self._models = [_stackable(each) for each in members]
-        self._spaces = [_box(each) for each in members]
         first = self._models[0]
         self._rows, self._steps = members[0].seat.num_envs, first.n_steps
         self._timesteps, self._updates = first.num_timesteps, first._n_updates
@@ -46,7 +44,7 @@ class Stack:
         policies = [_policy(model) for model in self._models]
         self._weights = Weights(policies, self._inputs.seen, self._inputs.criticised, self._device)
         self._acts = torch.zeros(len(members), 1, self._weights.log_std.shape[1], device=self._device)
-        for own, space in zip(self._acts, self._spaces, strict=True):
+        for own, space in zip(self._acts, self._inputs.spaces, strict=True):
             own[:, : space.shape[0]] = 1.0
         # Noise comes from a copy of each learner's torch stream, minibatches from its NumPy stream itself.
         self._noise = [torch.Generator().set_state(learner.streams.torch_state) for learner in members]
@@ -75,7 +73,7 @@ class Stack:
     def act(self, wait: Callable[[], None]) -> None:
         """Act for ever by the means of the policies, learning nothing."""
         while True:
-            self._hand_in(self._means(self._inputs.observed(learning=False)))
+            self._inputs.hand_in(self._means(self._inputs.observed(learning=False)))
             wait()
 
     def give(self) -> None:
@@ -100,7 +98,7 @@ class Stack:
             rollout.seen[:, :, t], rollout.actions[:, :, t] = self._current, actions
             rollout.log_probabilities[:, :, t] = ((rest - 0.5 * noise.square()) * self._acts).sum(dim=-1)
             rollout.starts[:, :, t] = self._starts
-            self._hand_in(actions)
+            self._inputs.hand_in(actions)
             wait()
             self._moves += 1
             self._current = self._inputs.observed(learning=True)
@@ -121,15 +119,10 @@ class Stack:
     def _means(self, seen: Tensor) -> Tensor:
         return self._weights.actor.forward(seen[..., : self._inputs.local])[-1]
 
-    def _hand_in(self, actions: Tensor) -> None:
-        """Hand in actions, shape (learners, rows, entries), clipped to their bounds."""
-        for own, learner, space in zip(actions.cpu().numpy(), self.members, self._spaces, strict=True):
-            learner.seat.step_async(np.clip(own[:, : space.shape[0]], space.low, space.high))
-
     def _drawn(self) -> Tensor:
         """Return standard normal noise, each learner's from its own stream, in the shape in which it draws it."""
         noise = torch.zeros(len(self.members), self._rows, self._acts.shape[2])
-        for own, stream, space in zip(noise, self._noise, self._spaces, strict=True):
+        for own, stream, space in zip(noise, self._noise, self._inputs.spaces, strict=True):
             own[:, : space.shape[0]] = torch.empty(self._rows, space.shape[0]).normal_(generator=stream)
         return noise.to(self._device)
 
@@ -162,8 +155,3 @@ def _stackable(learner: Learner) -> PPO | A2C:
 
 def _policy(model: PPO | A2C) -> ActorCriticPolicy:
     return model.policy
-
-
-def _box(learner: Learner) -> spaces.Box:
-    assert isinstance(learner.seat.action_space, spaces.Box)
-    return learner.seat.action_space
