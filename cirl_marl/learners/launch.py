@@ -163,6 +163,7 @@ def resume(
     steps: int | None = None,
     callbacks: Mapping[str, BaseCallback] | None = None,
     report: Callable[[Progress], None] | None = None,
+    device: str = "cpu",
 ) -> Training:
     """Go on with an interrupted run from its last checkpoint, or with a complete one to more steps than it has.
 
@@ -175,6 +176,7 @@ def resume(
         steps: environment steps of the whole run, summed over the copies; None takes what was first asked for.
         callbacks: Stable-Baselines3 callbacks by name of the learner; a run does not keep those that it began with.
         report: called after every joint step.
+        device: where stacked learners compute, as torch names it.
 
     Raises:
         CirlError: if the run has ``steps`` behind it.
@@ -189,7 +191,7 @@ def resume(
         training.check_callbacks(callbacks or {})
         run.go_on(config)
         training.keep_in(run)
-        run_together([training], callbacks=callbacks, report=report)
+        run_together([training], callbacks=callbacks, report=report, device=device)
     return training
 
 

@@ -249,6 +249,10 @@ class RunDirectory:
         except (ValueError, IndexError) as error:
             raise RunError(f"{path}: cannot be read: {error}") from error
 
+    def evaluations(self) -> int:
+        """Return how many evaluations there were during training."""
+        return len(_complete_rows(self._file("evaluations.csv"))) - 1
+
     def _file(self, name: str) -> Path:
         path = self.path / name
         if not path.is_file():
