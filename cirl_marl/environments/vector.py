@@ -111,6 +111,15 @@ class VectorEnv:
         _keep_freed_memory()
 
     @property
+    def circularity_weight(self) -> float:
+        """Weight of λ in the reward, in [0, 1]; another one counts from the next step on."""
+        return self._credit.weight
+
+    @circularity_weight.setter
+    def circularity_weight(self, weight: float) -> None:
+        self._credit.weigh(_share(weight))
+
+    @property
     def neutral_action(self) -> dict[str, Floats]:
         """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each."""
         return self._actuators.neutral_action(self._coming())
@@ -259,10 +268,12 @@ class VectorEnv:
         state, ended = self.physical, outcome.truncated
         steps = np.maximum(state.step, 1)
         final, whole = self.by_agent(outcome.observation), self.state()
-        service = self.scoring.service_level(state.service / steps)
+        levels = state.service / steps
+        service, least = self.scoring.service_level(levels), levels.min(axis=0, initial=1.0)
         for agent, info in infos.items():
             info |= {"final_observation": final[agent], "final_state": whole, "_final_observation": ended}
             info |= {"episode_circularity": state.circularity / steps, "episode_service_level": service}
+            info["episode_least_service"] = least
 
     def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in the copies that ended and return the observation of all."""

@@ -165,6 +165,11 @@ class Run(Settings):
         description="level that every service must reach for a checkpoint to be the best; of those that do, the best "
         "has the highest mean circularity. Left out: the best is paid most",
     )
+    price_rate: Annotated[Number, Field(ge=0)] = Field(
+        0.0,
+        description="how fast the price of a shortfall of service moves after training episodes until they come to "
+        "min_service, as a share; 0: circularity_weight stays as it is",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +261,8 @@ class Recipe(Settings):
         for i, match in enumerate(self.match):
             if match.kind is None and match.role is None and match.agents is None:
                 yield f"match.{i}: fits every agent; give kind, role or agents"
+        if self.run.price_rate and self.run.min_service is None:
+            yield "run.price_rate: moves the price of service to reach min_service, which is not given"
         for where, learner in self.learners():
             yield from (f"{where}.{mistake}" for mistake in learner.mistakes(steps))
 

@@ -9,7 +9,8 @@
       versions.json        of Python and of every package that matters
       status.json          state, joint steps, the newest checkpoint and the best; rewritten last, atomically
       checkpoints/NNN/     LEARNER.zip (policy and optimiser), LEARNER.normaliser.pkl,
-                           LEARNER.replay.pkl.gz; an independent learner has the name of its agent
+                           LEARNER.replay.pkl.gz; an independent learner has the name of its agent;
+                           price.json, if the price of service moves
       evaluations.csv      one row an evaluation during training: λ̄, service, whether it was the best so far
       metrics.csv          one row an episode: λ̄, service level, return of each agent
       tensorboard/LEARNER/ learning curves of each learner
@@ -313,7 +314,7 @@ class MetricsFile:
 class EvaluationsFile:
     """Appends a row per evaluation to ``evaluations.csv``; ``last`` is the joint step of the last one."""
 
-    COLUMNS = ("joint_step", "env_steps", "circularity", "service", "assured", "paid", "best")
+    COLUMNS = ("joint_step", "env_steps", "circularity", "service", "assured", "paid", "circularity_weight", "best")
 
     def __init__(self, path: Path, done: int) -> None:
         """Open the file; rows past joint step ``done``, which a resumed run will repeat, are dropped."""

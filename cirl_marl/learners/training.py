@@ -19,12 +19,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
+from cirl_marl.environments.rewards import WEIGHED
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError, RecipeError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
 from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, World, wait
 from cirl_marl.learners.policies import Policies, Policy
+from cirl_marl.learners.price import ServicePrice
 from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory
 from cirl_marl.learners.selection import Evaluation, Score, score_of
 from cirl_marl.learners.stacked.conditions import Stack, first_obstacle, obstacle, stacks
@@ -84,7 +86,23 @@ class Training:
             for name, seat in self.world.seats.items():
                 learner = Learner(seat, self.groups[name].spec, config.seed, done=self.done)
                 self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
+        self._price = self._priced(checkpoint)
         self._appoint_demonstrators()
+
+    def _priced(self, checkpoint: Path | None) -> ServicePrice | None:
+        """Return the price of service if it moves; a resumed one goes on."""
+        asked = self.config.recipe.run
+        if not asked.price_rate or asked.min_service is None or not self.env.network.services:
+            return None
+        if self.env.reward_mode not in WEIGHED:
+            raise RecipeError(
+                f"recipe '{self.config.recipe.name}': run.price_rate: reward '{self.env.reward_mode}' has no price of "
+                f"service that could move; choose {', '.join(WEIGHED)}, or a price_rate of 0"
+            )
+        price = ServicePrice(self.env, asked.min_service, asked.price_rate)
+        if checkpoint is not None:
+            price.load(checkpoint)
+        return price
 
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs, checkpoints and the best of them in ``run`` from now on."""
@@ -153,6 +171,8 @@ class Training:
                 returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
                 spent = self._metrics.seconds + seconds
                 self._metrics.append([steps, steps * copies, spent, circularity, service, *returns])
+        if finished and self._price is not None:
+            self._price.heed(infos, ended)
         planned = self.config.steps // copies
         if self._evaluation is not None:
             apart = max(self.env.network.episode.horizon, planned // self.config.recipe.run.evaluations)
@@ -186,11 +206,14 @@ class Training:
         if better:
             self._best = score
             self.run.save_best(self.joint_steps, partial(self._write, replay=False), score.said())
-        self._evaluations.append(self.joint_steps, self.config.envs, score.said(), better)
+        figures = score.said() | {"circularity_weight": self.env.circularity_weight}
+        self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
 
     def _write(self, folder: Path, *, replay: bool) -> None:
         for learner in self.learners.values():
             learner.save(folder, replay=replay)
+        if self._price is not None:
+            self._price.save(folder)
 
     def runs_stacked(self, bring_up_to_date: Callable[[], None]) -> None:
         """Have models brought up to date before they are saved or act."""
