@@ -33,7 +33,7 @@ with warnings.catch_warnings():
 
 SMALL: dict[str, Any] = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
 NOTHING = Normalisation(observation=False, reward=False)
-JOINT_RECIPES = ["shared_ppo", "shared_ars", "joint_ppo", "joint_sac", "mappo", "difference_ppo"]
+JOINT_RECIPES = ["shared_ppo", "shared_ars", "joint_ppo", "joint_sac", "mappo", "independent_ars"]
 
 
 @pytest.mark.parametrize("name", cirl_marl.networks())

@@ -26,7 +26,7 @@ def train(
     network: Annotated[
         str | None, typer.Argument(metavar="NETWORK", help="Catalogue name, FILE.toml or FILE.toml:REGION.")
     ] = None,
-    recipe: Annotated[str, typer.Option(help="Who learns how: catalogue name or .toml file.")] = "independent_ppo",
+    recipe: Annotated[str, typer.Option(help="Who learns how: catalogue name or .toml file.")] = "independent_ars",
     agents: Annotated[
         str | None, typer.Option(help="Who acts and learns, comma-separated ids; default: the network's choice.")
     ] = None,

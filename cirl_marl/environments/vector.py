@@ -268,12 +268,10 @@ class VectorEnv:
         state, ended = self.physical, outcome.truncated
         steps = np.maximum(state.step, 1)
         final, whole = self.by_agent(outcome.observation), self.state()
-        levels = state.service / steps
-        service, least = self.scoring.service_level(levels), levels.min(axis=0, initial=1.0)
+        service = self.scoring.service_level(state.service / steps)
         for agent, info in infos.items():
             info |= {"final_observation": final[agent], "final_state": whole, "_final_observation": ended}
             info |= {"episode_circularity": state.circularity / steps, "episode_service_level": service}
-            info["episode_least_service"] = least
 
     def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Start the next episode in the copies that ended and return the observation of all."""

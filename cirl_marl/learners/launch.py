@@ -26,7 +26,7 @@ from cirl_marl.network import Network
 
 def train(
     network: str | Path | Network,
-    recipe: str | Path | Recipe = "independent_ppo",
+    recipe: str | Path | Recipe = "independent_ars",
     *,
     directory: str | Path | None = None,
     steps: int | None = None,
@@ -74,7 +74,7 @@ def train(
 
 def train_seeds(
     network: str | Path | Network,
-    recipe: str | Path | Recipe = "independent_ppo",
+    recipe: str | Path | Recipe = "independent_ars",
     *,
     seeds: Sequence[int],
     directory: str | Path | None = None,

@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cirl_marl.environments.vector import Infos, VectorEnv
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.records.files import write_json
 
@@ -17,11 +16,11 @@ STEEPEST = 1e3
 
 
 class ServicePrice:
-    """The price p of a shortfall in units of circularity, moved by what training episodes deliver.
+    """The price p of a shortfall in units of circularity, moved by what evaluations find.
 
     The reward is w·λ/c − (1 − w)·shortfall, so that p = (1 − w)/w. A level s* that is demanded is a constraint, and p
-    its multiplier (Altman 1999, Constrained Markov Decision Processes; Stooke et al. 2020, arXiv 2007.03964). After
-    episodes whose worst service was s on average::
+    its multiplier (Altman 1999, Constrained Markov Decision Processes; Stooke et al. 2020, arXiv 2007.03964). After an
+    evaluation that assures the level s of every service::
 
         log p ← log p + rate · clip((s* − s)/(1 − s*), −1, 1)
     """
@@ -30,10 +29,9 @@ class ServicePrice:
         """Begin with the weight that ``env`` has."""
         self._env, self._demanded, self._rate = env, demanded, rate
 
-    def heed(self, infos: Infos, ended: NDArray[np.bool_]) -> None:
-        """Move the price after the episodes that ``ended``."""
-        served = float(infos[self._env.agents[0]]["episode_least_service"][ended].mean())
-        lacks = (self._demanded - served) / max(1.0 - self._demanded, 1e-3)
+    def heed(self, assured: float) -> None:
+        """Move the price after an evaluation."""
+        lacks = (self._demanded - assured) / max(1.0 - self._demanded, 1.0 / STEEPEST)
         weight = self._env.circularity_weight
         price = (1.0 - weight) / weight * np.exp(self._rate * np.clip(lacks, -1.0, 1.0))
         self._env.circularity_weight = 1.0 / (1.0 + float(np.clip(price, 1.0 / STEEPEST, STEEPEST)))

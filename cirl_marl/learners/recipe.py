@@ -167,8 +167,8 @@ class Run(Settings):
     )
     price_rate: Annotated[Number, Field(ge=0)] = Field(
         0.0,
-        description="how fast the price of a shortfall of service moves after training episodes until they come to "
-        "min_service, as a share; 0: circularity_weight stays as it is",
+        description="largest step of the logarithm of the price of a shortfall of service, which moves after each "
+        "evaluation until min_service is reached; 0: circularity_weight stays as it is",
     )
 
 
@@ -261,8 +261,9 @@ class Recipe(Settings):
         for i, match in enumerate(self.match):
             if match.kind is None and match.role is None and match.agents is None:
                 yield f"match.{i}: fits every agent; give kind, role or agents"
-        if self.run.price_rate and self.run.min_service is None:
-            yield "run.price_rate: moves the price of service to reach min_service, which is not given"
+        if self.run.price_rate and (self.run.min_service is None or not self.run.evaluations):
+            lacks = "evaluations are 0" if self.run.min_service is not None else "min_service is not given"
+            yield f"run.price_rate: moves the price of service after evaluations to reach min_service, but {lacks}"
         for where, learner in self.learners():
             yield from (f"{where}.{mistake}" for mistake in learner.mistakes(steps))
 

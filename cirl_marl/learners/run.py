@@ -312,7 +312,7 @@ class MetricsFile:
 
 
 class EvaluationsFile:
-    """Appends a row per evaluation to ``evaluations.csv``; ``last`` is the joint step of the last one."""
+    """Appends a row per evaluation to ``evaluations.csv``."""
 
     COLUMNS = ("joint_step", "env_steps", "circularity", "service", "assured", "paid", "circularity_weight", "best")
 
@@ -324,7 +324,6 @@ class EvaluationsFile:
                 rows += [row for row in _complete_rows(path)[1:] if float(row[0]) <= done]
             except (ValueError, IndexError) as error:
                 raise RunError(f"{path}: cannot be read: {error}") from error
-        self.last = int(float(rows[-1][0])) if len(rows) > 1 else -1
         text = "".join(",".join(row) + "\n" for row in rows)
         write_atomically(path, lambda temporary: temporary.write_text(text))
         self._path = path
@@ -334,4 +333,3 @@ class EvaluationsFile:
         own = [joint_step, joint_step * copies, *(f"{figures[name]:.10g}" for name in self.COLUMNS[2:-1]), int(best)]
         with self._path.open("a", newline="") as file:
             file.write(",".join(map(str, own)) + "\n")
-        self.last = joint_step

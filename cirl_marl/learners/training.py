@@ -69,7 +69,6 @@ class Training:
         self.run: RunDirectory | None = None
         self._metrics: MetricsFile | None = None
         self._evaluations: EvaluationsFile | None = None
-        self._evaluation: Evaluation | None = None
         self._best: Score | None = None
         self._bring_up_to_date: Callable[[], None] = lambda: None
         checkpoint = None
@@ -87,6 +86,12 @@ class Training:
                 learner = Learner(seat, self.groups[name].spec, config.seed, done=self.done)
                 self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
         self._price = self._priced(checkpoint)
+        asked = config.recipe.run
+        self._evaluation: Evaluation | None = None
+        if asked.evaluations:
+            own = VectorEnv(env.network, num_envs=asked.episodes, agents=env.agents, **config.options)
+            self._evaluation = Evaluation(own)
+        self._evaluated = -1
         self._appoint_demonstrators()
 
     def _priced(self, checkpoint: Path | None) -> ServicePrice | None:
@@ -110,12 +115,9 @@ class Training:
         self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
         for name, learner in self.learners.items():
             learner.model.set_logger(configure(str(run.path / "tensorboard" / name), ["tensorboard"]))
-        asked = self.config.recipe.run
-        if asked.evaluations:
-            best = run.status["best"]
-            self._best = score_of(best["figures"]) if best is not None else None
-            self._evaluations = EvaluationsFile(run.path / "evaluations.csv", self.done)
-            self._evaluation = Evaluation(run.make_env(asked.episodes))
+        best = run.status["best"]
+        self._best = score_of(best["figures"]) if best is not None else None
+        self._evaluations = EvaluationsFile(run.path / "evaluations.csv", self.done)
 
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
@@ -171,20 +173,18 @@ class Training:
                 returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
                 spent = self._metrics.seconds + seconds
                 self._metrics.append([steps, steps * copies, spent, circularity, service, *returns])
-        if finished and self._price is not None:
-            self._price.heed(infos, ended)
         planned = self.config.steps // copies
         if self._evaluation is not None:
             apart = max(self.env.network.episode.horizon, planned // self.config.recipe.run.evaluations)
             if steps % apart == 0:
-                self._evaluate()
+                self._evaluate(self._evaluation)
         if steps % max(1, planned // CHECKPOINTS) == 0:
             self.save("running")
 
     def finish(self) -> None:
         """Evaluate what was learnt in the end, and keep it."""
-        if self._evaluations is not None and self._evaluations.last != self.joint_steps:
-            self._evaluate()
+        if self._evaluation is not None and self._evaluated != self.joint_steps:
+            self._evaluate(self._evaluation)
         self.save("complete")
 
     def save(self, state: str, reason: str = "") -> None:
@@ -193,21 +193,25 @@ class Training:
         if self.run is not None:
             self.run.save_checkpoint(self.joint_steps, partial(self._write, replay=state != "complete"), state, reason)
 
-    def _evaluate(self) -> None:
-        """Play the evaluation's episodes by the policies of now, and keep them if they are the best so far."""
-        assert self.run is not None and self._evaluation is not None and self._evaluations is not None
+    def _evaluate(self, evaluation: Evaluation) -> None:
+        """Play its episodes by the policies of now, keep these if they are the best so far, and move the price."""
         self._bring_up_to_date()
         policies = {
             name: Policy(each.model, each.env if isinstance(each.env, VecNormalize) else None, each.seat.view)
             for name, each in self.learners.items()
         }
-        score, demanded = self._evaluation.score(Policies(policies)), self.config.recipe.run.min_service
+        score, demanded = evaluation.score(Policies(policies)), self.config.recipe.run.min_service
+        self._evaluated = self.joint_steps
         better = self._best is None or score.rank(demanded) > self._best.rank(demanded)
         if better:
             self._best = score
-            self.run.save_best(self.joint_steps, partial(self._write, replay=False), score.said())
-        figures = score.said() | {"circularity_weight": self.env.circularity_weight}
-        self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
+            if self.run is not None:
+                self.run.save_best(self.joint_steps, partial(self._write, replay=False), score.said())
+        if self._evaluations is not None:
+            figures = score.said() | {"circularity_weight": self.env.circularity_weight}
+            self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
+        if self._price is not None:
+            self._price.heed(score.assured)
 
     def _write(self, folder: Path, *, replay: bool) -> None:
         for learner in self.learners.values():
