@@ -28,7 +28,7 @@ from cirl_marl.learners import Recipe, RunDirectory, load_recipe, train_seeds
 from cirl_marl.records.files import write_json
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
-NETWORK, SEEDS, STEPS, EPISODES = "copper_net", (0, 1), 400_000, 16
+NETWORK, SEEDS, STEPS, EPISODES = "copper_net", (0, 1), 300_000, 16
 BEFORE = {"n_steps": 40, "batch_size": 640, "gamma": 0.98, "gae_lambda": 0.95, "learning_rate": 1e-3}
 """Parameters of the recipe that the study had before."""
 console = Console(width=None if sys.stdout.isatty() else 140)

@@ -35,6 +35,12 @@ def train(
     engine: Annotated[
         str | None, typer.Option(help="auto, lockstep or stacked (same learners as one); default: the recipe's.")
     ] = None,
+    min_service: Annotated[
+        float | None,
+        typer.Option(
+            min=0, max=1, help="Level that each service must reach for a checkpoint to act; default: the recipe's."
+        ),
+    ] = None,
     device: Annotated[str, typer.Option(help="Where stacked learners compute: cpu, cuda, …")] = "cpu",
     seed: Seed = 0,
     seeds: Annotated[
@@ -61,6 +67,7 @@ def train(
     if resume is not None:
         _only_resume(context)
     options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
+    options["min_service"] = min_service
     options |= {"observe": observe, "agents": None if agents is None else listed(agents), "device": device}
     directories = [resume] if resume is not None else _directories(out, str(network), recipe, range(seed, seed + seeds))
     with training_bar() as report:

@@ -32,6 +32,7 @@ def train(
     steps: int | None = None,
     envs: int | None = None,
     engine: str | None = None,
+    min_service: float | None = None,
     seed: int = 0,
     agents: Sequence[str] | None = None,
     callbacks: Mapping[str, BaseCallback] | None = None,
@@ -50,6 +51,7 @@ def train(
         steps: environment steps, summed over the copies; None takes the recipe's.
         envs: copies of the environment; None takes the recipe's.
         engine: ``auto``, ``lockstep`` or ``stacked``; None takes the recipe's.
+        min_service: level of every service that the best checkpoint must assure; None takes the recipe's.
         seed: from which every random stream derives.
         agents: who acts and learns; None takes the network's choice.
         callbacks: Stable-Baselines3 callbacks by name of the learner; learners that have one run in lockstep.
@@ -67,7 +69,7 @@ def train(
     """
     _check(options, train)
     kept = None if directory is None else [Path(directory)]
-    asked = {"steps": steps, "envs": envs, "engine": engine, "agents": agents, **options}
+    asked = {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents, **options}
     (training,) = _train(network, recipe, [seed], kept, callbacks=callbacks, report=report, device=device, **asked)
     return training
 
@@ -124,6 +126,7 @@ def prepared(
     steps: int | None = None,
     envs: int | None = None,
     engine: str | None = None,
+    min_service: float | None = None,
     seed: int = 0,
     agents: Sequence[str] | None = None,
     **options: Any,
@@ -131,11 +134,13 @@ def prepared(
     """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
     found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     steps = found.run.steps if steps is None else _whole("steps", steps, 1)
+    if engine is not None and engine not in ENGINES:
+        raise CirlError(unknown("engine", engine, ENGINES))
+    if min_service is not None and not 0 <= min_service <= 1:
+        raise CirlError(f"min_service must be a level in [0, 1], got {min_service}")
+    asked = {key: value for key, value in {"engine": engine, "min_service": min_service}.items() if value is not None}
+    found = found.model_copy(update={"run": found.run.model_copy(update=asked)})
     found.check(steps)
-    if engine is not None:
-        if engine not in ENGINES:
-            raise CirlError(unknown("engine", engine, ENGINES))
-        found = found.model_copy(update={"run": found.run.model_copy(update={"engine": engine})})
     given = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
     settings = found.environment | given
     copies = found.run.envs if envs is None else _whole("envs", envs, 1)
