@@ -19,14 +19,17 @@ ROOT = Path(__file__).parent.parent
 
 
 def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run is made again if its steps, options, recipe or network are no longer those of the study."""
-    job = study.Job("copper_net", "independent_a2c", 0, 320, (("reward", "team"),), tmp_path / "run")
+    """Runs are made again if their seeds, options, recipe or network are no longer those of the study."""
+    options = (("steps", 320), ("reward", "team"))
+    job = study.Job("copper_net", "independent_a2c", (0, 1), options, tmp_path / "run")
     assert not job.is_done()
     assert job.run() > 0
     assert job.is_done()
+    assert [run.config.seed for run in job.runs] == [0, 1]
     assert job.run() == 0
-    assert not replace(job, steps=640).is_done()
-    assert not replace(job, options=()).is_done()
+    assert not replace(job, seeds=(0, 1, 2)).is_done()
+    assert not replace(job, options=(("steps", 640), ("reward", "team"))).is_done()
+    assert not replace(job, options=options[:1]).is_done()
     assert not replace(job, recipe="independent_ppo").is_done()
     shorter = load_network("copper_net").with_options(episode={"horizon": 3})
     monkeypatch.setattr(study, "load_network", lambda name: shorter)
@@ -36,11 +39,12 @@ def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.slow
 def test_a_trial_writes_a_document_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer recipes, seeds or steps than the study has change nothing that is published."""
-    monkeypatch.setitem(study.CASES, "net_zero", replace(study.CASES["net_zero"], options={"horizon": 8}))
+    case = study.Case(("joint_sac",), options={"horizon": 8})
+    monkeypatch.setitem(study.CASES, "net_zero", case)
     published = {path: path.read_bytes() for path in (ROOT / "docs" / "study.md", *study.RESULTS.rglob("*.json"))}
     study.main(out=tmp_path, only=["net_zero"], recipes=["joint_sac"], seeds=1, steps=320, episodes=2, jobs=1)
     assert all(path.read_bytes() == text for path, text in published.items())
-    assert "| joint_sac |" in (tmp_path / "trial" / "study.md").read_text()
+    assert "| joint_sac | SAC | joint | team | 320 |" in (tmp_path / "trial" / "study.md").read_text()
     assert (tmp_path / "trial" / "results" / "net_zero" / "summary.json").is_file()
     assert (tmp_path / "trial" / "pictures" / "study_net_zero.png").is_file()
 
