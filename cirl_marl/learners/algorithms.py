@@ -159,8 +159,10 @@ def _are_amounts(values: Iterable[object]) -> bool:
     return all(isinstance(value, int | float) and not isinstance(value, bool) and value >= 0 for value in values)
 
 
+SCHEDULED = ("learning_rate", "clip_range", "delta_std")
+"""Parameters that may change from one number to another over the run."""
 WRITTEN: Mapping[str, Callable[[str, object], Iterator[str]]] = {
-    "learning_rate": _rate_mistakes,
+    **dict.fromkeys(SCHEDULED, _rate_mistakes),
     "action_noise": _noise_mistakes,
 }
 """Parameters that recipes may write as tables, which ``build`` turns into the objects that the library takes."""
@@ -187,9 +189,9 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
     if mistakes := list(parameter_mistakes(name, parameters)):
         raise RecipeError("; ".join(mistakes))
     arguments = {key: _as_tuple(value) for key, value in copy.deepcopy(dict(parameters)).items()}
-    rate = arguments.get("learning_rate")
-    if isinstance(rate, Mapping):
-        arguments["learning_rate"] = LinearSchedule(rate["linear_from"], rate["linear_to"], 1.0)
+    for key in SCHEDULED:
+        if isinstance(ends := arguments.get(key), Mapping):
+            arguments[key] = LinearSchedule(ends["linear_from"], ends["linear_to"], 1.0)
     noise = arguments.get("action_noise")
     if isinstance(noise, Mapping):
         mean = np.zeros(env.action_space.shape or (1,))

@@ -1,0 +1,187 @@
+"""Which checkpoint of a run acts, and the price of service that evaluations move."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cirl_marl import RecipeError, RunError, VectorEnv
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.evaluation import compare
+from cirl_marl.learners import RunDirectory, resume, train
+from cirl_marl.learners.price import STEEPEST, ServicePrice
+from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
+from cirl_marl.learners.selection import SEEDS, Evaluation, Score
+from cirl_marl.learners.trained import Trained
+from cirl_marl.report.run import choice
+
+HORIZON, STEPS = 6, 96
+
+
+def recipe(**run: Any) -> Recipe:
+    """Return a recipe of eight rollouts, with as many evaluations."""
+    parameters = {"n_steps": 6, "batch_size": 12, "learning_rate": 0.05, "policy_kwargs": {"net_arch": [8]}}
+    asked = {"steps": STEPS, "envs": 2, "evaluations": 8, "episodes": 3} | run
+    learner = LearnerSettings(algorithm="PPO", parameters=parameters)
+    return Recipe(name="small", title="small", run=Run(**asked), learner=learner, environment={"reward": "team"})
+
+
+def learnt(folder: Path, given: Recipe, **options: Any) -> RunDirectory:
+    """Train on copper_net in short episodes."""
+    train("copper_net", given, directory=folder, horizon=HORIZON, **options)
+    return RunDirectory(folder)
+
+
+def evaluations(run: RunDirectory) -> list[dict[str, float]]:
+    """Return the rows of ``evaluations.csv``."""
+    with (run.path / "evaluations.csv").open() as file:
+        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("demanded", [None, 0.0, 0.97, 1.0])
+def test_the_best_checkpoint_acts(tmp_path: Path, demanded: float | None) -> None:
+    """It is the best row by the rule, its policies give the figures of that row again, and the choice is said."""
+    run = learnt(tmp_path / "run", recipe(min_service=demanded))
+    rows = evaluations(run)
+    assert [row["joint_step"] for row in rows] == [6 * k for k in range(1, 9)]
+    scores = [Score(row["circularity"], row["service"], row["assured"], row["paid"]) for row in rows]
+    best = max(range(8), key=lambda i: scores[i].rank(demanded))
+    status = run.status["best"]
+    assert status["joint_steps"] == rows[best]["joint_step"]
+    assert run.chosen.name == status["checkpoint"] == f"{6 * (best + 1):09d}-best"
+    assert max(i for i in range(8) if rows[i]["best"]) == best
+    env = VectorEnv("copper_net", num_envs=3, horizon=HORIZON, reward="team")
+    again = rollout(env, Trained(run), seed=SEEDS)
+    assert float(again.episode_circularity.mean()) == pytest.approx(rows[best]["circularity"], rel=1e-9)
+    assert float(again.returns.sum(axis=0).mean()) == pytest.approx(rows[best]["paid"], rel=1e-9)
+    levels = again.episode_levels
+    assert float(levels.mean(axis=0).min()) == pytest.approx(rows[best]["service"])
+    spread = 1.645 * levels.std(axis=0, ddof=1) / np.sqrt(3)
+    assert float((levels.mean(axis=0) - spread).min()) == pytest.approx(rows[best]["assured"])
+    said = choice(run)
+    assert f"after {12 * (best + 1)} environment steps, the best of 8 evaluations" in said
+    assert ("none assured the service of 1" in said) == (demanded == 1.0)
+    assert compare([run], ("neutral",), episodes=2, bounds=False).entries[0].checkpoint == run.chosen.name
+    names = {path.name for path in (run.path / "checkpoints").iterdir()}
+    assert names == {run.chosen.name, run.checkpoint.name}
+
+
+@given(
+    st.lists(st.tuples(st.floats(-9, 9), st.floats(0, 1), st.floats(-9, 9)), min_size=2, max_size=9), st.floats(0, 1)
+)
+def test_service_comes_first(figures: list[tuple[float, float, float]], demanded: float) -> None:
+    """No score that falls short is above one that does not; among those that serve, λ̄ decides, else the level."""
+    scores = [Score(circularity, assured, assured, paid) for circularity, assured, paid in figures]
+    best = max(scores, key=lambda score: score.rank(demanded))
+    serving = [score for score in scores if score.assured >= demanded]
+    if serving:
+        assert best in serving and best.circularity == max(score.circularity for score in serving)
+    else:
+        assert best.assured == max(score.assured for score in scores)
+    assert max(scores, key=lambda score: score.rank(None)).paid == max(score.paid for score in scores)
+
+
+def test_without_evaluations_the_last_checkpoint_acts(tmp_path: Path) -> None:
+    """And the same is learnt: evaluating changes nothing."""
+    run, other = learnt(tmp_path / "a", recipe(evaluations=0)), learnt(tmp_path / "b", recipe())
+    assert run.chosen == run.checkpoint
+    assert choice(run) == "who acts: the last checkpoint, after 96 environment steps"
+    assert not evaluations(run)
+    for path in run.checkpoint.glob("*.normaliser.pkl"):
+        assert path.read_bytes() == (other.checkpoint / path.name).read_bytes()
+
+
+def test_the_best_survives_a_resumption(tmp_path: Path) -> None:
+    """A run that goes on keeps its best until there is a better one; rows go on, none twice."""
+    run = learnt(tmp_path / "run", recipe(min_service=1.0))
+    best, rows = run.status["best"], evaluations(run)
+    resume(run.path, steps=2 * STEPS)
+    after = evaluations(run)
+    assert after[:8] == rows and len(after) > 8
+    assert len({row["joint_step"] for row in after}) == len(after)
+    scores = {row["joint_step"]: Score(row["circularity"], 0.0, row["assured"], row["paid"]) for row in after}
+    assert run.status["best"]["joint_steps"] == max(scores, key=lambda step: scores[step].rank(1.0))
+    assert scores[best["joint_steps"]].assured == pytest.approx(best["figures"]["assured"])
+
+
+@pytest.mark.parametrize("best", [3, {"checkpoint": 4, "joint_steps": 1, "figures": {}}, {"checkpoint": "x"}])
+def test_a_status_of_something_else_is_refused(tmp_path: Path, best: object) -> None:
+    """And one from before there was a best is read."""
+    run = learnt(tmp_path / "run", recipe(evaluations=0))
+    path = run.path / "status.json"
+    status = json.loads(path.read_text())
+    del status["best"]
+    path.write_text(json.dumps(status))
+    assert run.chosen == run.checkpoint
+    path.write_text(json.dumps(status | {"best": best}))
+    with pytest.raises(RunError, match="is not the status of a run"):
+        assert run.chosen
+
+
+@pytest.mark.parametrize(("assured", "step"), [(0.5, 0.2), (0.985, 0.1), (0.99, 0.0), (0.995, -0.1), (1.0, -0.2)])
+def test_the_price_moves_by_what_lacks(assured: float, step: float) -> None:
+    """In closed form, at once in what is paid, and never without end."""
+    env = VectorEnv("copper_net", num_envs=2, reward="team", circularity="mean", circularity_weight=0.8)
+    price = ServicePrice(env, 0.99, 0.2)
+    price.heed(assured)
+    weight = env.circularity_weight
+    assert np.log((1 - weight) / weight) == pytest.approx(np.log(0.25) + step)
+    env.reset(seed=0)
+    outcome = env.advance(np.full((len(env.agents), 2), -1.0))
+    objective, services = env.network.objective, env.network.services
+    short = sum(service.weight * (1 - level) for service, level in zip(services, outcome.levels, strict=True))
+    paid = weight * outcome.circularity_mean / objective.circularity_scale - (1 - weight) * short
+    np.testing.assert_allclose(outcome.reward[0], paid, rtol=1e-9)
+    for _ in range(200):
+        price.heed(assured)
+    weight = env.circularity_weight
+    assert 1 / STEEPEST * 0.999 <= (1 - weight) / weight <= STEEPEST * 1.001
+
+
+def test_a_price_that_moves_is_kept(tmp_path: Path) -> None:
+    """It follows the evaluations of the run, is written beside them, and a resumption goes on with it."""
+    run = learnt(tmp_path / "run", recipe(min_service=1.0, price_rate=0.5))
+    rows = evaluations(run)
+    assert rows[0]["circularity_weight"] == 0.5
+    prices = [np.log((1 - row["circularity_weight"]) / row["circularity_weight"]) for row in rows]
+    np.testing.assert_allclose(np.diff(prices), 0.5, rtol=1e-6)  # never served wholly: the largest step each time
+    kept = json.loads((run.checkpoint / "price.json").read_text())["circularity_weight"]
+    assert kept < rows[-1]["circularity_weight"]
+    assert resume(run.path, steps=STEPS + 12).env.circularity_weight <= kept
+    (run.checkpoint / "price.json").write_text("{}")
+    with pytest.raises(RunError, match=r"price\.json: cannot be read: .* it holds the price of service"):
+        resume(run.path, steps=2 * STEPS)
+
+
+def test_a_price_needs_what_it_needs(tmp_path: Path) -> None:
+    """A level, evaluations, and a reward that has a price; a network without services has none to move."""
+    for run, said in (({}, "min_service is not given"), ({"min_service": 0.9, "evaluations": 0}, "evaluations are 0")):
+        with pytest.raises(RecipeError, match=f"run.price_rate: .*{said}"):
+            learnt(tmp_path / "run", recipe(price_rate=0.1, **run))
+    with pytest.raises(RecipeError, match="reward 'circularity' has no price of service that could move; choose mixed"):
+        learnt(tmp_path / "run", recipe(price_rate=0.1, min_service=0.9), reward="circularity")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_evaluation_has_episodes_of_its_own() -> None:
+    """The same each time, and none that a report plays."""
+    env = VectorEnv("copper_net", num_envs=2, horizon=HORIZON)
+    from cirl_marl.learners.policies import Policies
+
+    evaluation = Evaluation(env)
+
+    class Still(Policies):
+        def act(self, observations: Any) -> Any:
+            return {agent: np.zeros((2, 1)) for agent in env.agents}
+
+    first, again = (evaluation.score(Still({})) for _ in range(2))
+    assert first == again
+    reported = rollout(env, Still({}))
+    assert float(reported.episode_circularity.mean()) != first.circularity
