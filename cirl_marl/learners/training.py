@@ -24,6 +24,7 @@ from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
 from cirl_marl.learners.lockstep import Interrupted, Lockstep
 from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
+from cirl_marl.learners.start import begin_from
 
 CHECKPOINTS = 10
 """Checkpoints of a run, evenly spaced; a crash loses at most what came after the last."""
@@ -70,7 +71,15 @@ class Training:
         for name, seat in self.lockstep.seats.items():
             learner = Learner(seat, groups[name].spec, config.seed, done=self.done)
             self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
+        if checkpoint is None:
+            self._begin_from_others()
         self._appoint_demonstrators()
+
+    def _begin_from_others(self) -> None:
+        """Give learners their starts, and say in the configuration from where."""
+        asked = {name: each.spec.start for name, each in self.learners.items()}
+        origins = {n: begin_from(start, self.learners[n], self.env) for n, start in asked.items() if start is not None}
+        self.config = self.config.model_copy(update={"origins": origins})
 
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs and checkpoints in ``run`` from now on."""
@@ -78,6 +87,8 @@ class Training:
         self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
         for name, learner in self.learners.items():
             learner.model.set_logger(configure(str(run.path / "tensorboard" / name), ["tensorboard"]))
+        if self.config.origins and self.joint_steps == 0:
+            self._save("running")  # so that the run does not need those from which it started any more
 
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
