@@ -226,6 +226,17 @@ def test_starts_that_do_not_fit_are_named(
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
 
 
+def test_one_recipe_serves_several_seeds(first: tuple[Training, Path], tmp_path: Path) -> None:
+    """In the name of the run ``{seed}`` is that of the training."""
+    shutil.copytree(first[1], tmp_path / "first-seed3")
+    asked = recipe(**from_run(tmp_path / "first-seed{seed}"))
+    assert same(
+        weights(prepared("copper_net", asked, seed=3, **OPTIONS).learners["use"]), weights(first[0].learners["use"])
+    )
+    with pytest.raises(RecipeError, match=r"unknown run '.*first-seed4'. Did you mean '.*first-seed3'\?"):
+        prepared("copper_net", asked, seed=4, **OPTIONS)
+
+
 def test_somebody_has_to_learn(first: tuple[Training, Path]) -> None:
     """If all only act, nothing is left of a training."""
     with pytest.raises(RecipeError, match=r"nobody learns: share_of_steps is 0 for all of \['mine', 'use'\]"):

@@ -81,7 +81,8 @@ class Start(Settings):
     """What was learnt in another run, with which a learner begins."""
 
     run: Annotated[StrictStr, Field(min_length=1)] = Field(
-        description="directory of the run; a relative path counts from the working directory, as that of cirl train"
+        description="directory of the run; a relative path counts from the working directory, as that of cirl train; "
+        "{seed} stands for the seed of the training"
     )
     agent: StrictStr | None = Field(None, description="learner of that run; None is the one of the same name")
 

@@ -28,14 +28,17 @@ SHOWN = 3
 Bounds = tuple[float, float]
 
 
-def begin_from(start: Start, learner: Learner, env: VectorEnv) -> Origin:
+def begin_from(start: Start, learner: Learner, env: VectorEnv, seed: int) -> Origin:
     """Give a fresh ``learner`` in ``env`` the policy that ``start`` names; return where it comes from.
+
+    In the name of the run ``{seed}`` stands for ``seed``, so that one recipe serves several seeds.
 
     Raises:
         RecipeError: if there is no such run or learner, if its run is not whole, or if it learnt something else.
     """
     try:
-        return _begin_from(RunDirectory(start.run), start.agent or learner.name, learner, env)
+        run = RunDirectory(start.run.replace("{seed}", str(seed)))
+        return _begin_from(run, start.agent or learner.name, learner, env)
     except CirlError as error:
         raise RecipeError(f"{learner.seat.title}: start: {error}") from error
 

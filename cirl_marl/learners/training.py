@@ -78,7 +78,11 @@ class Training:
     def _begin_from_others(self) -> None:
         """Give learners their starts, and say in the configuration from where."""
         asked = {name: each.spec.start for name, each in self.learners.items()}
-        origins = {n: begin_from(start, self.learners[n], self.env) for n, start in asked.items() if start is not None}
+        origins = {
+            name: begin_from(start, self.learners[name], self.env, self.config.seed)
+            for name, start in asked.items()
+            if start is not None
+        }
         self.config = self.config.model_copy(update={"origins": origins})
 
     def keep_in(self, run: RunDirectory) -> None:
