@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.lockstep import Lockstep
+from cirl_marl.learners.lockstep import Lockstep, Participant, World
 from cirl_marl.learners.recipe import Recipe
-from cirl_marl.learners.seat import Seat
+from cirl_marl.learners.seat import JointStep, Seat
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Arc, Control, ControlKind, Episode, Law, Node, Role
@@ -214,36 +213,29 @@ def lone_seat(env: FreeEnv, agent: str) -> Seat:
     """Return a seat that nobody else waits for: a ``VecEnv`` with the outcomes that ``env`` has for ``agent``."""
     step = 0
 
-    def exchange(seat: Seat) -> VecEnvStepReturn:
+    def wait() -> None:
         nonlocal step
         step += 1
-        seen, ended = env.observation(agent, step), env.ended(step)
-        infos: list[dict[str, Any]] = [{} for _ in range(env.num_envs)]
-        for i in np.flatnonzero(ended):
-            infos[i] = {
-                "TimeLimit.truncated": True,
-                "terminal_observation": seen[i].copy(),
-                "episode": {"r": 0.0, "l": env.network.episode.horizon, "t": 0.0},
-            }
-        seat.latest = seen
-        return seen, env.reward(agent, step).astype(np.float32), ended, infos
+        seat.latest, nothing = env.observation(agent, step), np.zeros(env.num_envs)
+        infos: Infos = {agent: {"final_observation": seat.latest}}
+        paid = {agent: env.reward(agent, step)}
+        seat.last = JointStep(paid, env.ended(step), {agent: nothing}, nothing.astype(int), infos)
 
-    seat = Seat(env, agent, OneAgent(env, agent), exchange)
+    seat = Seat(env, agent, OneAgent(env, agent), wait)
     seat.latest = env.observation(agent, 0)
     return seat
 
 
 def learn_together(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weights]:
     """Let every agent learn for ``steps`` in lockstep; return the seconds it took, without set-up, and the weights."""
-    hub = Lockstep(env, range(env.num_envs))
-    learners = {agent: _built(seat, recipe, env) for agent, seat in hub.seats.items()}
+    world = World(env, range(env.num_envs))
+    learners = {agent: _built(seat, recipe, env) for agent, seat in world.seats.items()}
+    everyone = [
+        Participant(agent, _learning(learner, steps), learner.act, learner.streams, learner.budget(steps))
+        for agent, learner in learners.items()
+    ]
     began = time.perf_counter()
-    hub.run(
-        learners={agent: _learning(learner, steps) for agent, learner in learners.items()},
-        actors={agent: learner.act for agent, learner in learners.items()},
-        streams={agent: learner.streams for agent, learner in learners.items()},
-        budgets={agent: learner.budget(steps) for agent, learner in learners.items()},
-    )
+    Lockstep([world], everyone).run()
     return time.perf_counter() - began, _weights(learners.values())
 
 

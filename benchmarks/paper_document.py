@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from benchmarks.document import markdown_table, wrapped
+from benchmarks.paper_difference import ERRORS
 from benchmarks.paper_summary import summary
 from cirl_marl.paper.published import ENVIRONMENTS, HARDWARE, SOURCE
 from cirl_marl.paper.results import WINDOW, Result
@@ -23,14 +24,20 @@ Published figures: {SOURCE}. Written by `python benchmarks/paper.py --table`, fr
 - s: share of evaluation episodes with a success at any step, deterministic policy.
 - final policy: mean return of the trained policy, deterministic, on fresh episodes that no training saw.
 - Several seeds: mean ± standard deviation over them. Where starts are drawn, a mean over n episodes varies by the
-  standard deviation of one episode, which the notes give, over √n: figures "better than the optimum" are such chance.
+  standard deviation of one episode, which the notes give, over √n. Figures above the optimum, which is a mean over all
+  starts, are such chance, and are marked.
+- difference: tuned less the paper's best, ± its error, which is {ERRORS:g} standard errors. better: "yes" or "no" where
+  the difference exceeds its error.
+- standard error: one run varies by the standard deviation over seeds or by that of one episode over √n, whichever is
+  more, and a mean over k runs by 1/√k of that. The paper's figure is of one run. It is taken to vary as ours do, or as
+  its algorithm does over seeds here, whichever is more.
 - Minutes: training alone, on the machines named below, which did other work at the same time; the paper's on a
   {HARDWARE}. CPU min: processor time, which other work does not lengthen; blank where it was not recorded, and over
   the seeds that have it. Speed on an idle machine: [benchmarks](../benchmarks/README.md).
 - Time limits are truncations here. The published CarboNet and CopperNet end their episodes otherwise
   ([networks.md](networks.md#the-published-carbonet-and-coppernet-where-episodes-start-and-end)): the best return
-  there is −1.593e5 and −4.674e7, here −1.072e5 and −4.604e7 (`pytest tests/test_paper_optima.py`). So "better" means
-  there: the final policy, in episodes that end as the published ones, against the paper's r_e. Elsewhere: r_e.
+  there is −1.593e5 and −4.674e7, here −1.072e5 and −4.604e7 (`pytest tests/test_paper_optima.py`). So the difference
+  is there that of the final policy, in episodes that end as the published ones, to the paper's r_e. Elsewhere: of r_e.
 """
 
 

@@ -9,14 +9,16 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.document import markdown_table
+from benchmarks.paper_difference import best_run, difference
 from cirl_marl.paper.published import ENVIRONMENTS, PaperEnvironment
 from cirl_marl.paper.results import Result
-from cirl_marl.paper.table import NOT_RUN, number, over_seeds
+from cirl_marl.paper.table import NOT_RUN, above_optimum, number, over_seeds
 
 COLUMNS = (
     "environment",
     "paper's best r_e",
     "tuned r_e",
+    "difference",
     "better",
     "tuned, final policy",
     "optimum",
@@ -67,8 +69,7 @@ def summary(results: Sequence[Result]) -> str:
 
 
 def _line(environment: PaperEnvironment, results: Sequence[Result]) -> tuple[str, ...]:
-    ends = {run.end_return: name for name, run in environment.runs.items() if run.end_return is not None}
-    best = max(ends)
+    best, algorithm = best_run(environment)
     optimum = number(environment.optima[0].value) if environment.optima else "not known"
     goal = GOALS.get(environment.name)
     tuned = [
@@ -77,12 +78,13 @@ def _line(environment: PaperEnvironment, results: Sequence[Result]) -> tuple[str
         if (result.row.environment, result.row.settings, result.row.steps)
         == (environment.name, "tuned", environment.steps)
     ]
-    paper, asked = f"{number(best)} ({ends[best]})", str(goal) if goal is not None else ""
+    paper = f"{number(best)} ({algorithm}){_chance(environment, [best])}"
+    asked = str(goal) if goal is not None else ""
     if not tuned:
-        return (environment.name, paper, NOT_RUN, "", "", optimum, asked, "")
-    end = [result.end_return for result in tuned]
+        return (environment.name, paper, NOT_RUN, "", "", "", optimum, asked, "")
+    end = _returns(environment, [result.end_return for result in tuned])
     played = [result.evaluation for result in tuned if result.evaluation is not None]
-    final = over_seeds([evaluation.mean for evaluation in played]) if played else ""
+    final = _returns(environment, [evaluation.mean for evaluation in played])
     successes = [evaluation.success for evaluation in played if evaluation.success is not None]
     if environment.success_episodes and successes:
         final += f", s {over_seeds(successes)} %"
@@ -90,18 +92,18 @@ def _line(environment: PaperEnvironment, results: Sequence[Result]) -> tuple[str
     if goal is not None:
         reached = successes if goal.figure == "success" else [evaluation.mean for evaluation in played]
         met = _yes(len(reached) == len(tuned) and float(np.mean(reached)) >= goal.least)
-    better = _better(environment, best, tuned)
-    return (environment.name, paper, over_seeds(end), better, final, optimum, asked, met)
+    found = difference(environment, tuned, results)
+    missing = NOT_RUN if environment.comparable else "not comparable"
+    compared = (str(found), found.better) if found is not None else ("", missing)
+    return (environment.name, paper, end, *compared, final, optimum, asked, met)
 
 
-def _better(environment: PaperEnvironment, best: float, tuned: Sequence[Result]) -> str:
-    """Compare r_e, or what final policies return where the published class ends its episodes otherwise."""
-    if not environment.comparable:
-        return "not comparable"
-    if not environment.published_ends:
-        return _yes(float(np.mean([result.end_return for result in tuned])) > best)
-    played = [result.published_ends.mean for result in tuned if result.published_ends is not None]
-    return _yes(float(np.mean(played)) > best) if played else NOT_RUN
+def _returns(environment: PaperEnvironment, found: Sequence[float]) -> str:
+    return f"{over_seeds(found)}{_chance(environment, found)}" if found else ""
+
+
+def _chance(environment: PaperEnvironment, found: Sequence[float]) -> str:
+    return ", chance: above the optimum" if above_optimum(environment, float(np.mean(found))) else ""
 
 
 def _yes(met: bool) -> str:

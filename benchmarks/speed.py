@@ -38,7 +38,7 @@ from benchmarks.generated import (
 from cirl_marl import parallel_env
 from cirl_marl.environments.parallel import NetworkParallelEnv
 from cirl_marl.environments.vector import VectorEnv
-from cirl_marl.learners import load_recipe, train
+from cirl_marl.learners import load_recipe, train, train_seeds
 from cirl_marl.network import Network
 from cirl_marl.records.machine import processor
 
@@ -48,6 +48,8 @@ COPIES, AGENTS = 1024, 16
 LONE = 64
 """Lone environments stepped in turn; 1 024 of them cost 16 times as much."""
 ARCS = (10, 100, 1_000, 10_000, 100_000, 1_000_000)
+LEARNT, SEEDS = 10_240, 5
+"""Environment steps of a training, two rollouts of the recipe, and seeds that learn together."""
 CELLS = 1_000_000
 """Arcs × copies at every size, so that every size has as much to compute and arrays of 8 MB each."""
 PACKAGES = ("numpy", "scipy", "torch", "stable-baselines3", "gymnasium", "pettingzoo", "greenlet", "vmas")
@@ -60,6 +62,7 @@ class Measurement(StrEnum):
     SINGLE = "single"
     SHARE = "share"
     LOCKSTEP = "lockstep"
+    STACKED = "stacked"
     ARCS = "arcs"
     YEARLY = "yearly"
 
@@ -173,7 +176,7 @@ def single() -> list[Figure]:
 
 
 def share() -> list[Figure]:
-    """Measure which share of a training run the default recipe spends in ``VectorEnv.step``."""
+    """Measure which share of a training run PPO in lockstep spends in ``VectorEnv.step``."""
     spans: list[tuple[float, float]] = []
     step = VectorEnv.step
 
@@ -188,12 +191,13 @@ def share() -> list[Figure]:
     with patch.object(VectorEnv, "step", timed):
         for seed in range(4):
             spans.clear()
-            train("copper_net", "independent_ppo", steps=6400, seed=seed)
+            train("copper_net", "independent_ppo", steps=LEARNT, seed=seed, engine="lockstep")
             wall = time.perf_counter() - spans[0][0]  # making the learners is not training
             shares.append(sum(ended - began for began, ended in spans) / wall)
             rates.append(len(spans) * run.envs / wall)
     value = median(shares[1:])  # the first run warms up
-    remark = f"median of 3 runs of 6 400 steps in {run.envs} copies, {median(rates[1:]):,.0f} environment steps/s"
+    rate = f"{median(rates[1:]):,.0f} environment steps/s"
+    remark = f"in lockstep; median of 3 runs of {LEARNT:,} steps in {run.envs} copies, {rate}"
     what = "independent_ppo on copper_net: share of the environment in training time"
     return [Figure(what, f"{value:.1%}", "≤ 5 %", value <= 0.05, remark)]
 
@@ -225,6 +229,44 @@ def lockstep() -> list[Figure]:
             ratio >= 0.9,
             f"{1 / median(joint):,.0f} / {1 / median(lone):,.0f}; weights {'bit-identical' if same else 'DIFFER'}",
         )
+    ]
+
+
+def stacked() -> list[Figure]:
+    """Measure learners that run as one against the same in lockstep, and seeds together against one after another."""
+
+    def seconds(engine: str, *seeds: int) -> Callable[[], float]:
+        def run() -> float:
+            began = time.process_time()
+            train_seeds("copper_net", "independent_ppo", seeds=seeds, steps=LEARNT, engine=engine)
+            return time.process_time() - began
+
+        return run
+
+    def one_by_one() -> float:
+        return sum(seconds("stacked", seed)() for seed in range(SEEDS))
+
+    alone, as_one, together, after = _interleaved(
+        3, seconds("lockstep", 0), seconds("stacked", 0), seconds("stacked", *range(SEEDS)), one_by_one
+    )
+    ratio = median(a / b for a, b in zip(alone, as_one, strict=True))
+    gain = median(a / b for a, b in zip(after, together, strict=True))
+    rates = [f"{LEARNT / median(each):,.0f}" for each in (as_one, alone)]
+    return [
+        Figure(
+            "independent_ppo on copper_net, stacked / in lockstep: environment steps per second of one core",
+            f"{ratio:.1f} ×",
+            "≥ 4 ×",
+            ratio >= 4,
+            f"{rates[0]} / {rates[1]}; {LEARNT:,} steps, median of 3 rounds, the making of learners included",
+        ),
+        Figure(
+            f"{SEEDS} stacked seeds together / one after another: environment steps per second of one core",
+            f"{gain:.2f} ×",
+            "≥ 2 ×",
+            gain >= 2,
+            "median of 3 rounds",
+        ),
     ]
 
 
@@ -298,7 +340,7 @@ def yearly() -> list[Figure]:
 
 
 MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
-    zip(Measurement, (batched, single, share, lockstep, arcs, yearly), strict=True)
+    zip(Measurement, (batched, single, share, lockstep, stacked, arcs, yearly), strict=True)
 )
 
 

@@ -269,8 +269,8 @@ def _figure(found: Aggregate | None, form: str, *, interval: bool = True) -> str
 
 def _lqr_table(episodes: int) -> Iterator[str]:
     """Compare LQR, MPC and neutral control where a single agent acts."""
-    yield "| network | who acts | controller | λ̄ | service level | bound | gap to the bound |"
-    yield "|-|-|-|-|-|-|-|"
+    yield "| network | who acts | controller | set-points | λ̄ | service level | bound | gap to the bound |"
+    yield "|-|-|-|-|-|-|-|-|"
     for name, agent, set_points in LQR_CASES:
         env = VectorEnv(name, num_envs=episodes, agents=[agent])
         starts = starting_stocks(env, first_seed(0))
@@ -287,7 +287,16 @@ def _lqr_table(episodes: int) -> Iterator[str]:
             left = over_episodes(gap(proved, run.episode_circularity))
             cells = [_figure(over_episodes(each), "{:.4g}") for each in (run.episode_circularity, run.episode_service)]
             shown = _figure(over_episodes(proved), "{:.4g}", interval=False)
-            yield f"| {name} | {agent} | {label} | {' | '.join(cells)} | {shown} | {_figure(left, '{:.1%}')} |"
+            who = f"{name} | {agent} | {label} | {_set_points(acting[label], env.network.mass_unit)}"
+            yield f"| {who} | {' | '.join(cells)} | {shown} | {_figure(left, '{:.1%}')} |"
+
+
+def _set_points(controller: Controller, unit: str) -> str:
+    """Name the stocks that LQR has been given set-points for, and these; others pursue none."""
+    if not isinstance(controller, LQR):
+        return ""
+    given = zip(controller.system.states, controller.system.set_points, strict=True)
+    return ", ".join(f"{node} {value:g} {unit}" for node, value in given if np.isfinite(value))
 
 
 def _credit_table(jobs: Sequence[Job], pictures: Path) -> Iterator[str]:

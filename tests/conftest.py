@@ -103,7 +103,9 @@ def few_rollouts() -> Recipe:
 
     parameters = {"n_steps": 10, "batch_size": 20, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
     learner = LearnerSettings(algorithm="PPO", parameters=parameters)
-    return Recipe(name="small", title="small", run=Run(steps=80, envs=2), learner=learner)
+    return Recipe(
+        name="small", title="small", run=Run(steps=80, envs=2, engine="lockstep", evaluations=0), learner=learner
+    )
 
 
 @pytest.fixture

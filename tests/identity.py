@@ -32,7 +32,6 @@ TRAININGS = {
     "independent_ppo": ("copper_net", 4096),
     "independent_a2c": ("net_zero", 640),
     "independent_sac": ("carbo_net", 400),
-    "difference_ppo": ("carbo_net", 2048),
     "joint_ppo": ("copper_net", 4096),
     "joint_sac": ("carbo_net", 400),
     "shared_ppo": ("copper_net", 2048),

@@ -11,6 +11,7 @@ import typer
 
 from benchmarks import paper, study
 from cirl_marl import load_network
+from cirl_marl.controllers.lqr import LinearSystem
 
 pytestmark = pytest.mark.medium
 
@@ -42,6 +43,17 @@ def test_a_trial_writes_a_document_of_its_own(tmp_path: Path, monkeypatch: pytes
     assert "| joint_sac |" in (tmp_path / "trial" / "study.md").read_text()
     assert (tmp_path / "trial" / "results" / "net_zero" / "summary.json").is_file()
     assert (tmp_path / "trial" / "pictures" / "study_net_zero.png").is_file()
+
+
+def test_rows_of_lqr_name_its_set_points() -> None:
+    """Those that it was given, or else the definition's, of every stock that it regulates."""
+    rows = (ROOT / "docs" / "study.md").read_text(encoding="utf-8").splitlines()
+    for name, agent, given in study.LQR_CASES:
+        network = load_network(name)
+        states = LinearSystem.of(network, [agent]).states
+        own = {node.id: node.set_point for node in network.nodes if node.id in states and node.set_point is not None}
+        wanted = ", ".join(f"{node} {value:g} {network.mass_unit}" for node, value in (given or own).items())
+        assert sum(row.startswith(f"| {name} | {agent} | lqr | {wanted} |") for row in rows) == 1
 
 
 @pytest.mark.slow

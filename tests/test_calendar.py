@@ -148,6 +148,8 @@ def test_axes_show_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         axes = figures[-1].axes[-1]
         assert axes.get_xlabel() == label
         assert axes.get_xlim() == ends
+        means = np.asarray(figures[-1].axes[2].lines[0].get_xdata(), dtype=np.float64)
+        np.testing.assert_allclose(means, ends[0] + time - 0.5)  # in the middle of their intervals
         curves.save_circularity(tmp_path / "x.png", made, time, {"neutral": -time}, {"neutral": time / 3})
         assert figures[-1].axes[-1].get_xlabel() == label
         assert figures[-1].axes[-1].get_xlim() == (ends[0] + 0.5, ends[1] - 0.5)  # means stand in the middle

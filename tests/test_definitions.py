@@ -31,6 +31,7 @@ from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import Definition, write_network
 from cirl_marl.definitions.schema import json_schema
 from cirl_marl.network.elements import ControlKind
+from cirl_marl.records import files
 
 FILES = sorted(folder("envs").glob("*.toml"))
 COPPER = (Path(__file__).parent / "reference" / "definition.toml").read_text(encoding="utf-8")
@@ -370,6 +371,22 @@ def test_what_is_written_reads_back(name: str, scenario: str, tmp_path: Path) ->
     for titled in (network, replace(network, title="")):
         write_network(titled, path)
         assert load_network(path) == replace(titled, scenario_name="default", scenarios={})
+
+
+def test_a_network_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that fails leaves the file that was there, and nothing beside it."""
+    path = tmp_path / "kept.toml"
+    write_network(load_network("copper_net"), path)
+    before = path.read_bytes()
+
+    def fail(_: Path) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(files, "sync", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_network(load_network("carbo_net"), path)
+    assert path.read_bytes() == before
+    assert [each.name for each in tmp_path.iterdir()] == ["kept.toml"]
 
 
 ROLE = {role.value: role for role in Role}

@@ -20,7 +20,7 @@ from cirl_marl import DefinitionError, Network, VectorEnv, vector_env
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import load_recipe, train
 from cirl_marl.learners.central_critic import CentralCriticPolicy
-from cirl_marl.learners.lockstep import Lockstep
+from cirl_marl.learners.lockstep import Lockstep, Participant, World
 from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.trained import Trained
@@ -33,7 +33,7 @@ with warnings.catch_warnings():
 
 SMALL: dict[str, Any] = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
 NOTHING = Normalisation(observation=False, reward=False)
-JOINT_RECIPES = ["shared_ppo", "shared_ars", "joint_ppo", "joint_sac", "mappo", "difference_ppo"]
+JOINT_RECIPES = ["shared_ppo", "shared_ars", "joint_ppo", "joint_sac", "mappo", "independent_ars"]
 
 
 @pytest.mark.parametrize("name", cirl_marl.networks())
@@ -140,15 +140,21 @@ def test_team_reward() -> None:
 
 def small(learner: LearnerSettings, **options: Any) -> Recipe:
     """Return a recipe for two copies."""
-    return Recipe(name="small", title="small", learner=learner, run=Run(steps=64, envs=2), **options)
+    return Recipe(
+        name="small",
+        title="small",
+        learner=learner,
+        run=Run(steps=64, envs=2, engine="lockstep", evaluations=0),
+        **options,
+    )
 
 
 def test_rows_of_a_seat_are_agents_in_copies() -> None:
     """Time limits, returns and attributes of a row are those of its agent and copy; the last state as well."""
     env = vector_env("copper_net", num_envs=2, horizon=3)
     by_hand = vector_env("copper_net", num_envs=2, horizon=3)
-    lockstep = Lockstep(env, [1, 2], {"all": SharedPolicy(env, env.agents).with_state(env)})
-    seat, count = lockstep.seats["all"], len(env.agents)
+    world = World(env, [1, 2], {"all": SharedPolicy(env, env.agents).with_state(env)})
+    seat, count = world.seats["all"], len(env.agents)
     by_hand.reset(seed=[1, 2])
     assert seat.get_attr("agent") == [agent for agent in env.agents for _ in range(2)]
     assert seat.get_attr("index") == [0, 1] * count
@@ -162,7 +168,7 @@ def test_rows_of_a_seat_are_agents_in_copies() -> None:
         while True:
             seat.step(np.zeros((2 * count, 1), dtype=np.float32))
 
-    lockstep.run({"all": learn}, {"all": rest}, {"all": Streams(0)}, {"all": 99})
+    Lockstep([world], [Participant("all", learn, rest, Streams(0))]).run()
     returns = np.zeros(2 * count)
     for observation, reward, done, infos in seen:
         still = {agent: np.zeros((2, 1)) for agent in env.agents}
@@ -188,8 +194,8 @@ def test_rows_of_a_seat_are_agents_in_copies() -> None:
 def central_critic() -> PPO:
     """Return PPO with a central critic on a toy view."""
     env = vector_env("carbo_net", num_envs=2)
-    lockstep = Lockstep(env, [0, 1], {"all": SharedPolicy(env, env.agents).with_state(env)})
-    return PPO(CentralCriticPolicy, lockstep.seats["all"], seed=0, device="cpu", **SMALL)
+    world = World(env, [0, 1], {"all": SharedPolicy(env, env.agents).with_state(env)})
+    return PPO(CentralCriticPolicy, world.seats["all"], seed=0, device="cpu", **SMALL)
 
 
 def perturbed(model: PPO) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
@@ -304,7 +310,9 @@ def shortened(name: str) -> Recipe:
     recipe = load_recipe(name)
     parameters = recipe.learner.parameters | BRIEF[recipe.learner.algorithm]
     learner = recipe.learner.model_copy(update={"parameters": parameters})
-    return recipe.model_copy(update={"learner": learner, "run": Run(steps=16, envs=2)})
+    return recipe.model_copy(
+        update={"learner": learner, "run": Run(steps=16, envs=2, engine="lockstep", evaluations=0)}
+    )
 
 
 @pytest.mark.parametrize("network", cirl_marl.networks())

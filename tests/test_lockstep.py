@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from cirl_marl import LearnerError, VectorEnv
-from cirl_marl.learners.lockstep import Interrupted, Lockstep
+from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, World
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams
 
@@ -20,10 +20,10 @@ HORIZON = 5
 COPIES = 3
 
 
-def make_lockstep(agents: list[str] | None = None) -> Lockstep:
+def make_world(agents: list[str] | None = None) -> World:
     """Seat the agents of a short copper_net."""
     env = VectorEnv("copper_net", num_envs=COPIES, agents=agents, horizon=HORIZON)
-    return Lockstep(env, seeds=[11, 12, 13])
+    return World(env, seeds=[11, 12, 13])
 
 
 def scripted(seat: Seat, steps: int, seen: list[VecEnvStepReturn], value: float = 0.0) -> Callable[[], None]:
@@ -47,24 +47,25 @@ def hold(seat: Seat) -> Callable[[], None]:
     return run
 
 
-def run_scripted(lockstep: Lockstep, steps: dict[str, int], **options: Any) -> dict[str, list[VecEnvStepReturn]]:
+def run_scripted(world: World, steps: dict[str, int], **options: Any) -> dict[str, list[VecEnvStepReturn]]:
     """Run scripted learners for the given numbers of steps."""
-    seen: dict[str, list[VecEnvStepReturn]] = {agent: [] for agent in lockstep.seats}
-    lockstep.run(
-        learners={a: scripted(s, steps[a], seen[a]) for a, s in lockstep.seats.items()},
-        actors={a: hold(s) for a, s in lockstep.seats.items()},
-        streams={a: Streams(i) for i, a in enumerate(lockstep.seats)},
-        budgets=dict.fromkeys(lockstep.seats, 10**6),
-        **options,
-    )
+    seen: dict[str, list[VecEnvStepReturn]] = {agent: [] for agent in world.seats}
+    learn = {agent: scripted(seat, steps[agent], seen[agent]) for agent, seat in world.seats.items()}
+    Lockstep([world], participants(world, learn)).run(**options)
     return seen
+
+
+def participants(world: World, learn: dict[str, Callable[[], None]]) -> list[Participant]:
+    """Return who learns by its own function, and holds action 0 after it."""
+    seats = world.seats.items()
+    return [Participant(seat.title, learn[a], hold(seat), Streams(i)) for i, (a, seat) in enumerate(seats)]
 
 
 def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
     """Every seat sees exactly what ``VectorEnv`` gives its agent, and the true last observation at a time limit."""
-    lockstep = make_lockstep()
-    first = {agent: seat.latest for agent, seat in lockstep.seats.items()}
-    seen = run_scripted(lockstep, dict.fromkeys(lockstep.seats, HORIZON + 2))
+    world = make_world()
+    first = {agent: seat.latest for agent, seat in world.seats.items()}
+    seen = run_scripted(world, dict.fromkeys(world.seats, HORIZON + 2))
     env = VectorEnv("copper_net", num_envs=COPIES, horizon=HORIZON)
     by_hand = env.reset(seed=[11, 12, 13])
     actions = {agent: np.zeros((COPIES, 1)) for agent in env.agents}
@@ -86,25 +87,25 @@ def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
 
 def test_copies_have_their_own_seeds() -> None:
     """SuperSuit's bridge gives all copies one stream; here no two copies start alike."""
-    lockstep = make_lockstep()
-    starts = np.asarray(lockstep.seats["use"].latest)
+    world = make_world()
+    starts = np.asarray(world.seats["use"].latest)
     assert len(np.unique(starts[:, 0])) == COPIES
 
 
 def test_seeded_algorithm_can_be_built_on_a_seat() -> None:
     """With SuperSuit's bridge ``PPO(seed=…)`` raises; here it works and does not reseed the environment."""
-    lockstep = make_lockstep()
-    before = np.asarray(lockstep.seats["use"].latest).copy()
+    world = make_world()
+    before = np.asarray(world.seats["use"].latest).copy()
     with Streams(0).active():
-        model = PPO("MlpPolicy", lockstep.seats["use"], seed=3, device="cpu")
+        model = PPO("MlpPolicy", world.seats["use"], seed=3, device="cpu")
     assert model.seed == 3
-    assert np.array_equal(np.asarray(lockstep.seats["use"].latest), before)
+    assert np.array_equal(np.asarray(world.seats["use"].latest), before)
 
 
 def test_truncation_bootstraps() -> None:
     """SuperSuit's bridge never reports truncation; here PPO adds the value of the final observation."""
-    lockstep = make_lockstep(["use"])
-    seat = lockstep.seats["use"]
+    world = make_world(["use"])
+    seat = world.seats["use"]
     streams = Streams(0)
     with streams.active():
         model = PPO("MlpPolicy", seat, n_steps=HORIZON, batch_size=HORIZON * COPIES, seed=0, device="cpu", gamma=0.9)
@@ -130,77 +131,67 @@ def test_truncation_bootstraps() -> None:
     def hook(infos: Any, done: np.ndarray) -> None:
         if done.any():
             finals.append(infos["use"]["final_observation"].copy())
-            last.append(np.asarray(lockstep._outcomes["use"][1]).copy())
+            last.append(seat.paid()[0])
 
-    lockstep.run({"use": learn}, {"use": hold(seat)}, {"use": streams}, {"use": 10**6}, hook)
+    Lockstep([world], [Participant("use", learn, hold(seat), streams)]).run([hook])
     assert np.allclose(rewards[0], last[0] + 0.9 * values[0], atol=1e-4)
     assert np.all(np.abs(values[0]) > 0.1)  # so that it would show if the value were not added
 
 
 def test_learners_of_different_length_finish_and_go_on_acting() -> None:
     """A learner that is done acts until the last one is done."""
-    lockstep = make_lockstep(["mine", "use", "sorting"])
-    seen = run_scripted(lockstep, {"mine": 3, "use": 11, "sorting": 7})
+    world = make_world(["mine", "use", "sorting"])
+    seen = run_scripted(world, {"mine": 3, "use": 11, "sorting": 7})
     assert {agent: len(steps) for agent, steps in seen.items()} == {"mine": 3, "use": 11, "sorting": 7}
-    assert lockstep.joint_steps == 11
+    assert world.joint_steps == 11
 
 
 def test_failing_learner_is_named() -> None:
     """The error says whose learner failed and when; the others are ended."""
-    lockstep = make_lockstep(["mine", "use"])
+    world = make_world(["mine", "use"])
     ended: list[str] = []
 
     def fails() -> None:
         for _ in range(4):
-            lockstep.seats["mine"].step(np.zeros((COPIES, 1), dtype=np.float32))
+            world.seats["mine"].step(np.zeros((COPIES, 1), dtype=np.float32))
         raise ValueError("exploded")
 
     def steady() -> None:
         try:
-            hold(lockstep.seats["use"])()
+            hold(world.seats["use"])()
         finally:
             ended.append("use")
 
     with pytest.raises(LearnerError, match=r"agent 'mine' failed at joint step 4: ValueError\('exploded'\)"):
-        lockstep.run(
-            {"mine": fails, "use": steady},
-            {a: hold(s) for a, s in lockstep.seats.items()},
-            {"mine": Streams(0), "use": Streams(1)},
-            {"mine": 10**6, "use": 10**6},
-        )
+        Lockstep([world], participants(world, {"mine": fails, "use": steady})).run()
     assert ended == ["use"]
 
 
-def test_hook_can_stop_everything() -> None:
+def test_everything_can_be_stopped() -> None:
     """``Interrupted`` ends all learners cleanly."""
-    lockstep = make_lockstep(["mine", "use"])
-
-    def stop(infos: Any, done: np.ndarray) -> None:
-        if lockstep.joint_steps == 4:
-            raise Interrupted
-
+    world = make_world(["mine", "use"])
     with pytest.raises(Interrupted):
-        run_scripted(lockstep, {"mine": 100, "use": 100}, hook=stop)
-    assert lockstep.joint_steps == 4
+        run_scripted(world, {"mine": 100, "use": 100}, interrupted=lambda: world.joint_steps == 4)
+    assert world.joint_steps == 4
 
 
 def test_rewards_are_each_agents_own() -> None:
     """PPO changes its rewards in place; nobody else may see that."""
-    lockstep = make_lockstep(["mine", "use"])
-    seen = run_scripted(lockstep, {"mine": 2, "use": 2})
+    world = make_world(["mine", "use"])
+    seen = run_scripted(world, {"mine": 2, "use": 2})
     assert not np.shares_memory(seen["mine"][0][1], seen["use"][0][1])
     assert not np.shares_memory(np.asarray(seen["mine"][0][0]), np.asarray(seen["mine"][1][0]))
 
 
 def test_env_method_and_attributes_reach_the_agent() -> None:
     """HER calls ``env_method``; it reaches the agent's view of the chosen copies, and through it the environment."""
-    lockstep = make_lockstep()
-    seat = lockstep.seats["use"]
+    world = make_world()
+    seat = world.seats["use"]
     rewards = seat.env_method("local_reward", indices=[0, 2])
-    expected = lockstep.env.local_rewards()["use"]
+    expected = world.env.local_rewards()["use"]
     assert rewards == [expected[0], expected[2]]
-    assert seat.get_attr("compartment")[0] is lockstep.env.network.compartments["use"]
-    assert seat.get_attr("network", indices=1) == [lockstep.env.network]
+    assert seat.get_attr("compartment")[0] is world.env.network.compartments["use"]
+    assert seat.get_attr("network", indices=1) == [world.env.network]
     seat.set_attr("note", "here", indices=[1])
     assert seat.get_attr("note", indices=[1]) == ["here"]
     assert seat.env_is_wrapped(object) == [False] * COPIES

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Service, VectorEnv
-from cirl_marl.learners.lockstep import Lockstep
+from cirl_marl.learners.lockstep import Lockstep, Participant, World
 from cirl_marl.learners.streams import Streams
 
 VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
@@ -107,21 +108,20 @@ def test_an_episode_reports_the_means_over_its_own_steps() -> None:
 
 def test_a_second_episode_has_a_return_of_its_own() -> None:
     """The return and the length that a learner is told are those of the episode that ended, and of no other."""
-    lockstep = Lockstep(VectorEnv("carbo_net", num_envs=2, horizon=4), seeds=[1, 2])
-    seen: dict[str, list[Any]] = {name: [] for name in lockstep.seats}
+    world = World(VectorEnv("carbo_net", num_envs=2, horizon=4), seeds=[1, 2])
+    seen: dict[str, list[Any]] = {name: [] for name in world.seats}
 
     def learner(name: str, steps: int) -> None:
-        seat = lockstep.seats[name]
+        seat = world.seats[name]
         seat.reset()
         for step in range(steps):
             seen[name].append(seat.step(np.full((2, 1), 0.5 * (-1) ** step, dtype=np.float32)))
 
-    lockstep.run(
-        learners={name: lambda name=name: learner(name, 12) for name in lockstep.seats},  # type: ignore[misc]
-        actors={name: lambda name=name: learner(name, 10**6) for name in lockstep.seats},  # type: ignore[misc]
-        streams={name: Streams(i) for i, name in enumerate(lockstep.seats)},
-        budgets=dict.fromkeys(lockstep.seats, 10**6),
-    )
+    acting = [
+        Participant(name, partial(learner, name, 12), partial(learner, name, 10**6), Streams(i))
+        for i, name in enumerate(world.seats)
+    ]
+    Lockstep([world], acting).run()
     for told in seen.values():
         for end in (4, 8, 12):
             rewards = np.sum([reward for _, reward, _, _ in told[end - 4 : end]], axis=0, dtype=np.float64)

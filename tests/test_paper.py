@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,6 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.paper import study_rows
+from benchmarks.paper_difference import difference
 from benchmarks.paper_document import markdown
 from cirl_marl import CirlError, RecipeError, cli
 from cirl_marl.errors import RunError
@@ -28,10 +30,11 @@ from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment
 from cirl_marl.paper.results import Evaluation, PaperRow, Result, Results, thinned
 from cirl_marl.paper.running import evaluate, outdated, run_row
 from cirl_marl.paper.selection import planned
-from cirl_marl.paper.table import table_rows
+from cirl_marl.paper.table import above_optimum, table_rows
 from cirl_marl.paper.training import PaperTraining, described, train_tuned
 
 COPPER = ENVIRONMENTS["CopperNet"]
+KEPT = Path(__file__).parent.parent / "benchmarks" / "results" / "paper"
 
 
 class Toy(gymnasium.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
@@ -282,12 +285,12 @@ def test_curves_are_thinned_to_means() -> None:
 
 def test_table_shows_both_and_what_was_not_run() -> None:
     """The paper's figures, ours over the seeds with all steps, shorter runs as such, and what is missing."""
-    runs = [result(end=-5e7), result(seed=1, end=-4e7), result(steps=500, end=-1.0), result("PPO", 50_000)]
+    runs = [result(end=-6e7), result(seed=1, end=-5e7), result(steps=500, end=-1.0), result("PPO", 50_000)]
     shown = {"recipe": {"learner": {"demonstrations": {"controller": "scripted", "steps": 7_500}}}}
     runs.append(result("ARS", settings=shown))
     rows = {(row[0], row[1]): row for row in table_rows(COPPER, runs)}
     assert rows["A2C", "paper"][3:7] == ("-1.34e8", "-5.30e7", "8.10e7", "405")
-    assert rows["A2C", "ours"][2:5] == ("0, 1", "-1.50e8 ± 0.00e8", "-4.50e7 ± 0.71e7")
+    assert rows["A2C", "ours"][2:5] == ("0, 1", "-1.50e8 ± 0.00e8", "-5.50e7 ± 0.71e7")
     assert rows["A2C", "ours"][-3:] == ("1.5", "1.0", "")
     assert rows["PPO", "ours"][-1] == "50,000 of 200,000 steps"
     assert rows["ARS", "ours"][-1] == "the first 7,500 steps, and r_s with them, are shown by scripted control"
@@ -327,16 +330,82 @@ def test_summary_says_what_was_reached() -> None:
         return [cell.strip() for cell in found.split("|")[1:-1]]
 
     near = line("CarboNet", "PPO", -1e6, [-1.10e5, -1.12e5])
-    assert near[1:4] == ["-2.04e6 (ARS)", "-1.00e6 ± 0.00e6", "yes"]
-    assert near[5:] == ["-1.07e5", "≥ -1.13e5 (5 % of the optimum)", "yes"]
-    assert line("CarboNet", "PPO", -3e6, [-1.10e5, -1.20e5])[3::4] == ["yes", "no"]
-    assert line("CarboNet", "PPO", -1e6, [-1.10e5], there=-3e6)[3] == "no"
-    assert line("TransportTruck", "PPO", -1.3e8, [-1.16e8])[3] == "no"
-    assert line("FetchWasteSorting", "TQC-HER", -9.0, [-8.0], 100.0)[3::4] == ["not comparable", "yes"]
+    assert near[1:5] == ["-2.04e6 (ARS)", "-1.00e6 ± 0.00e6", "4.00e4 ± 0.02449", "yes"]
+    assert near[6:] == ["-1.07e5", "≥ -1.13e5 (5 % of the optimum)", "yes"]
+    assert line("CarboNet", "PPO", -3e6, [-1.10e5, -1.20e5])[4::4] == ["yes", "no"]
+    assert line("CarboNet", "PPO", -1e6, [-1.10e5], there=-3e6)[4] == "no"
+    assert line("TransportTruck", "PPO", -1.3e8, [-1.18e8])[4:6] == ["no", "-1.18e8"]
+    assert line("FetchWasteSorting", "TQC-HER", -9.0, [-8.0], 100.0)[3:5] == ["", "not comparable"]
+    assert line("FetchWasteSorting", "TQC-HER", -9.0, [-8.0], 100.0)[-1] == "yes"
     assert line("Reacher", "SAC", -5.0, [-4.0], 94.0)[-1] == "no"
-    assert line("Reacher", "SAC", -5.0, [-4.0], 95.0)[4:] == ["-4, s 95 %", "not known", "s ≥ 95 %", "yes"]
-    assert line("CO2MicroalgaeDroop", "PPO", 480.0, [450.0])[-2:] == ["", ""]
+    assert line("Reacher", "SAC", -5.0, [-4.0], 95.0)[5:] == ["-4, s 95 %", "not known", "s ≥ 95 %", "yes"]
+    droop = line("CO2MicroalgaeDroop", "PPO", 480.0, [450.0])
+    assert droop[1:3] == ["473 (A2C), chance: above the optimum", "480, chance: above the optimum"]
+    assert droop[5:] == ["450", "454", "", ""]
     assert markdown([], "## Mine\n").index("## Mine") < markdown([], "## Mine\n").index("## Reacher")
+
+
+@pytest.mark.parametrize(
+    ("ends", "one", "again", "error", "better"),
+    [
+        ([-5.0], 1.0, [], math.hypot(0.1, 0.1), "yes"),  # one run each, of 100 episodes
+        ([-5.5, -4.5], 1.0, [], math.hypot(0.5, 0.5**0.5), "within its error"),  # seeds vary by the root of a half
+        ([-5.0, -5.0], 4.0, [], math.hypot(0.4 / 2**0.5, 0.4), "within its error"),  # their episodes vary more
+        ([-5.0, -5.0], 1.0, [-4.0, -6.0], math.hypot(0.1 / 2**0.5, 2**0.5), "within its error"),
+        ([-6.0, -6.0], 1.0, [-5.0], math.hypot(0.1 / 2**0.5, 0.1), "no"),
+        ([-6.0, -5.0], 1.0, [], math.hypot(0.5, 0.5**0.5), "within its error"),  # no difference at all
+    ],
+)
+def test_differences_are_held_against_their_error(
+    ends: list[float], one: float, again: list[float], error: float, better: str
+) -> None:
+    """Two standard errors: of the mean over our seeds, and of the paper's one run, −5.5 with DDPG on Reacher."""
+
+    def reacher(end: float, seed: int, algorithm: str, settings: str) -> Result:
+        row = PaperRow(environment="Reacher", algorithm=algorithm, settings=settings, steps=100_000, seed=seed)
+        played = Evaluation(episodes=10_000, mean=-4.0, deviation=one, success=95.0)
+        return result(end=end, row=row, evaluation=played)
+
+    tuned = [reacher(end, seed, "SAC", "tuned") for seed, end in enumerate(ends)]
+    others = [reacher(end, seed, "DDPG", "published") for seed, end in enumerate(again)]
+    others += [reacher(end, seed, "SAC", "published") for seed, end in enumerate((-1.0, -99.0))]
+    found = difference(ENVIRONMENTS["Reacher"], tuned, [*tuned, *others])
+    assert found is not None
+    assert found.value == pytest.approx(np.mean(ends) + 5.5)
+    assert found.error == pytest.approx(2 * error)
+    assert found.better == better
+
+
+def test_what_the_kept_rows_say_is_better() -> None:
+    """As the prose beside the table says."""
+    kept = Results(KEPT).all()
+    found = {}
+    for name, environment in ENVIRONMENTS.items():
+        tuned = [each for each in kept if (each.row.environment, each.row.settings) == (name, "tuned")]
+        found[name] = getattr(difference(environment, tuned, kept), "better", "not comparable")
+    assert {name for name, better in found.items() if better == "yes"} == {"Reacher", "CO2MicroalgaeMonod", "CarboNet"}
+    assert {name for name, better in found.items() if better == "no"} == {"CO2MicroalgaeDroop"}
+    assert [name for name, better in found.items() if better == "not comparable"] == ["FetchWasteSorting"]
+
+
+def test_figures_above_the_optimum_are_chance() -> None:
+    """They are said to be so in the rows that have them, and lie within three standard errors of it."""
+    kept = Results(KEPT).all()
+    marked = 0
+    for environment in ENVIRONMENTS.values():
+        mine = [each for each in kept if each.row.environment == environment.name]
+        deviation = [each.evaluation.deviation for each in mine if each.row.settings == "tuned" and each.evaluation]
+        for each in mine:
+            figures = {"r_s": each.start_return, "r_e": each.end_return}
+            figures |= {"final policy": each.evaluation.mean} if each.evaluation is not None else {}
+            above = [name for name, value in figures.items() if above_optimum(environment, value)]
+            remark = next(row[-1] for row in table_rows(environment, [each]) if row[2])
+            assert (f"{', '.join(above)} above the optimum: chance" in remark) == bool(above)
+            for name in above:
+                error = np.mean(deviation) / each.window**0.5
+                assert figures[name] - environment.optima[0].value < 3 * error
+                marked += 1
+    assert marked > 20
 
 
 def test_published_table_is_whole() -> None:
@@ -402,14 +471,12 @@ def test_results_that_answer_another_question_are_outdated() -> None:
 @pytest.mark.medium
 def test_every_kept_row_is_of_the_definitions_of_today() -> None:
     """Those on record are those of today, as all are but in 16 early rows, and the document shows all rows."""
-    root = Path(__file__).parent.parent
-    folder = root / "benchmarks" / "results" / "paper"
-    kept = Results(folder).all()
+    kept = Results(KEPT).all()
     assert len(kept) > 80
     assert sum("definition_sha256" not in result.settings for result in kept) == 16
     assert [(str(result.row), why) for result in kept if (why := outdated(result))] == []
-    text = markdown(kept, (folder / "comment.md").read_text(encoding="utf-8"))
-    assert text == (root / "docs" / "paper_tables.md").read_text(encoding="utf-8")
+    text = markdown(kept, (KEPT / "comment.md").read_text(encoding="utf-8"))
+    assert text == (Path(__file__).parent.parent / "docs" / "paper_tables.md").read_text(encoding="utf-8")
 
 
 def test_results_need_a_directory(

@@ -71,7 +71,7 @@ def test_best_return_under_the_published_step_counter(name: str, published: floa
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_tuned_policies_beat_the_papers_best_in_its_episodes(name: str) -> None:
+def test_tuned_policies_return_more_than_the_papers_best_in_its_episodes(name: str) -> None:
     """Where episodes end as the published class ends them, they lie between the paper's best and the best possible."""
     there = [result.published_ends for result in tuned(name)]
     best = best_return(name, 49) + best_return(name, 1)

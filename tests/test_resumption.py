@@ -47,7 +47,7 @@ def test_a_failed_learner_does_not_take_the_good_checkpoint_with_it(tmp_path: Pa
             callbacks={"use": FailsAt(30)},
         )
     run = RunDirectory(directory)
-    assert run.status == {"state": "failed", "joint_steps": 28, "checkpoint": "000000028-running"} | {
+    assert run.status == {"state": "failed", "joint_steps": 28, "checkpoint": "000000028-running", "best": None} | {
         "reason": run.status["reason"]
     }
     assert sorted(path.name for path in (directory / "checkpoints").iterdir()) == [
@@ -61,7 +61,7 @@ def test_a_failed_learner_does_not_take_the_good_checkpoint_with_it(tmp_path: Pa
 def test_resumed_exploration_is_fresh(tmp_path: Path, ctrl_c_after: Any) -> None:
     """Before it learns, SAC draws its actions; after a resumption it does not draw the same ones again."""
     learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
-    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
+    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1, engine="lockstep", evaluations=0), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
     model = resume(tmp_path).learners["use"].model
@@ -73,7 +73,10 @@ def test_returns_of_several_steps_end_where_a_run_was_stopped(tmp_path: Path, ct
     """19 transitions were kept; the next begins an episode, so that no return goes on into it."""
     parameters = {"learning_starts": 100, "buffer_size": 100, "n_steps": 3}
     recipe = Recipe(
-        name="x", title="x", run=Run(steps=40, envs=1), learner=LearnerSettings(algorithm="SAC", parameters=parameters)
+        name="x",
+        title="x",
+        run=Run(steps=40, envs=1, engine="lockstep", evaluations=0),
+        learner=LearnerSettings(algorithm="SAC", parameters=parameters),
     )
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
@@ -116,7 +119,7 @@ def test_misspelt_callbacks_leave_nothing_behind(tmp_path: Path, ppo_recipe: Rec
 def test_lost_experience_is_an_error(damage: Callable[[Path], None], tmp_path: Path, ctrl_c_after: Any) -> None:
     """A replay buffer that is gone, or no longer one, is named instead of begun anew."""
     learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
-    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
+    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1, engine="lockstep", evaluations=0), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
     damage(RunDirectory(tmp_path).checkpoint / "use.replay.pkl.gz")
@@ -127,7 +130,7 @@ def test_lost_experience_is_an_error(damage: Callable[[Path], None], tmp_path: P
 def test_room_in_a_replay_buffer_costs_little(tmp_path: Path, ctrl_c_after: Any) -> None:
     """A checkpoint is not as large as the buffer may become, but as what is in it."""
     learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 1_000_000})
-    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), learner=learner)
+    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1, engine="lockstep", evaluations=0), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
     saved = RunDirectory(tmp_path).checkpoint / "use.replay.pkl.gz"
@@ -161,7 +164,7 @@ def test_a_complete_run_goes_on_to_more_steps(tmp_path: Path, ppo_recipe: Recipe
 def test_what_needs_its_past_does_not_go_on_without(tmp_path: Path) -> None:
     """A complete run has no replay buffers; it says so, and stays what it was."""
     learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
-    recipe = Recipe(name="x", title="x", run=Run(steps=20, envs=1), learner=learner)
+    recipe = Recipe(name="x", title="x", run=Run(steps=20, envs=1, engine="lockstep", evaluations=0), learner=learner)
     train("copper_net", recipe, agents=["use"], directory=tmp_path)
     with pytest.raises(RunError, match=r"keep no replay buffers, without which \['use'\] cannot go on"):
         resume(tmp_path, steps=40)
@@ -172,7 +175,9 @@ def test_an_interrupted_rollout_is_begun_anew(tmp_path: Path, ppo_recipe: Recipe
     """Steps whose rollout was lost do not count as learnt, however often the run is interrupted."""
     parameters = ppo_recipe.learner.parameters | {"n_steps": 40}
     learner = ppo_recipe.learner.model_copy(update={"parameters": parameters})
-    recipe = ppo_recipe.model_copy(update={"learner": learner, "run": Run(steps=160, envs=2)})
+    recipe = ppo_recipe.model_copy(
+        update={"learner": learner, "run": Run(steps=160, envs=2, engine="lockstep", evaluations=0)}
+    )
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["mine", "use"], directory=tmp_path, report=ctrl_c_after(100))
     for _ in range(3):
@@ -204,7 +209,7 @@ def test_demonstrations_have_room_in_a_run_that_goes_on(tmp_path: Path, ctrl_c_a
     """A run is not cut so short that nobody would learn from what is shown."""
     shown = Demonstrations(controller="neutral", steps=60)
     learner = LearnerSettings(algorithm="SAC", parameters={"buffer_size": 100}, demonstrations=shown)
-    recipe = Recipe(name="x", title="x", run=Run(steps=100, envs=1), learner=learner)
+    recipe = Recipe(name="x", title="x", run=Run(steps=100, envs=1, engine="lockstep", evaluations=0), learner=learner)
     with pytest.raises(KeyboardInterrupt):
         train("copper_net", recipe, agents=["use"], directory=tmp_path, report=ctrl_c_after(20))
     with pytest.raises(RecipeError, match="60 is more than the 30 steps"):
@@ -217,7 +222,13 @@ def test_the_experience_of_another_learner_is_refused(tmp_path: Path, ctrl_c_aft
     learner = LearnerSettings(algorithm="SAC", parameters={"learning_starts": 100, "buffer_size": 100})
     for name, observe in (("a", "local"), ("b", "full")):
         options: dict[str, Any] = {"observe": observe}
-        recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=1), environment=options, learner=learner)
+        recipe = Recipe(
+            name="x",
+            title="x",
+            run=Run(steps=40, envs=1, engine="lockstep", evaluations=0),
+            environment=options,
+            learner=learner,
+        )
         with pytest.raises(KeyboardInterrupt):
             train("copper_net", recipe, agents=["use"], directory=tmp_path / name, report=ctrl_c_after(20))
     kept = [RunDirectory(tmp_path / name).checkpoint / "use.replay.pkl.gz" for name in "ab"]
@@ -233,7 +244,7 @@ def test_a_policy_that_breaks_is_a_failure(algorithm: str, tmp_path: Path) -> No
     recipe = Recipe(
         name="x",
         title="x",
-        run=Run(steps=40, envs=1),
+        run=Run(steps=40, envs=1, engine="lockstep", evaluations=0),
         learner=LearnerSettings(algorithm=algorithm, parameters=parameters),
     )
     with pytest.raises(LearnerError, match="failed at joint step"):

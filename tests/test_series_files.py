@@ -122,6 +122,10 @@ def test_the_rest_of_a_share(tmp_path: Path) -> None:
     assert "arcs.sold.share: must be a table { value = …, unit = …, source = … }, got 0.5" in wrong
     wrong = refused(tmp_path, definition('"rest"'))
     assert "arcs.ore.flow: must be a table { value = …, unit = …, source = … }, got 'rest'" in wrong
+    flow = f"flow = {CONSTANT}"
+    for share in ('"rest"', HALF.removeprefix("share = ")):
+        wrong = refused(tmp_path, text.replace(flow, f"{flow}\nshare = {share}"))
+        assert "arcs.ore.share: law 'exogenous' takes none; shares need law = \"share\"" in wrong
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from cirl_marl import CirlError, DefinitionError, LearnerError, RecipeError
 from cirl_marl.learners import Recipe, RunDirectory, Training, load_recipe, resume, train
 from cirl_marl.learners.launch import prepared
-from cirl_marl.learners.learner import Learner
+from cirl_marl.learners.learner import Learner, load_model
 from cirl_marl.learners.trained import Trained
 
 AGENTS = ["mine", "use"]
@@ -41,7 +41,13 @@ def recipe(algorithm: str = "PPO", matches: list[dict[str, Any]] | None = None, 
         common["policy"] = "MlpLstmPolicy"
     told = [common | match for match in matches or []]
     return Recipe.model_validate(
-        {"name": "a", "title": "a", "run": {"steps": 24, "envs": 2}, "learner": common | learner, "match": told}
+        {
+            "name": "a",
+            "title": "a",
+            "run": {"steps": 24, "envs": 2, "evaluations": 0},
+            "learner": common | learner,
+            "match": told,
+        }
     )
 
 
@@ -95,13 +101,14 @@ def test_policy_before_the_first_update_is_that_of_the_run(algorithm: str, tmp_p
 
 
 def test_whoever_has_no_share_of_the_steps_only_acts(first: tuple[Training, Path], tmp_path: Path) -> None:
-    """Weights and statistics are bit-equal in the end, and its actions those of the other run; the other learns on."""
+    """Weights are bit-equal in the end, and its actions those of the other run; the other learns on."""
     source, path = first
     acting = [{"agents": ["mine"], **from_run(path, share_of_steps=0)}]
     found = train("copper_net", recipe(matches=acting, **from_run(path)), directory=tmp_path / "run", **OPTIONS)
     mine, use = (found.learners[name] for name in AGENTS)
     assert same(weights(mine), weights(source.learners["mine"]))
-    assert statistics(mine) == statistics(source.learners["mine"])
+    for learner in (mine, use):
+        assert statistics(learner) == statistics(source.learners[learner.name])
     assert not same(weights(use), weights(source.learners["use"])) and use.model.num_timesteps == 24
     before, after = Trained(path), Trained(tmp_path / "run")
     observations = found.env.reset(seed=[1, 2])
@@ -117,6 +124,18 @@ def test_shared_policy_has_a_start_too(tmp_path: Path) -> None:
     asked = recipe(scheme="shared", **from_run(tmp_path / "first"))
     (found,) = prepared("copper_net", asked, **OPTIONS).learners.values()
     assert same(weights(found), weights(source.learners["shared-learner"]))
+
+
+def test_start_is_the_best_checkpoint(tmp_path: Path) -> None:
+    """Where evaluations chose one, as whoever evaluates the run sees it."""
+    asked = recipe()
+    chosen = asked.model_copy(update={"run": asked.run.model_copy(update={"evaluations": 6, "episodes": 2})})
+    train("copper_net", chosen, directory=tmp_path / "first", **OPTIONS)
+    found = prepared("copper_net", recipe(**from_run(tmp_path / "first")), **OPTIONS)
+    folder = RunDirectory(tmp_path / "first").chosen
+    assert folder.name.endswith("-best") and found.config.origins["use"].checkpoint == folder.name
+    expected = load_model(folder, "use", "PPO").policy.state_dict()
+    assert same(weights(found.learners["use"]), expected)
 
 
 class FailsAtOnce(BaseCallback):

@@ -171,10 +171,11 @@ class Alone(Seat):
     def __init__(self, env: VectorEnv, seeds: list[int]) -> None:
         """Seat the only agent of ``env``."""
         self.joint = env
-        super().__init__(env, env.agents[0], OneAgent(env, env.agents[0]), self._step_alone)
+        super().__init__(env, env.agents[0], OneAgent(env, env.agents[0]), lambda: None)
         self.latest = np.ascontiguousarray(env.reset(seed=seeds)[self.name])
 
-    def _step_alone(self, _: Seat) -> VecEnvStepReturn:
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step the environment."""
         assert self.action is not None
         observations, rewards, _terminations, truncations, infos = self.joint.step({self.name: self.action})
         self.latest = np.ascontiguousarray(observations[self.name])
@@ -228,7 +229,7 @@ def test_different_rollouts_and_shares_finish_cleanly(ppo_recipe: Recipe) -> Non
     assert steps["mine"] == 84  # 14 rollouts of 3 steps in 2 copies: the first count of at least 80
     assert steps["use"] == 24
     assert steps["refinery"] == 80
-    assert training.lockstep.joint_steps == 42
+    assert training.joint_steps == 42
 
 
 def test_who_has_learnt_enough_acts_without_exploring(ppo_recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,13 +26,26 @@ def train(
     network: Annotated[
         str | None, typer.Argument(metavar="NETWORK", help="Catalogue name, FILE.toml or FILE.toml:REGION.")
     ] = None,
-    recipe: Annotated[str, typer.Option(help="Who learns how: catalogue name or .toml file.")] = "independent_ppo",
+    recipe: Annotated[str, typer.Option(help="Who learns how: catalogue name or .toml file.")] = "independent_ars",
     agents: Annotated[
         str | None, typer.Option(help="Who acts and learns, comma-separated ids; default: the network's choice.")
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Environment steps, summed over the copies.")] = None,
     envs: Annotated[int | None, typer.Option(min=1, help="Copies of the environment.")] = None,
+    engine: Annotated[
+        str | None, typer.Option(help="auto, lockstep or stacked (same learners as one); default: the recipe's.")
+    ] = None,
+    min_service: Annotated[
+        float | None,
+        typer.Option(
+            min=0, max=1, help="Level that each service must reach for a checkpoint to act; default: the recipe's."
+        ),
+    ] = None,
+    device: Annotated[str, typer.Option(help="Where stacked learners compute: cpu, cuda, …")] = "cpu",
     seed: Seed = 0,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="So many runs together, of this seed and the next ones, in OUT-seedN.")
+    ] = 1,
     scenario: Scenario = None,
     reward: Annotated[str | None, typer.Option(help=f"{', '.join(REWARDS)}; default: the recipe's.")] = None,
     observe: Annotated[
@@ -53,22 +66,32 @@ def train(
         raise CirlError(f"--resume goes on with the network of its run; leave out {network}")
     if resume is not None:
         _only_resume(context)
-    directory = resume or out
-    if directory is None:
-        directory = Path("runs") / f"{load_network(str(network)).name}-{Path(recipe).stem}-seed{seed}"
-    options: dict[str, Any] = {"steps": steps, "envs": envs, "seed": seed, "scenario": scenario, "reward": reward}
-    options |= {"observe": observe, "agents": None if agents is None else listed(agents)}
+    options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
+    options["min_service"] = min_service
+    options |= {"observe": observe, "agents": None if agents is None else listed(agents), "device": device}
+    directories = [resume] if resume is not None else _directories(out, str(network), recipe, range(seed, seed + seeds))
     with training_bar() as report:
+        options["report"] = report
         try:
             if resume is not None:
-                training = learners.resume(resume, steps=steps, report=report)
+                learners.resume(resume, steps=steps, report=report, device=device)
+            elif seeds > 1:
+                parent = str(directories[0]).removesuffix(f"-seed{seed}")
+                learners.train_seeds(str(network), recipe, seeds=range(seed, seed + seeds), directory=parent, **options)
             else:
-                training = learners.train(str(network), recipe, directory=directory, report=report, **options)
+                learners.train(str(network), recipe, seed=seed, directory=directories[0], **options)
         except KeyboardInterrupt:
-            console.print(f"\nstopped; {_kept(directory)}", soft_wrap=True, highlight=False)
+            for directory in directories:
+                console.print(f"\nstopped; {_kept(directory)}", soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None
-    assert training.run is not None
-    _evaluate_and_draw(training.run.path, episodes, 0)
+    for directory in directories:
+        _evaluate_and_draw(directory, episodes, 0)
+
+
+def _directories(out: Path | None, network: str, recipe: str, seeds: Sequence[int]) -> list[Path]:
+    """Return where the runs are kept."""
+    parent = out or Path("runs") / f"{load_network(network).name}-{Path(recipe).stem}"
+    return [out] if out is not None and len(seeds) == 1 else [Path(f"{parent}-seed{seed}") for seed in seeds]
 
 
 @app.command()
@@ -78,13 +101,14 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     """
     from cirl_marl.learners.run import RunDirectory
-    from cirl_marl.report.run import evaluate_run
+    from cirl_marl.report.run import choice, evaluate_run
     from cirl_marl.report.tables import evaluation_table, local_returns_table
 
     with shares() as progress:
         figures, rollouts, env = evaluate_run(RunDirectory(run), episodes=episodes, seed=seed, progress=progress)
     console.print(evaluation_table(figures))
     console.print(local_returns_table(figures))
+    say(choice(RunDirectory(run)))
     _say_shortages(rollouts, env.network)
     if "no_bound" in figures:
         say(f"gap to bound: {figures['no_bound']}")
@@ -166,7 +190,7 @@ def _only_resume(context: typer.Context) -> None:
     given = [
         f"--{name}"
         for name in context.params
-        if name not in ("resume", "network", "episodes", "steps")
+        if name not in ("resume", "network", "episodes", "steps", "device")
         and getattr(context.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT"
     ]
     if given:
@@ -195,13 +219,14 @@ def _say_shortages(rollouts: Mapping[str, Rollout], network: Network) -> None:
 
 def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:
     from cirl_marl.learners.run import RunDirectory
-    from cirl_marl.report.run import draw_run, evaluate_run
+    from cirl_marl.report.run import choice, draw_run, evaluate_run
     from cirl_marl.report.tables import evaluation_table
 
     run = RunDirectory(directory)
     with shares() as progress:
         figures, rollouts, env = evaluate_run(run, episodes=episodes, seed=seed, bounds=False, progress=progress)
     console.print(evaluation_table(figures))
+    say(choice(run))
     _say_shortages(rollouts, env.network)
     for path in draw_run(run, rollouts, env):
         say(f"picture: {path}")

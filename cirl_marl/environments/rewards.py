@@ -13,6 +13,9 @@ from cirl_marl.environments.state import State
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 
+WEIGHED = ("mixed", "mixed_difference", "team")
+"""Rewards in which λ has a weight, and so services a price."""
+
 CELLS = 4_000_000
 """Largest number of stocks and inner states that difference rewards re-simulate at once."""
 
@@ -37,9 +40,12 @@ class Credit:
         """Pay ``agents`` by ``mode``; ``measure`` is ``end`` or ``mean``."""
         self.mode, self._measure = mode, measure
         self._dynamics, self._scoring, self._agents = dynamics, scoring, tuple(agents)
-        objective = dynamics.network.objective
-        self._rest = 1.0 - objective.circularity_weight
-        self._per_mass = objective.circularity_weight / objective.circularity_scale
+        self.weigh(dynamics.network.objective.circularity_weight)
+
+    def weigh(self, weight: float) -> None:
+        """Pay by this weight of λ from now on."""
+        self.weight, self._rest = weight, 1.0 - weight
+        self._per_mass = weight / self._dynamics.network.objective.circularity_scale
 
     def circularity(self, state: State, transition: Transition, flow: Floats) -> tuple[Floats, Floats, Floats]:
         """Return λ at the end of the interval, its mean over the interval, and m_fb, shape (B,) each, mass.

@@ -111,6 +111,15 @@ class VectorEnv:
         _keep_freed_memory()
 
     @property
+    def circularity_weight(self) -> float:
+        """Weight of λ in the reward, in [0, 1]; another one counts from the next step on."""
+        return self._credit.weight
+
+    @circularity_weight.setter
+    def circularity_weight(self, weight: float) -> None:
+        self._credit.weigh(_share(weight))
+
+    @property
     def neutral_action(self) -> dict[str, Floats]:
         """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each."""
         return self._actuators.neutral_action(self._coming())

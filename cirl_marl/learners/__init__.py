@@ -10,12 +10,12 @@ from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.run import RunDirectory
 
 if TYPE_CHECKING:
-    from cirl_marl.learners.launch import resume, train
+    from cirl_marl.learners.launch import resume, train, train_seeds
     from cirl_marl.learners.training import Progress, Training
 
-__all__ = ["Progress", "Recipe", "RunDirectory", "Training", "load_recipe", "resume", "train"]
+__all__ = ["Progress", "Recipe", "RunDirectory", "Training", "load_recipe", "resume", "train", "train_seeds"]
 
-_HOME = {"Progress": "training", "Training": "training", "resume": "launch", "train": "launch"}
+_HOME = {"Progress": "training", "Training": "training", "resume": "launch", "train": "launch", "train_seeds": "launch"}
 
 
 def __getattr__(name: str) -> Any:

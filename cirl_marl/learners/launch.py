@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,24 +17,27 @@ from cirl_marl.definitions.reading import write_network
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.algorithms import has_replay_buffer
-from cirl_marl.learners.recipe import OPTIONS, Recipe, load_recipe
+from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run import RunConfig, RunDirectory
 from cirl_marl.learners.streams import global_streams_claimed
-from cirl_marl.learners.training import Progress, Training
+from cirl_marl.learners.training import Progress, Training, run_together
 from cirl_marl.network import Network
 
 
 def train(
     network: str | Path | Network,
-    recipe: str | Path | Recipe = "independent_ppo",
+    recipe: str | Path | Recipe = "independent_ars",
     *,
     directory: str | Path | None = None,
     steps: int | None = None,
     envs: int | None = None,
+    engine: str | None = None,
+    min_service: float | None = None,
     seed: int = 0,
     agents: Sequence[str] | None = None,
     callbacks: Mapping[str, BaseCallback] | None = None,
     report: Callable[[Progress], None] | None = None,
+    device: str = "cpu",
     **options: Any,
 ) -> Training:
     """Train the learners of all agents, all at once, in the same coupled environment.
@@ -47,10 +50,13 @@ def train(
         directory: where the run is kept; None keeps it in memory only.
         steps: environment steps, summed over the copies; None takes the recipe's.
         envs: copies of the environment; None takes the recipe's.
+        engine: ``auto``, ``lockstep`` or ``stacked``; None takes the recipe's.
+        min_service: level of every service that the best checkpoint must assure; None takes the recipe's.
         seed: from which every random stream derives.
         agents: who acts and learns; None takes the network's choice.
-        callbacks: Stable-Baselines3 callbacks by name of the learner.
+        callbacks: Stable-Baselines3 callbacks by name of the learner; learners that have one run in lockstep.
         report: called after every joint step.
+        device: where stacked learners compute, as torch names it.
         **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``, ``horizon``; they
             override the recipe's.
 
@@ -61,21 +67,56 @@ def train(
         CirlError: for input that cannot be used, before anything is written.
         LearnerError: if a learner fails; what was learnt is saved first.
     """
-    parameters = inspect.signature(train).parameters.values()
-    known = (*OPTIONS, *(parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY))
-    for option in options:
-        if option not in known:
-            raise CirlError(unknown("option", option, known))
+    _check(options, train)
+    kept = None if directory is None else [Path(directory)]
+    asked = {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents, **options}
+    (training,) = _train(network, recipe, [seed], kept, callbacks=callbacks, report=report, device=device, **asked)
+    return training
+
+
+def train_seeds(
+    network: str | Path | Network,
+    recipe: str | Path | Recipe = "independent_ars",
+    *,
+    seeds: Sequence[int],
+    directory: str | Path | None = None,
+    report: Callable[[Progress], None] | None = None,
+    device: str = "cpu",
+    **options: Any,
+) -> list[Training]:
+    """Train once for each of ``seeds``, all step by step together, so that learners of all runs stack.
+
+    What is learnt does not depend on who learns beside it. Runs are kept in ``directory-seedN``; the other arguments
+    are those of ``train``.
+    """
+    _check(options, train, train_seeds)
+    kept = None if directory is None else [Path(f"{directory}-seed{seed}") for seed in seeds]
+    return _train(network, recipe, seeds, kept, report=report, device=device, **options)
+
+
+def _train(
+    network: str | Path | Network,
+    recipe: str | Path | Recipe,
+    seeds: Sequence[int],
+    directories: Sequence[Path] | None,
+    *,
+    callbacks: Mapping[str, BaseCallback] | None = None,
+    report: Callable[[Progress], None] | None = None,
+    device: str,
+    **options: Any,
+) -> list[Training]:
     with ExitStack() as claims:
         claims.enter_context(global_streams_claimed())
-        training = prepared(network, recipe, steps=steps, envs=envs, seed=seed, agents=agents, **options)
-        training.check_callbacks(callbacks or {})
-        if directory is not None:
-            run = _create(Path(directory), training.config, training.env.network)
+        trainings = [prepared(network, recipe, seed=seed, **options) for seed in seeds]
+        for training in trainings:
+            training.check_callbacks(callbacks or {})
+            training.stackable(callbacks or {})
+        for directory, training in zip(directories or (), trainings, strict=directories is not None):
+            run = _create(directory, training.config, training.env.network)
             claims.enter_context(run.claimed())
             training.keep_in(run)
-        training.start(callbacks=callbacks, report=report)
-    return training
+        run_together(trainings, callbacks=callbacks, report=report, device=device)
+    return trainings
 
 
 def prepared(
@@ -84,6 +125,8 @@ def prepared(
     *,
     steps: int | None = None,
     envs: int | None = None,
+    engine: str | None = None,
+    min_service: float | None = None,
     seed: int = 0,
     agents: Sequence[str] | None = None,
     **options: Any,
@@ -91,6 +134,12 @@ def prepared(
     """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
     found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     steps = found.run.steps if steps is None else _whole("steps", steps, 1)
+    if engine is not None and engine not in ENGINES:
+        raise CirlError(unknown("engine", engine, ENGINES))
+    if min_service is not None and not 0 <= min_service <= 1:
+        raise CirlError(f"min_service must be a level in [0, 1], got {min_service}")
+    asked = {key: value for key, value in {"engine": engine, "min_service": min_service}.items() if value is not None}
+    found = found.model_copy(update={"run": found.run.model_copy(update=asked)})
     found.check(steps)
     given = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
     settings = found.environment | given
@@ -122,6 +171,7 @@ def resume(
     steps: int | None = None,
     callbacks: Mapping[str, BaseCallback] | None = None,
     report: Callable[[Progress], None] | None = None,
+    device: str = "cpu",
 ) -> Training:
     """Go on with an interrupted run from its last checkpoint, or with a complete one to more steps than it has.
 
@@ -134,6 +184,7 @@ def resume(
         steps: environment steps of the whole run, summed over the copies; None takes what was first asked for.
         callbacks: Stable-Baselines3 callbacks by name of the learner; a run does not keep those that it began with.
         report: called after every joint step.
+        device: where stacked learners compute, as torch names it.
 
     Raises:
         CirlError: if the run has ``steps`` behind it.
@@ -148,7 +199,7 @@ def resume(
         training.check_callbacks(callbacks or {})
         run.go_on(config)
         training.keep_in(run)
-        training.start(callbacks=callbacks, report=report)
+        run_together([training], callbacks=callbacks, report=report, device=device)
     return training
 
 
@@ -187,6 +238,16 @@ def _create(directory: Path, config: RunConfig, network: Network) -> RunDirector
         except CirlError as error:
             raise RunError(f"{directory}: a run on disk needs a network that can be read again: {error}") from error
         return RunDirectory.create(directory, config.model_copy(update={"scenario": "default"}), written)
+
+
+def _check(options: Iterable[str], *functions: Callable[..., object]) -> None:
+    """Refuse options that are neither the environment's nor keywords of these functions."""
+    parameters = [each for function in functions for each in inspect.signature(function).parameters.values()]
+    keywords = (each.name for each in parameters if each.kind is each.KEYWORD_ONLY)
+    known = dict.fromkeys((*OPTIONS, *keywords))
+    for option in options:
+        if option not in known:
+            raise CirlError(unknown("option", option, known))
 
 
 def _whole(name: str, value: object, least: int) -> int:

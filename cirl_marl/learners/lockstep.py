@@ -1,23 +1,24 @@
-"""Many unmodified learners in one joint environment, in lockstep.
+"""Many learners in one joint environment, in lockstep; or in several environments at once.
 
-Each learner's own ``learn()`` runs in a greenlet against its ``Seat``. A seat's ``step_wait`` switches back here; when
-every learner has handed in its actions, the joint environment moves once and the learners go on, in a fixed order.
+Each learner's own ``learn()`` runs unmodified in a greenlet against its ``Seat``. A seat's ``step_wait`` switches back
+here; when every learner has handed in its actions, the joint environment moves once and the learners go on, in a fixed
+order. Who occupies several seats, of one environment or of more, hands in all their actions before it waits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import copy_context
+from dataclasses import dataclass
 
 import numpy as np
-from greenlet import GreenletExit, greenlet
+from greenlet import GreenletExit, getcurrent, greenlet
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import ControlError, LearnerError
-from cirl_marl.learners.seat import Seat
+from cirl_marl.learners.seat import JointStep, Seat
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.views import OneAgent, View
 
@@ -29,14 +30,18 @@ class BudgetSpent(GreenletExit):  # type: ignore[misc]
 
 
 class Interrupted(Exception):
-    """Raised by a step hook to end training early; what was learnt is kept."""
+    """Raised to end training early; what was learnt is kept."""
 
 
-class Lockstep:
-    """Seats the learners of one batched environment and lets them run together.
+def wait() -> None:
+    """Leave a learner's coroutine until the joint step is done."""
+    getcurrent().parent.switch()
 
-    Learners are resumed in the order of ``seats``. ``joint_steps`` are control intervals done, each in every copy,
-    those of a run that is resumed included.
+
+class World:
+    """A batched environment with the seats of its learners.
+
+    ``joint_steps`` are control intervals done, each in every copy, those of a run that is resumed included.
     """
 
     def __init__(
@@ -49,74 +54,18 @@ class Lockstep:
         """
         self.env = env
         self.joint_steps = done
-        self._hub = greenlet.getcurrent()
-        self._own = Streams()
-        self._streams: dict[str, Streams] = {}
-        self._coroutines: dict[str, greenlet] = {}
-        self._outcomes: dict[str, VecEnvStepReturn] = {}
-        self._learning: set[str] = set()
         views = views if views is not None else {agent: OneAgent(env, agent) for agent in env.agents}
-        self.seats = {name: Seat(env, name, view, self._exchange) for name, view in views.items()}
+        self.seats = {name: Seat(env, name, view, wait) for name, view in views.items()}
         self._show(env.reset(seed=list(seeds)))
         self._returns = np.zeros((len(env.agents), env.num_envs))
         self._lengths = np.zeros(env.num_envs, dtype=int)
 
-    def run(
-        self,
-        learners: Mapping[str, Callable[[], None]],
-        actors: Mapping[str, Callable[[], None]],
-        streams: Mapping[str, Streams],
-        budgets: Mapping[str, int],
-        hook: StepHook | None = None,
-    ) -> None:
-        """Run every learner to its end.
-
-        Args:
-            learners: by name, what learns; returns when it has learnt enough.
-            actors: by name, what acts for ever once its learner is done, so that the others' world goes on.
-            streams: by name, its random streams.
-            budgets: by name, joint steps after which a learner that has not returned is stopped by ``BudgetSpent``.
-            hook: called after each joint step, in the caller's random streams; may raise ``Interrupted``.
+    def step(self, hook: StepHook | None = None) -> None:
+        """Move by the actions that were handed in, and show every seat what came of it.
 
         Raises:
-            LearnerError: if a learner raises; names it and the joint step.
-            Interrupted: if the hook raised it.
+            LearnerError: if an action cannot be used.
         """
-        self._hub = greenlet.getcurrent()
-        self._streams = dict(streams)
-        self._learning = set(self.seats)
-        try:
-            for name in self.seats:
-                self._coroutines[name] = greenlet(self._task(name, learners[name], actors[name]))
-                self._coroutines[name].gr_context = copy_context()
-                self._resume(name)
-            while self._learning:
-                self._step_jointly(hook)
-                for name in self.seats:
-                    self._resume(name)
-                    if name in self._learning and self.joint_steps >= budgets[name]:
-                        self._stop_learning(name)
-        finally:
-            self._end()
-
-    def _task(self, name: str, learn: Callable[[], None], act: Callable[[], None]) -> Callable[[], None]:
-        def run() -> None:
-            try:
-                learn()
-            except GreenletExit:
-                if name in self._learning:
-                    return  # training is over for everyone
-            self._learning.discard(name)
-            act()
-
-        return run
-
-    def _show(self, observations: Arrays) -> None:
-        """Show every learner the current observations."""
-        for seat in self.seats.values():
-            seat.latest = seat.view.observe(observations, self.env.state)
-
-    def _step_jointly(self, hook: StepHook | None) -> None:
         actions: dict[str, NDArray[np.floating]] = {}
         for seat in self.seats.values():
             assert seat.action is not None
@@ -127,55 +76,125 @@ class Lockstep:
             raise LearnerError(f"a learner failed at joint step {self.joint_steps}: {error}") from error
         self.joint_steps += 1
         done = next(iter(truncations.values()))
-        self._returns += list(rewards.values())
-        self._lengths += 1
-        self._show(observations)
+        self._returns = self._returns + list(rewards.values())
+        self._lengths = self._lengths + 1
         returns = dict(zip(self.env.agents, self._returns, strict=True))
-        for name, seat in self.seats.items():
-            final = None
-            if done.any():
-                final = seat.view.observe(
-                    {agent: infos[agent]["final_observation"] for agent in seat.view.agents},
-                    lambda: infos[self.env.agents[0]]["final_state"],
-                )
-            self._outcomes[name] = seat.outcome(rewards, done, returns, self._lengths, final)
+        step = JointStep(rewards, done, returns, self._lengths, infos)
+        for seat in self.seats.values():
+            seat.last = step
+        self._show(observations)
         if hook is not None:
             if done.any():
                 for agent, total in returns.items():
                     infos[agent]["episode_return"] = total.copy()
             hook(infos, done)
-        self._returns[:, done] = 0.0
-        self._lengths[done] = 0
+        self._returns, self._lengths = np.where(done, 0.0, self._returns), np.where(done, 0, self._lengths)
 
-    def _exchange(self, seat: Seat) -> VecEnvStepReturn:
-        """Leave the learner's coroutine until the joint step is done."""
-        self._hub.switch()
-        return self._outcomes.pop(seat.name)
+    def _show(self, observations: Arrays) -> None:
+        """Show every learner the current observations."""
+        for seat in self.seats.values():
+            seat.latest = seat.view.observe(observations, self.env.state)
 
-    def _resume(self, name: str) -> None:
+
+@dataclass(frozen=True, slots=True)
+class Participant:
+    """Who acts in one or more seats.
+
+    Attributes:
+        title: what messages call it.
+        learn: learns, waiting for each joint step; returns when it has learnt enough.
+        act: acts for ever, once ``learn`` is done, so that the others' world goes on.
+        streams: its random streams.
+        budget: joint steps after which it is stopped by ``BudgetSpent``, if it has not returned.
+    """
+
+    title: str
+    learn: Callable[[], None]
+    act: Callable[[], None]
+    streams: Streams
+    budget: int = 2**62
+
+
+class Lockstep:
+    """Lets those who act in some worlds run together; all worlds move at once."""
+
+    def __init__(self, worlds: Sequence[World], participants: Sequence[Participant]) -> None:
+        """``participants`` are resumed in their order; together they occupy every seat of ``worlds``."""
+        self._worlds, self._participants = worlds, participants
+        self._own = Streams()
+        self._coroutines: list[greenlet] = []
+        self._learning: set[int] = set()
+
+    def run(self, hooks: Sequence[StepHook] | None = None, interrupted: Callable[[], bool] = lambda: False) -> None:
+        """Run every learner to its end.
+
+        Args:
+            hooks: of each world, called after each joint step, in the caller's random streams.
+            interrupted: asked after each joint step whether this is enough.
+
+        Raises:
+            LearnerError: if a learner raises; names it and the joint step.
+            Interrupted: if it was enough.
+        """
+        self._learning = set(range(len(self._participants)))
         try:
-            self._enter(name, self._coroutines[name].switch)
-        except Exception as error:
-            who = self.seats[name].title
-            raise LearnerError(f"{who} failed at joint step {self.joint_steps}: {error!r}") from error
-        if self._coroutines[name].dead:
-            raise LearnerError(f"{self.seats[name].title} stopped acting at joint step {self.joint_steps}")
+            for i, participant in enumerate(self._participants):
+                self._coroutines.append(greenlet(self._task(i, participant)))
+                self._coroutines[i].gr_context = copy_context()
+                self._resume(i)
+            while self._learning:
+                for place, world in enumerate(self._worlds):
+                    world.step(hooks[place] if hooks is not None else None)
+                if interrupted():
+                    raise Interrupted
+                for i, participant in enumerate(self._participants):
+                    self._resume(i)
+                    if i in self._learning and self._joint_steps >= participant.budget:
+                        self._stop_learning(i)
+        finally:
+            self._end()
 
-    def _stop_learning(self, name: str) -> None:
+    @property
+    def _joint_steps(self) -> int:
+        """Steps that every world has behind it."""
+        return min(world.joint_steps for world in self._worlds)
+
+    def _task(self, i: int, participant: Participant) -> Callable[[], None]:
+        def run() -> None:
+            try:
+                participant.learn()
+            except GreenletExit:
+                if i in self._learning:
+                    return  # training is over for everyone
+            self._learning.discard(i)
+            participant.act()
+
+        return run
+
+    def _resume(self, i: int) -> None:
+        title, step = self._participants[i].title, self._joint_steps
+        try:
+            self._enter(i, self._coroutines[i].switch)
+        except Exception as error:
+            raise LearnerError(f"{title} failed at joint step {step}: {error!r}") from error
+        if self._coroutines[i].dead:
+            raise LearnerError(f"{title} stopped acting at joint step {step}")
+
+    def _stop_learning(self, i: int) -> None:
         """End ``learn()`` of a learner that has used up its steps; it goes on acting from its next turn."""
-        self._learning.discard(name)
-        self._enter(name, lambda: self._coroutines[name].throw(BudgetSpent))
+        self._learning.discard(i)
+        self._enter(i, lambda: self._coroutines[i].throw(BudgetSpent))
 
     def _end(self) -> None:
-        self._learning = set(self.seats)
-        for name, coroutine in self._coroutines.items():
+        self._learning = set(range(len(self._participants)))
+        for i, coroutine in enumerate(self._coroutines):
             if not coroutine.dead:
-                self._enter(name, lambda: coroutine.throw(GreenletExit))  # noqa: B023 (called at once)
+                self._enter(i, lambda: coroutine.throw(GreenletExit))  # noqa: B023 (called at once)
         self._coroutines.clear()
 
-    def _enter(self, name: str, action: Callable[[], object]) -> None:
-        """Do something in the random streams of a learner."""
-        streams = self._streams[name]
+    def _enter(self, i: int, action: Callable[[], object]) -> None:
+        """Do something in the random streams of a participant."""
+        streams = self._participants[i].streams
         self._own.switch_to(streams)
         try:
             action()

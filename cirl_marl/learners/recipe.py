@@ -30,6 +30,8 @@ from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
 
+Engine = Literal["auto", "lockstep", "stacked"]
+ENGINES: tuple[Engine, ...] = ("auto", "lockstep", "stacked")
 Count = Annotated[int, Field(strict=True, gt=0)]
 Limit = Annotated[Number, Field(gt=0)]
 
@@ -155,10 +157,34 @@ class Match(LearnerSettings):
 
 
 class Run(Settings):
-    """How long and in how many copies; the command line overrides it."""
+    """How long and in how many copies, by which engine, and which checkpoint counts; the command line overrides it."""
 
     steps: Count = Field(200_000, description="environment steps, summed over the copies")
     envs: Count = Field(16, description="copies of the environment")
+    common_random_numbers: StrictBool = Field(
+        False,
+        description="whether episodes that run side by side begin alike and draw the same, so that they differ by what "
+        "was done alone; the next ones begin elsewhere",
+    )
+    engine: Engine = Field(
+        "auto",
+        description="lockstep: each learner's own learn(), unmodified; stacked: learners of the same settings as one, "
+        "the same algorithm up to rounding and several times as fast; auto: stacks those that can be",
+    )
+    evaluations: Annotated[int, Field(strict=True, ge=0)] = Field(
+        20, description="evaluations during a run, the best of which is the checkpoint that counts; 0: the last one"
+    )
+    episodes: Count = Field(16, description="episodes of an evaluation")
+    min_service: Annotated[Number, Field(ge=0, le=1)] | None = Field(
+        None,
+        description="level that every service must reach for a checkpoint to be the best; of those that do, the best "
+        "has the highest mean circularity. Left out: the best is paid most",
+    )
+    price_rate: Annotated[Number, Field(ge=0)] = Field(
+        0.0,
+        description="largest step of the logarithm of the price of a shortfall of service, which moves after each "
+        "evaluation until min_service is reached; 0: circularity_weight stays as it is",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,6 +276,9 @@ class Recipe(Settings):
         for i, match in enumerate(self.match):
             if match.kind is None and match.role is None and match.agents is None:
                 yield f"match.{i}: fits every agent; give kind, role or agents"
+        if self.run.price_rate and (self.run.min_service is None or not self.run.evaluations):
+            lacks = "evaluations are 0" if self.run.min_service is not None else "min_service is not given"
+            yield f"run.price_rate: moves the price of service after evaluations to reach min_service, but {lacks}"
         for where, learner in self.learners():
             yield from (f"{where}.{mistake}" for mistake in learner.mistakes(steps))
 

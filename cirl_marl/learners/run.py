@@ -7,9 +7,11 @@
       network.toml         the definition that was trained on; network/network.toml, with its data files beside or
                            below it, if it has such
       versions.json        of Python and of every package that matters
-      status.json          state, joint steps, the checkpoint that counts; rewritten last, atomically
+      status.json          state, joint steps, the newest checkpoint and the best; rewritten last, atomically
       checkpoints/NNN/     LEARNER.zip (policy and optimiser), LEARNER.normaliser.pkl,
-                           LEARNER.replay.pkl.gz; an independent learner has the name of its agent
+                           LEARNER.replay.pkl.gz; an independent learner has the name of its agent;
+                           price.json, if the price of service moves
+      evaluations.csv      one row an evaluation during training: λ̄, service, whether it was the best so far
       metrics.csv          one row an episode: λ̄, service level, return of each agent
       tensorboard/LEARNER/ learning curves of each learner
       evaluation.json      written by an evaluation
@@ -23,7 +25,7 @@ import csv
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -144,25 +146,36 @@ class RunDirectory:
         status = self._json("status.json")
         fits = isinstance(status, dict) and {"state", "joint_steps", "checkpoint"} <= set(status)
         fits = fits and status["state"] in STATES and type(status["joint_steps"]) is int
-        if not fits or not isinstance(status["checkpoint"], str | None):
+        fits = fits and isinstance(status["checkpoint"], str | None) and _is_best(status.setdefault("best", None))
+        if not fits:
             raise RunError(f"{self.path / 'status.json'}: is not the status of a run: {status!r}")
         return status
 
-    def set_status(self, state: str, joint_steps: int, checkpoint: str | None, reason: str = "") -> None:
-        """Say how far the run got; written atomically."""
-        status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "reason": reason}
+    def set_status(
+        self, state: str, joint_steps: int, checkpoint: str | None, best: dict[str, Any] | None = None, reason: str = ""
+    ) -> None:
+        """Say how far the run got, and which checkpoint is the best; written atomically."""
+        status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "best": best, "reason": reason}
         write_json(self.path / "status.json", status)
 
     def go_on(self, config: RunConfig) -> None:
         """Say that the run goes on, to the steps of ``config``, which is the run's but for these."""
         write_json(self.path / "config.json", config.model_dump(mode="json"))
         status = self.status
-        self.set_status("running", status["joint_steps"], status["checkpoint"])
+        self.set_status("running", status["joint_steps"], status["checkpoint"], status["best"])
 
     @property
     def checkpoint(self) -> Path:
         """The newest complete checkpoint; a ``RunError`` if nothing was saved yet, or files of it are missing."""
-        name = self.status["checkpoint"]
+        return self._checkpoint(self.status["checkpoint"])
+
+    @property
+    def chosen(self) -> Path:
+        """The checkpoint that acts: the best by evaluation, or the newest if none was evaluated; errors likewise."""
+        status = self.status
+        return self._checkpoint(status["best"]["checkpoint"] if status["best"] is not None else status["checkpoint"])
+
+    def _checkpoint(self, name: str | None) -> Path:
         if name is None:
             raise RunError(f"{self.path}: nothing was saved in this run yet (state: {self.status['state']})")
         folder: Path = self.path / "checkpoints" / name
@@ -205,7 +218,24 @@ class RunDirectory:
 
         What a failed learner leaves behind may be of no use: if there is an older checkpoint, that goes on to count.
         """
-        folder = self.path / "checkpoints" / f"{joint_steps:09d}-{state}"
+        name = self._filled(f"{joint_steps:09d}-{state}", write)
+        status = self.status
+        before = status["checkpoint"] if state == "failed" else None
+        counts = before or name
+        self.set_status(state, int(counts.partition("-")[0]), counts, status["best"], reason)
+        self._drop_all_but({name, before, (status["best"] or {}).get("checkpoint")})
+
+    def save_best(self, joint_steps: int, write: Callable[[Path], None], figures: dict[str, float]) -> None:
+        """Let ``write`` fill the checkpoint that acts from now on, and note the ``figures`` that it was chosen by."""
+        name = self._filled(f"{joint_steps:09d}-best", write)
+        status = self.status
+        best = {"checkpoint": name, "joint_steps": joint_steps, "figures": figures}
+        self.set_status(status["state"], status["joint_steps"], status["checkpoint"], best, status.get("reason", ""))
+        self._drop_all_but({name, status["checkpoint"]})
+
+    def _filled(self, name: str, write: Callable[[Path], None]) -> str:
+        """Let ``write`` fill the checkpoint ``name``, which is there when all of it is on the disk."""
+        folder = self.path / "checkpoints" / name
         partial = folder.with_name(folder.name + ".partial")
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
@@ -215,11 +245,11 @@ class RunDirectory:
         shutil.rmtree(folder, ignore_errors=True)
         partial.replace(folder)
         sync(folder.parent)
-        before = self.status["checkpoint"] if state == "failed" else None
-        counts = before or folder.name
-        self.set_status(state, int(counts.partition("-")[0]), counts, reason)
-        for other in folder.parent.iterdir():
-            if other.name not in (folder.name, before):
+        return name
+
+    def _drop_all_but(self, names: Collection[str | None]) -> None:
+        for other in (self.path / "checkpoints").iterdir():
+            if other.name not in names:
                 shutil.rmtree(other)
 
     def metrics(self) -> dict[str, list[float]]:
@@ -230,6 +260,10 @@ class RunDirectory:
             return {name: [float(row[i]) for row in rows] for i, name in enumerate(header)}
         except (ValueError, IndexError) as error:
             raise RunError(f"{path}: cannot be read: {error}") from error
+
+    def evaluations(self) -> int:
+        """Return how many evaluations there were during training."""
+        return len(_complete_rows(self._file("evaluations.csv"))) - 1
 
     def _file(self, name: str) -> Path:
         path = self.path / name
@@ -256,6 +290,14 @@ def _complete_rows(path: Path) -> list[list[str]]:
     return list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
 
 
+def _is_best(best: object) -> bool:
+    """Return whether ``status.json`` says which checkpoint is the best, or that none is."""
+    if best is None:
+        return True
+    fits = isinstance(best, dict) and set(best) == {"checkpoint", "joint_steps", "figures"}
+    return fits and isinstance(best["checkpoint"], str) and isinstance(best["figures"], dict)  # type: ignore[index]
+
+
 class MetricsFile:
     """Appends a row per joint episode to ``metrics.csv``; ``seconds`` is the training time of rows that were there."""
 
@@ -278,3 +320,27 @@ class MetricsFile:
         """Write a row."""
         with self._path.open("a", newline="") as file:
             file.write(",".join(f"{value:.10g}" for value in row) + "\n")
+
+
+class EvaluationsFile:
+    """Appends a row per evaluation to ``evaluations.csv``."""
+
+    COLUMNS = ("joint_step", "env_steps", "circularity", "service", "assured", "paid", "circularity_weight", "best")
+
+    def __init__(self, path: Path, done: int) -> None:
+        """Open the file; rows past joint step ``done``, which a resumed run will repeat, are dropped."""
+        rows = [list(self.COLUMNS)]
+        if path.is_file():
+            try:
+                rows += [row for row in _complete_rows(path)[1:] if float(row[0]) <= done]
+            except (ValueError, IndexError) as error:
+                raise RunError(f"{path}: cannot be read: {error}") from error
+        text = "".join(",".join(row) + "\n" for row in rows)
+        write_atomically(path, lambda temporary: temporary.write_text(text))
+        self._path = path
+
+    def append(self, joint_step: int, copies: int, figures: dict[str, float], best: bool) -> None:
+        """Write a row."""
+        own = [joint_step, joint_step * copies, *(f"{figures[name]:.10g}" for name in self.COLUMNS[2:-1]), int(best)]
+        with self._path.open("a", newline="") as file:
+            file.write(",".join(map(str, own)) + "\n")

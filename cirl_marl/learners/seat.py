@@ -3,17 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn
 
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.views import ObservedRows, View
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Compartment
+
+
+@dataclass(frozen=True, slots=True)
+class JointStep:
+    """What a joint step brought.
+
+    Attributes:
+        rewards: of this step by agent, shape (B,).
+        done: the copies whose episode ended, shape (B,).
+        returns: of the episodes so far by agent, shape (B,).
+        lengths: of the episodes so far, shape (B,).
+        infos: of the environment.
+    """
+
+    rewards: Mapping[str, Floats]
+    done: NDArray[np.bool_]
+    returns: Mapping[str, Floats]
+    lengths: NDArray[np.integer]
+    infos: Infos
 
 
 class CopyView:
@@ -52,18 +72,20 @@ class Seat(VecEnv):
     Attributes:
         name: of the learner; an independent learner has its agent's.
         latest: the observation that it acts on next, one row for each row of its view.
+        last: the joint step that is behind it.
         action: what it last did.
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
     """
 
-    def __init__(self, env: VectorEnv, name: str, view: View, exchange: Callable[[Seat], VecEnvStepReturn]) -> None:
-        """Seat the learner ``name``; ``exchange`` hands in its action and waits for the outcome of the joint step."""
+    def __init__(self, env: VectorEnv, name: str, view: View, wait: Callable[[], object]) -> None:
+        """Seat the learner ``name``; ``wait`` returns when every learner has acted and the environment has moved."""
         self.name, self.view, self.copies = name, view, env.num_envs
         self.latest: ObservedRows | None = None
+        self.last: JointStep | None = None
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
         self.views = [CopyView(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
-        self._exchange = exchange
+        self._wait = wait
         super().__init__(len(self.views), view.observation_space, view.action_space)
 
     @property
@@ -71,32 +93,26 @@ class Seat(VecEnv):
         """What messages call the learner."""
         return f"agent '{self.name}'" if self.view.agents == (self.name,) else f"learner '{self.name}'"
 
-    def outcome(
-        self,
-        rewards: Mapping[str, Floats],
-        done: NDArray[np.bool_],
-        returns: Mapping[str, Floats],
-        lengths: NDArray[np.integer],
-        final: ObservedRows | None,
-    ) -> VecEnvStepReturn:
-        """Put together what a joint step brought the learner.
+    def paid(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Return the reward of each row, and whether its episode ended; arrays of its own, which PPO adds to."""
+        last = self._past
+        return self.view.score(last.rewards).astype(np.float32), np.tile(last.done, self.num_envs // self.copies)
 
-        ``rewards`` are those of this step, ``returns`` and ``lengths`` those of the episode so far, ``done`` the copies
-        whose episode ended, each of shape (B,), and ``final`` the last observation of these; None if there is none.
-        """
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        ended = np.tile(done, self.num_envs // self.copies)
-        if final is not None:
-            scores = self.view.score(returns)
-            for row in np.flatnonzero(ended):
-                infos[row] = {
-                    "TimeLimit.truncated": self.bootstrap,
-                    "terminal_observation": _row(final, int(row)),
-                    "episode": {"r": float(scores[row]), "l": int(lengths[row % self.copies]), "t": 0.0},
-                }
-        assert self.latest is not None
-        # arrays of its own: PPO adds the bootstrap value to the rewards in place
-        return self.latest, self.view.score(rewards).astype(np.float32), ended, infos
+    def final_observation(self) -> ObservedRows:
+        """Return what was seen last in the episodes that ended; other rows hold what is seen now."""
+        infos = self._past.infos
+        seen = {agent: infos[agent]["final_observation"] for agent in self.view.agents}
+        return self.view.observe(seen, lambda: infos[self.view.agents[0]]["final_state"])
+
+    def episode_returns(self) -> Floats:
+        """Return the sum of the rewards of each row in its episode so far."""
+        return self.view.score(self._past.returns)
+
+    @property
+    def _past(self) -> JointStep:
+        if self.last is None:
+            raise CirlError(f"the seat of {self.title} has no step behind it")
+        return self.last
 
     def reset(self) -> VecEnvObs:
         """Return the current observation of every copy."""
@@ -110,7 +126,18 @@ class Seat(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Wait until every learner has handed in its actions and the joint environment has moved."""
-        return self._exchange(self)
+        self._wait()
+        rewards, ended = self.paid()
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if ended.any():
+            final, scores, lengths = self.final_observation(), self.episode_returns(), self._past.lengths
+            for row in np.flatnonzero(ended):
+                infos[row] = {
+                    "TimeLimit.truncated": self.bootstrap,
+                    "terminal_observation": _row(final, int(row)),
+                    "episode": {"r": float(scores[row]), "l": int(lengths[row % self.copies]), "t": 0.0},
+                }
+        return self.reset(), rewards, ended, infos
 
     def close(self) -> None:
         """Do nothing: the joint environment is not the seat's to close."""

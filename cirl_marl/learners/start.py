@@ -1,7 +1,8 @@
 """A start from what was learnt in another run: its policy and the statistics of its observations.
 
 The policy comes whole, with critics and a learnt entropy coefficient. Optimiser, replay buffer, statistics of rewards
-and schedules begin anew, as rewards, copies and steps may be others now.
+and schedules begin anew, as rewards, copies and steps may be others now. The statistics of observations stay as they
+were: another environment shows other states more often, and a policy that sees the same state in other numbers forgets.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 import torch
 from sb3_contrib import ARS
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.environments.vector import VectorEnv
@@ -26,6 +28,18 @@ SHOWN = 3
 """Entries that a message lists of those that differ."""
 
 Bounds = tuple[float, float]
+
+
+class Settled(RunningMeanStd):
+    """Statistics that no longer follow what is seen."""
+
+    def __init__(self, known: RunningMeanStd) -> None:
+        """Stay with what is ``known``."""
+        super().__init__(shape=known.mean.shape)
+        self.mean, self.var, self.count = known.mean.copy(), known.var.copy(), known.count
+
+    def update_from_moments(self, batch_mean: Any, batch_var: Any, batch_count: float) -> None:
+        """Do nothing."""
 
 
 def begin_from(start: Start, learner: Learner, env: VectorEnv, seed: int) -> Origin:
@@ -47,7 +61,7 @@ def _begin_from(run: RunDirectory, name: str, learner: Learner, env: VectorEnv) 
     groups = {group.name: group for group in run.groups()}
     if name not in groups:
         raise RecipeError(f"{run.path}: {unknown('agent', name, groups)}")
-    there, source, folder = groups[name], run.make_env(1), run.checkpoint
+    there, source, folder = groups[name], run.make_env(1), run.chosen
     _refuse(f"{run.path}: '{name}'", [*_other_settings(there.spec, learner.spec)])
     seen = [_entries(*pair, learner.spec) for pair in ((source, there.agents), (env, learner.seat.view.agents))]
     _refuse(f"{run.path}: '{name}'", [*_other_entries(*seen), *_other_actions(there.view(source), learner.seat.view)])
@@ -77,7 +91,9 @@ def _take_over(model: BaseAlgorithm, normaliser: VecNormalize | None, learner: L
     if theirs is not None and own is not None:
         own.data.copy_(theirs.data)
     if normaliser is not None and isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
-        learner.env.obs_rms = normaliser.obs_rms
+        known = normaliser.obs_rms
+        settled = {key: Settled(each) for key, each in known.items()} if isinstance(known, dict) else Settled(known)
+        learner.env.obs_rms = settled  # type: ignore[assignment]
 
 
 def _other_settings(there: LearnerSettings, here: LearnerSettings) -> Iterator[str]:

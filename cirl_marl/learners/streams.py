@@ -41,6 +41,20 @@ class Streams:
             torch.set_grad_enabled(True)
             self._leave()
 
+    @property
+    def bit_generator(self) -> np.random.BitGenerator:
+        """The NumPy stream itself, while it is not active; who draws from it moves it on."""
+        return self._numpy
+
+    @property
+    def torch_state(self) -> torch.Tensor:
+        """State of the torch stream, while it is not active."""
+        return self._torch
+
+    @torch_state.setter
+    def torch_state(self, state: torch.Tensor) -> None:
+        self._torch = state
+
     @contextmanager
     def active(self) -> Iterator[None]:
         """Run the block with these streams; the ones active before come back after it."""

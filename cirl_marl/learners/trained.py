@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.learners.learner import load_model, load_normaliser
+from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.run import RunDirectory
-from cirl_marl.learners.views import unseen_state
 
 
-class Trained(Controller):
-    """Acts by the deterministic policies of a run's newest checkpoint, with their normalisers frozen.
+class Trained(Policies):
+    """Acts by the policies of the checkpoint that a run has chosen.
 
     ``checkpoint`` is the folder from which they were loaded; a run that is being trained has others later.
     """
@@ -25,21 +20,21 @@ class Trained(Controller):
     def __init__(self, run: str | Path | RunDirectory) -> None:
         """Load every policy; a ``RunError`` if the run is incomplete or a file of it cannot be read."""
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
-        self.checkpoint = folder = self.run.checkpoint
-        groups = self.run.groups()
+        self.checkpoint = folder = self.run.chosen
         env = self.run.make_env(1)
         self._seen = env.layout.names
-        self._views = {group.name: group.view(env) for group in groups}
-        self._models = {group.name: load_model(folder, group.name, group.spec.algorithm) for group in groups}
-        self._normalisers = {group.name: load_normaliser(folder, group.name, group.spec) for group in groups}
-        for name, view in self._views.items():
-            for loaded in (self._models[name], self._normalisers[name]):
+        policies: dict[str, Policy] = {}
+        for group in self.run.groups():
+            name, view = group.name, group.view(env)
+            model = load_model(folder, name, group.spec.algorithm)
+            normaliser = load_normaliser(folder, name, group.spec)
+            for loaded in (model, normaliser):
                 shapes = getattr(loaded, "observation_space", None), getattr(loaded, "action_space", None)
                 if loaded is not None and shapes != (view.observation_space, view.action_space):
                     what = f"the policy or normaliser of '{name}'"
                     raise RunError(f"{folder}: {what} is for other observations or actions")
-        self._memory: dict[str, Any] = {}
-        self._starts = np.ones(1, dtype=bool)
+            policies[name] = Policy(model, normaliser, view)
+        super().__init__(policies)
 
     def start(self, env: VectorEnv, seed: int) -> None:
         """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
@@ -52,20 +47,4 @@ class Trained(Controller):
                     f"{self.run.path}: '{agent}' learnt from other observations than this environment's ({other}); "
                     "make the environment with the options of the run, as its make_env() does"
                 )
-        self._memory = dict.fromkeys(self._models)
-        self._starts = np.ones(env.num_envs, dtype=bool)
-        self._state = unseen_state(env)
-
-    def act(self, observations: Arrays) -> Arrays:
-        """Return each policy's deterministic action, which depends on the observations of its agents alone."""
-        actions: dict[str, NDArray[np.floating]] = {}
-        for name, model in self._models.items():
-            view, normaliser = self._views[name], self._normalisers[name]
-            seen = view.observe(observations, self._state)
-            if normaliser is not None:
-                seen = normaliser.normalize_obs(seen)
-            starts = np.tile(self._starts, max(1, len(view.row_agents)))
-            chosen, self._memory[name] = model.predict(seen, self._memory[name], starts, deterministic=True)
-            actions.update(view.act(chosen))
-        self._starts = np.zeros_like(self._starts)
-        return actions
+        super().start(env, seed)

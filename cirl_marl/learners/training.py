@@ -1,11 +1,11 @@
-"""Training: seat the learners, let them run in lockstep, keep what they learn."""
+"""Training: seat the learners, let them run in lockstep or stacked, keep what they learn and choose the best of it."""
 
 from __future__ import annotations
 
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -17,14 +17,21 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
 
+from cirl_marl.environments.rewards import WEIGHED
 from cirl_marl.environments.vector import Infos, VectorEnv
-from cirl_marl.errors import CirlError, unknown
+from cirl_marl.errors import CirlError, RecipeError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
-from cirl_marl.learners.lockstep import Interrupted, Lockstep
-from cirl_marl.learners.run import MetricsFile, RunConfig, RunDirectory
+from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, World, wait
+from cirl_marl.learners.policies import Policies, Policy
+from cirl_marl.learners.price import ServicePrice
+from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory
+from cirl_marl.learners.selection import Evaluation, Score, score_of
+from cirl_marl.learners.stacked.conditions import Stack, first_obstacle, obstacle, stacks
 from cirl_marl.learners.start import begin_from
+from cirl_marl.learners.streams import Streams
 
 CHECKPOINTS = 10
 """Checkpoints of a run, evenly spaced; a crash loses at most what came after the last."""
@@ -50,6 +57,9 @@ class Progress:
     episode: bool
 
 
+Report = Callable[[Progress], None]
+
+
 class Training:
     """A run in progress: what it was asked to do, the joint environment, its learners by name, and where it is kept."""
 
@@ -59,21 +69,48 @@ class Training:
         self.env = env
         self.run: RunDirectory | None = None
         self._metrics: MetricsFile | None = None
-        self._interrupted = False
+        self._evaluations: EvaluationsFile | None = None
+        self._best: Score | None = None
+        self._bring_up_to_date: Callable[[], None] = lambda: None
         checkpoint = None
         self.done = 0
         if resumed is not None and resumed.status["checkpoint"] is not None:
             checkpoint, self.done = resumed.checkpoint, int(resumed.status["joint_steps"])
-        seeds = [derived_seed(config.seed, "copies", i, self.done) for i in range(config.envs)]
-        groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
-        self.lockstep = Lockstep(env, seeds, {name: group.view(env) for name, group in groups.items()}, done=self.done)
+        alike = config.recipe.run.common_random_numbers
+        seeds = [derived_seed(config.seed, "copies", 0 if alike else i, self.done) for i in range(config.envs)]
+        self.groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
+        views = {name: group.view(env) for name, group in self.groups.items()}
+        self.world = World(env, seeds, views, done=self.done)
         self.learners: dict[str, Learner] = {}
-        for name, seat in self.lockstep.seats.items():
-            learner = Learner(seat, groups[name].spec, config.seed, done=self.done)
-            self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
+        with one_torch_thread():
+            for name, seat in self.world.seats.items():
+                learner = Learner(seat, self.groups[name].spec, config.seed, done=self.done)
+                self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
         if checkpoint is None:
             self._begin_from_others()
+        self._price = self._priced(checkpoint)
+        asked = config.recipe.run
+        self._evaluation: Evaluation | None = None
+        if asked.evaluations:
+            own = VectorEnv(env.network, num_envs=asked.episodes, agents=env.agents, **config.options)
+            self._evaluation = Evaluation(own)
+        self._evaluated = -1
         self._appoint_demonstrators()
+
+    def _priced(self, checkpoint: Path | None) -> ServicePrice | None:
+        """Return the price of service if it moves; a resumed one goes on."""
+        asked = self.config.recipe.run
+        if not asked.price_rate or asked.min_service is None or not self.env.network.services:
+            return None
+        if self.env.reward_mode not in WEIGHED:
+            raise RecipeError(
+                f"recipe '{self.config.recipe.name}': run.price_rate: reward '{self.env.reward_mode}' has no price of "
+                f"service that could move; choose {', '.join(WEIGHED)}, or a price_rate of 0"
+            )
+        price = ServicePrice(self.env, asked.min_service, asked.price_rate)
+        if checkpoint is not None:
+            price.load(checkpoint)
+        return price
 
     def _begin_from_others(self) -> None:
         """Give learners their starts, and say in the configuration from where."""
@@ -86,13 +123,16 @@ class Training:
         self.config = self.config.model_copy(update={"origins": origins})
 
     def keep_in(self, run: RunDirectory) -> None:
-        """Keep metrics, logs and checkpoints in ``run`` from now on."""
+        """Keep metrics, logs, checkpoints and the best of them in ``run`` from now on."""
         self.run = run
         self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
         for name, learner in self.learners.items():
             learner.model.set_logger(configure(str(run.path / "tensorboard" / name), ["tensorboard"]))
+        best = run.status["best"]
+        self._best = score_of(best["figures"]) if best is not None else None
+        self._evaluations = EvaluationsFile(run.path / "evaluations.csv", self.done)
         if self.config.origins and self.joint_steps == 0:
-            self._save("running")  # so that the run does not need those from which it started any more
+            self.save("running")  # so that the run does not need those from which it started any more
 
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
@@ -105,52 +145,36 @@ class Training:
                 leader.check(learner.seat.view.agents, learner.seat.title)
                 learner.demonstrator = leader
 
-    def start(
-        self, *, callbacks: Mapping[str, BaseCallback] | None = None, report: Callable[[Progress], None] | None = None
-    ) -> None:
-        """Train to the end of the budget; the arguments are those of ``train``.
-
-        Raises:
-            LearnerError: if a learner fails; what was learnt is saved first, as it is after Ctrl-C.
-        """
-        callbacks = callbacks or {}
-        steps = self.config.steps
-        try:
-            with one_torch_thread(), self._interruptible():
-                self.lockstep.run(
-                    learners={a: partial(each.learn, steps, callbacks.get(a)) for a, each in self.learners.items()},
-                    actors={a: each.act for a, each in self.learners.items()},
-                    streams={a: each.streams for a, each in self.learners.items()},
-                    budgets={a: each.budget(steps) for a, each in self.learners.items()},
-                    hook=partial(self._after_step, time.perf_counter(), report),
-                )
-        except Interrupted:
-            self._save("interrupted", "stopped by the user")
-            raise KeyboardInterrupt from None
-        except Exception as error:
-            self._save("failed", str(error).partition("\n")[0] or repr(error))
-            raise
-        else:
-            self._save("complete")
-        finally:
-            for learner in self.learners.values():
-                learner.model.logger.close()
-
     def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
-        """Raise a ``CirlError`` for callbacks of learners that there are not."""
+        """Raise a ``CirlError`` for callbacks of learners that there are not, or that run as one with others."""
         for name in callbacks:
             if name not in self.learners:
                 raise CirlError(f"callbacks: {unknown('learner', name, self.learners)}")
+            if self.config.recipe.run.engine == "stacked":
+                title = self.learners[name].seat.title
+                raise CirlError(f"callbacks: {title}: engine stacked calls none; use engine lockstep or auto")
+
+    def stackable(self, callbacks: Mapping[str, BaseCallback]) -> list[Learner]:
+        """Return the learners that the engine of the run lets run as one with others.
+
+        Raises:
+            RecipeError: if all should, and one cannot; names it and what is in the way.
+        """
+        engine = self.config.recipe.run.engine
+        learners = list(self.learners.values())
+        if engine == "stacked" and (why := first_obstacle(learners)) is not None:
+            raise RecipeError(f"recipe '{self.config.recipe.name}': {why}; use engine auto or lockstep")
+        if engine == "lockstep":
+            return []
+        return [each for each in learners if each.name not in callbacks and obstacle(each) is None]
 
     @property
     def joint_steps(self) -> int:
         """Joint steps done, those before a resumption included."""
-        return self.lockstep.joint_steps
+        return self.world.joint_steps
 
-    def _after_step(
-        self, began: float, report: Callable[[Progress], None] | None, infos: Infos, ended: NDArray[np.bool_]
-    ) -> None:
-        """Report, record finished episodes, save checkpoints, heed Ctrl-C."""
+    def after_step(self, began: float, report: Report | None, infos: Infos, ended: NDArray[np.bool_]) -> None:
+        """Report, record finished episodes, evaluate, save checkpoints."""
         seconds, copies, steps = time.perf_counter() - began, self.env.num_envs, self.joint_steps
         finished = bool(ended.any())
         if finished or report is not None:
@@ -164,38 +188,144 @@ class Training:
                 returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
                 spent = self._metrics.seconds + seconds
                 self._metrics.append([steps, steps * copies, spent, circularity, service, *returns])
-        if steps % max(1, self.config.steps // copies // CHECKPOINTS) == 0:
-            self._save("running")
-        if self._interrupted:
-            raise Interrupted
+        planned = self.config.steps // copies
+        if self._evaluation is not None:
+            apart = max(self.env.network.episode.horizon, planned // self.config.recipe.run.evaluations)
+            if steps % apart == 0:
+                self._evaluate(self._evaluation)
+        if steps % max(1, planned // CHECKPOINTS) == 0:
+            self.save("running")
 
-    def _save(self, state: str, reason: str = "") -> None:
-        if self.run is None:
-            return
+    def finish(self) -> None:
+        """Evaluate what was learnt in the end, and keep it."""
+        if self._evaluation is not None and self._evaluated != self.joint_steps:
+            self._evaluate(self._evaluation)
+        self.save("complete")
 
-        def write(folder: Path) -> None:
-            for learner in self.learners.values():
-                learner.save(folder, replay=state != "complete")
+    def save(self, state: str, reason: str = "") -> None:
+        """Bring the models up to date, and write a checkpoint from which the run can go on, if it is kept."""
+        self._bring_up_to_date()
+        if self.run is not None:
+            self.run.save_checkpoint(self.joint_steps, partial(self._write, replay=state != "complete"), state, reason)
 
-        self.run.save_checkpoint(self.joint_steps, write, state, reason)
+    def _evaluate(self, evaluation: Evaluation) -> None:
+        """Play its episodes by the policies of now, keep these if they are the best so far, and move the price."""
+        self._bring_up_to_date()
+        policies = {
+            name: Policy(each.model, each.env if isinstance(each.env, VecNormalize) else None, each.seat.view)
+            for name, each in self.learners.items()
+        }
+        score, demanded = evaluation.score(Policies(policies)), self.config.recipe.run.min_service
+        self._evaluated = self.joint_steps
+        better = self._best is None or score.rank(demanded) > self._best.rank(demanded)
+        if better:
+            self._best = score
+            if self.run is not None:
+                self.run.save_best(self.joint_steps, partial(self._write, replay=False), score.said())
+        if self._evaluations is not None:
+            figures = score.said() | {"circularity_weight": self.env.circularity_weight}
+            self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
+        if self._price is not None:
+            self._price.heed(score.assured)
 
-    @contextmanager
-    def _interruptible(self) -> Iterator[None]:
-        """Turn the first Ctrl-C into a clean stop at the next joint step; the second acts as usual."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = signal.getsignal(signal.SIGINT)
+    def _write(self, folder: Path, *, replay: bool) -> None:
+        for learner in self.learners.values():
+            learner.save(folder, replay=replay)
+        if self._price is not None:
+            self._price.save(folder)
 
-        def note(_signal: int, _frame: FrameType | None) -> None:
-            self._interrupted = True
-            signal.signal(signal.SIGINT, before)
+    def runs_stacked(self, bring_up_to_date: Callable[[], None]) -> None:
+        """Have models brought up to date before they are saved or act."""
+        self._bring_up_to_date = bring_up_to_date
 
-        signal.signal(signal.SIGINT, note)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, before)
+
+def run_together(
+    trainings: Sequence[Training],
+    *,
+    callbacks: Mapping[str, BaseCallback] | None = None,
+    report: Report | None = None,
+    device: str = "cpu",
+) -> None:
+    """Train to the end of the budget; several trainings step by step together, learners of all of them stacked.
+
+    Args:
+        trainings: of the same recipe, steps and copies.
+        callbacks: Stable-Baselines3 callbacks by name of the learner; those who have one run in lockstep.
+        report: called after every joint step of the first training.
+        device: where stacked learners compute.
+
+    Raises:
+        LearnerError: if a learner fails; what was learnt is saved first, as it is after Ctrl-C.
+        RecipeError: if the engine cannot stack a learner that it should.
+    """
+    callbacks = callbacks or {}
+    stacked = stacks([each for training in trainings for each in training.stackable(callbacks)], device)
+    began = time.perf_counter()
+
+    def bring_up_to_date() -> None:
+        for stack in stacked:
+            stack.give()
+
+    for training in trainings:
+        training.runs_stacked(bring_up_to_date)
+    reports: list[Report | None] = [report] + [None] * (len(trainings) - 1)
+    try:
+        with one_torch_thread(), _interruption() as interrupted:
+            hooks = [partial(t.after_step, began, told) for t, told in zip(trainings, reports, strict=True)]
+            lockstep = Lockstep([t.world for t in trainings], list(_participants(trainings, stacked, callbacks)))
+            lockstep.run(hooks, interrupted)
+            for training in trainings:
+                training.finish()
+    except Interrupted:
+        for training in trainings:
+            training.save("interrupted", "stopped by the user")
+        raise KeyboardInterrupt from None
+    except Exception as error:
+        for training in trainings:
+            training.save("failed", str(error).partition("\n")[0] or repr(error))
+        raise
+    finally:
+        for training in trainings:
+            for learner in training.learners.values():
+                learner.model.logger.close()
+
+
+def _participants(
+    trainings: Sequence[Training], stacks: Sequence[Stack], callbacks: Mapping[str, BaseCallback]
+) -> Iterator[Participant]:
+    """Yield who acts: each stack, then everyone else, in the order of their seats."""
+    steps = trainings[0].config.steps
+    for stack in stacks:
+        title = ", ".join(each.seat.title for each in stack.members[:3]) + (", …" if len(stack.members) > 3 else "")
+        yield Participant(
+            f"the stack of {title}", partial(stack.learn, steps, wait), partial(stack.act, wait), Streams()
+        )
+    stacked = {id(each) for stack in stacks for each in stack.members}
+    for training in trainings:
+        for name, learner in training.learners.items():
+            if id(learner) not in stacked:
+                learn = partial(learner.learn, steps, callbacks.get(name))
+                yield Participant(learner.seat.title, learn, learner.act, learner.streams, learner.budget(steps))
+
+
+@contextmanager
+def _interruption() -> Iterator[Callable[[], bool]]:
+    """Yield what says whether Ctrl-C was pressed; the second time it acts as usual."""
+    pressed = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed.is_set
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(_signal: int, _frame: FrameType | None) -> None:
+        pressed.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

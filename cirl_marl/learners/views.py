@@ -33,28 +33,29 @@ class View(ABC):
         row_agents: the agent of each row that a copy of the environment fills; empty if its row is that of all agents.
         observation_space: of one row.
         action_space: of one row.
+        state_entries: of the whole state beside a row; 0 if it is not shown.
     """
 
     agents: tuple[str, ...]
     row_agents: tuple[str, ...]
     observation_space: spaces.Space[Any]
     action_space: spaces.Space[Any]
-    _sees_state = False
+    state_entries = 0
 
     def with_state(self, env: VectorEnv) -> View:
         """Show the whole state beside the rows from now on: ``{"observation": …, "state": …}``; return the view.
 
         The state is that of ``VectorEnv.state()``, in physical units and double precision.
         """
-        state = spaces.Box(-np.inf, np.inf, (len(env.state_names) + 1,), dtype=np.float64)
+        self.state_entries = len(env.state_names) + 1
+        state = spaces.Box(-np.inf, np.inf, (self.state_entries,), dtype=np.float64)
         self.observation_space = spaces.Dict({"observation": self.observation_space, "state": state})
-        self._sees_state = True
         return self
 
     def observe(self, observations: Arrays, state: Callable[[], Floats]) -> ObservedRows:
         """Return the rows of all copies, agent by agent; ``state`` is called by those who see the whole state."""
         rows = self.rows(observations)
-        if not self._sees_state:
+        if not self.state_entries:
             return rows
         return {"observation": rows, "state": np.tile(state(), (max(1, len(self.row_agents)), 1))}
 

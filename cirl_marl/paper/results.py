@@ -103,6 +103,11 @@ class Result:
         return self.end_return - self.start_return
 
     @property
+    def window(self) -> int:
+        """Episodes over which r_s and r_e are means: 100, or half of those that there were."""
+        return max(1, min(WINDOW, self.episodes // 2))
+
+    @property
     def diverged(self) -> bool:
         """Whether the weights became NaN, so that the training ended before its time and left no policy."""
         return self.evaluation is None

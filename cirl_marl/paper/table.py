@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from rich.table import Table
@@ -78,6 +78,15 @@ def over_seeds(values: Sequence[float]) -> str:
     return f"{mean:.4g} ± {number(deviation)}"
 
 
+def above_optimum(environment: PaperEnvironment, value: float | None) -> bool:
+    """Return whether a figure, as it is written, is above the optimum, which is a mean over the starts."""
+    return bool(environment.optima) and value is not None and _written(value) > _written(environment.optima[0].value)
+
+
+def _written(value: float) -> float:
+    return float(number(value))
+
+
 def _scaled(value: float) -> tuple[float, int]:
     """Split large and tiny figures into mantissa and exponent; the exponent of others is 0."""
     if value == 0 or not math.isfinite(value) or 1e-3 <= abs(value) < 1e4:
@@ -90,7 +99,15 @@ def _paper_row(environment: PaperEnvironment, algorithm: str, run: Published) ->
     gain = None if run.start_return is None or run.end_return is None else run.end_return - run.start_return
     figures = (run.start_return, run.end_return, gain, None if gain is None else gain / environment.steps, run.success)
     minutes = "" if run.minutes is None else f"{run.minutes:.1f}"
-    return (algorithm, "paper", "", *map(number, figures), "", minutes, "", "")
+    above = _above(environment, {"r_s": run.start_return, "r_e": run.end_return})
+    remark = f"{above}: chance, or other starts" if above else ""
+    return (algorithm, "paper", "", *map(number, figures), "", minutes, "", remark)
+
+
+def _above(environment: PaperEnvironment, figures: Mapping[str, float | None]) -> str:
+    """Name the figures above the optimum."""
+    found = [name for name, value in figures.items() if above_optimum(environment, value)]
+    return f"{', '.join(found)} above the optimum" if found else ""
 
 
 def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Sequence[Result]) -> tuple[str, ...]:
@@ -124,9 +141,9 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
 
 
 def _remarks(environment: PaperEnvironment, seeds: Sequence[Result]) -> Iterator[str]:
-    """Say what sets a row apart from the paper's: fewer steps or episodes, weights that broke, a start it was shown."""
+    """Say what sets a row apart: fewer steps or episodes than the paper's, weights that broke, a start shown, luck."""
     result = seeds[0]
-    few = max(1, min(seed.episodes for seed in seeds) // 2)
+    few = min(seed.window for seed in seeds)
     if few < WINDOW:
         yield f"r_s and r_e over {few} episodes"
     if result.row.steps != environment.steps:
@@ -138,6 +155,11 @@ def _remarks(environment: PaperEnvironment, seeds: Sequence[Result]) -> Iterator
     shown = result.settings.get("recipe", {}).get("learner", {}).get("demonstrations")
     if shown:
         yield f"the first {shown['steps']:,} steps, and r_s with them, are shown by {shown['controller']} control"
+    played = [seed.evaluation.mean for seed in seeds if seed.evaluation is not None]
+    figures = {"r_s": [seed.start_return for seed in seeds], "r_e": [seed.end_return for seed in seeds]}
+    means = {name: float(np.mean(values)) for name, values in (figures | {"final policy": played}).items() if values}
+    if above := _above(environment, means):
+        yield f"{above}: chance"
 
 
 def _broke(result: Result) -> str:

@@ -62,6 +62,23 @@ def evaluate_run(
     return figures, rollouts, env
 
 
+def choice(run: RunDirectory) -> str:
+    """Say which checkpoint of a run acts, and by what it was chosen."""
+    status, config, network = run.status, run.config, run.network()
+    best = status["best"]
+    if best is None:
+        return f"who acts: the last checkpoint, after {status['joint_steps'] * config.envs:,} environment steps"
+    figures, demanded = best["figures"], config.recipe.run.min_service
+    said = (
+        f"who acts: the checkpoint after {best['joint_steps'] * config.envs:,} environment steps, the best of "
+        f"{run.evaluations()} evaluations (λ̄ {figures['circularity']:.4g} {network.mass_unit}, "
+        f"lowest service {figures['service']:.4f})"
+    )
+    if demanded is not None and figures["assured"] < demanded:
+        said += f"; none assured the service of {demanded:g} that the recipe demands"
+    return said
+
+
 def _is_evaluated(run: RunDirectory, figures: Mapping[str, Any]) -> bool:
     """Whether ``evaluation.json`` is of the same checkpoint and episodes as ``figures``."""
     path = run.path / "evaluation.json"

@@ -1,0 +1,97 @@
+"""Which learners can run as one, and why others cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from sb3_contrib import ARS
+from sb3_contrib.ars.policies import ARSPolicy
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
+
+from cirl_marl.learners.central_critic import CentralCriticPolicy
+from cirl_marl.learners.learner import Learner
+from cirl_marl.learners.stacked.on_policy import RolloutStack
+from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, linear_layers
+from cirl_marl.learners.stacked.search import SearchStack, copies_each, parts_of
+
+Stack = RolloutStack | SearchStack
+OPTIMISERS = (torch.optim.Adam, torch.optim.AdamW, torch.optim.RMSprop, torch.optim.SGD, RMSpropTFLike)
+"""Optimisers that work element by element, so that zeros stay zero."""
+EXTRACTORS = {ActorCriticPolicy: FlattenExtractor, CentralCriticPolicy: CombinedExtractor}
+
+
+def stacks(learners: Iterable[Learner], device: str) -> list[Stack]:
+    """Return learners that can be stacked as one for each group of the same settings, rows and steps so far."""
+    found: dict[str, list[Learner]] = {}
+    for learner in learners:
+        settings = learner.spec.model_dump(exclude={"kind", "role", "agents"})
+        key = f"{settings} {learner.seat.num_envs} {learner.model.num_timesteps}"
+        found.setdefault(key, []).append(learner)
+    return [
+        (SearchStack if isinstance(members[0].model, ARS) else RolloutStack)(members, device)
+        for members in found.values()
+    ]
+
+
+def obstacle(learner: Learner) -> str | None:
+    """Return why a learner cannot be stacked, in words that name what its recipe asks for; None if it can be."""
+    model = learner.model
+    if learner.demonstrator is not None:
+        return "demonstrations: each learner imitates by itself"
+    if learner.spec.start is not None:
+        return "start: its statistics of observations stay as they are"
+    if type(model) in (PPO, A2C):
+        assert isinstance(model, PPO | A2C)
+        return _on_policy_obstacle(model, learner.spec.policy)
+    if type(model) is ARS:
+        return _search_obstacle(learner)
+    return f"algorithm {learner.spec.algorithm} is not PPO, A2C or ARS"
+
+
+def first_obstacle(learners: Sequence[Learner]) -> str | None:
+    """Return what keeps the first learner that cannot be stacked from it; None if all can be."""
+    return next(
+        (f"{each.seat.title}: engine stacked: {why}" for each in learners if (why := obstacle(each)) is not None), None
+    )
+
+
+def _on_policy_obstacle(model: PPO | A2C, asked: str) -> str | None:
+    if model.use_sde:
+        return "parameters.use_sde: noise that depends on the state is not stacked"
+    if getattr(model, "target_kl", None) is not None:
+        return "parameters.target_kl: learners of a stack cannot stop their epochs one by one"
+    if type(model.rollout_buffer) not in (RolloutBuffer, DictRolloutBuffer):
+        return f"parameters.rollout_buffer_class: {type(model.rollout_buffer).__name__} is the learner's own"
+    policy = model.policy
+    if type(policy) not in EXTRACTORS or type(policy.features_extractor) is not EXTRACTORS[type(policy)]:
+        return f"policy {asked} with {type(policy.features_extractor).__name__}: only multilayer perceptrons are"
+    if type(policy.action_dist) is not DiagGaussianDistribution:
+        return f"parameters.policy_kwargs: actions are drawn from a {type(policy.action_dist).__name__}"
+    if type(policy.optimizer) not in OPTIMISERS:
+        return f"parameters.policy_kwargs: optimiser {type(policy.optimizer).__name__} is not element by element"
+    try:
+        kinds = {linear_layers(each)[1] for each in (policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net)}
+    except TypeError as error:
+        return f"parameters.policy_kwargs: {error}"
+    if len(kinds - {None}) > 1 or not kinds <= {None, *ACTIVATIONS}:
+        known = " or ".join(each.__name__ for each in ACTIVATIONS)
+        return f"parameters.policy_kwargs: hidden layers are not linear with {known} between them"
+    return None
+
+
+def _search_obstacle(learner: Learner) -> str | None:
+    policy = learner.model.policy
+    if not isinstance(policy, ARSPolicy):
+        return f"policy {learner.spec.policy} is not one of ARS"
+    try:
+        parts_of(policy)
+        copies_each(learner)
+    except (TypeError, ValueError) as error:
+        return f"parameters: {error}"
+    return None

@@ -1,0 +1,196 @@
+"""Augmented random search of many learners as one, its candidates side by side in the copies of the environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from sb3_contrib import ARS
+from sb3_contrib.ars.policies import ARSPolicy
+from torch import Tensor, nn
+
+from cirl_marl.learners.learner import Learner
+from cirl_marl.learners.stacked.inputs import Inputs
+from cirl_marl.learners.stacked.layout import Layout, layers_of
+from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, Activation, Perceptrons, linear_layers
+
+
+class SearchStack:
+    """ARS learners of the same settings (Mania et al. 2018, arXiv 1803.07055), who all try their candidates at once.
+
+    Candidate k of every learner acts beside candidate k of the others. If all are paid the same, the search is that of
+    one learner whose parameters are those of all, though nobody sees more than its own observation. A candidate has
+    ``n_eval_episodes`` episodes, each in a copy of its own; with as many of them as there are copies, candidates take
+    turns, which is what the algorithm does by itself.
+
+    Attributes:
+        members: the learners, whose order is that of all leading axes.
+    """
+
+    def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
+        """Take over what the learners know."""
+        self.members = list(members)
+        self._device = torch.device(device)
+        self._models = [_search(each) for each in members]
+        first = self._models[0]
+        self._inputs = Inputs(members, self._device)
+        self._layout = Layout(len(members))
+        policies = [_policy(model) for model in self._models]
+        parts = [parts_of(policy) for policy in policies]
+        self._fields = self._layout.layers([[*linear, head] for linear, head, _ in parts], self._inputs.seen)
+        self._activation: Activation = parts[0][2]
+        self._squashes = policies[0].squash_output
+        self._centre = torch.zeros(len(members), self._layout.columns, device=self._device)
+        for i in range(len(members)):
+            for parameter, columns in self._layout.places(i):
+                self._centre[i, columns] = parameter.detach().flatten().to(self._device)
+        self._columns = [torch.cat([c for _, c in self._layout.places(i)]) for i in range(len(members))]
+        self._noise = [torch.Generator().set_state(learner.streams.torch_state) for learner in members]
+        seat = members[0].seat
+        self._rows, self._copies = seat.num_envs, seat.copies
+        self._each = copies_each(members[0])
+        # the algorithm counts a step of all its rows once for each of them
+        self._steps, self._updates = first.num_timesteps // self._rows**2, first._n_updates
+        self._given = self._steps
+
+    def learn(self, steps: int, wait: Callable[[], None]) -> None:
+        """Learn for the share of ``steps`` that is the learners'; ``wait`` returns when the environments have moved.
+
+        With δ_k standard normal, R_k± the returns of the candidates θ ± s δ_k, and b the number of the best pairs::
+
+            θ ← θ + α/(b σ_R) Σ_k (R_k+ − R_k−) δ_k
+        """
+        budget, first = self.members[0].budget(steps), self._models[0]
+        self._inputs.begin()
+        while self._steps < budget:
+            remaining = 1.0 - self._steps / budget
+            rate, std = first.lr_schedule(remaining), first.delta_std_schedule(remaining)
+            deltas = self._drawn()
+            moved = std * deltas
+            centre = self._centre[:, None]
+            returns = self._returns(torch.cat([centre + moved, centre - moved], dim=1), wait)
+            better, worse = returns[:, : first.n_delta], returns[:, first.n_delta :]
+            top = torch.argsort(torch.maximum(better, worse), dim=1, descending=True)[:, : first.n_top]
+            better, worse = better.gather(1, top), worse.gather(1, top)
+            spread = torch.cat([better, worse], dim=1).std(dim=1)
+            size = rate / (first.n_top * spread + 1e-6)
+            chosen = deltas.gather(1, top[..., None].expand(-1, -1, deltas.shape[2]))
+            self._centre += size[:, None] * torch.einsum("nk,nkp->np", better - worse, chosen)
+            self._updates += 1
+            self._log(returns, spread, size, rate, std)
+
+    def act(self, wait: Callable[[], None]) -> None:
+        """Act for ever by what was found, learning nothing."""
+        while True:
+            seen = self._inputs.observed(learning=False)
+            self._inputs.hand_in(self._actions(self._centre, seen))
+            wait()
+
+    def give(self) -> None:
+        """Bring models, normalisers and random streams up to date, as if each learner had learnt by itself."""
+        if self._given == self._steps:
+            return
+        self._given = self._steps
+        self._inputs.give()
+        for i, (learner, model) in enumerate(zip(self.members, self._models, strict=True)):
+            found = self._centre[i, self._columns[i]].cpu()
+            model.policy.load_from_vector(found.numpy())
+            model.weights = found  # type: ignore[assignment]
+            model.num_timesteps, model._n_updates = self._steps * self._rows**2, self._updates
+            learner.streams.torch_state = self._noise[i].get_state()
+
+    def _drawn(self) -> Tensor:
+        """Return the directions of all learners, each drawn as it draws them, shape (learners, K, columns)."""
+        count = self._models[0].n_delta
+        deltas = torch.zeros(len(self.members), count, self._layout.columns)
+        for own, stream, columns in zip(deltas, self._noise, self._columns, strict=True):
+            own[:, columns] = torch.normal(0.0, 1.0, (count, len(columns)), generator=stream)
+        return deltas.to(self._device)
+
+    def _returns(self, candidates: Tensor, wait: Callable[[], None]) -> Tensor:
+        """Return what the episodes of each candidate brought each learner, shape (learners, candidates)."""
+        at_once = self._copies // self._each
+        found = [
+            self._episodes(candidates[:, first : first + at_once], wait)
+            for first in range(0, candidates.shape[1], at_once)
+        ]
+        return torch.cat(found, dim=1)
+
+    def _episodes(self, candidates: Tensor, wait: Callable[[], None]) -> Tensor:
+        """Let candidates, shape (learners, C, columns), act for one episode, each in its copies."""
+        learners, count = candidates.shape[:2]
+        matrix = candidates.reshape(learners * count, -1)
+        agents = self._rows // self._copies  # rows of a shared policy, agent by agent
+        shape = (learners, agents, count, self._each)
+        seen, goes_on, total = self._inputs.begin(), True, torch.zeros(learners, count, device=self._device)
+        offset = self._models[0].alive_bonus_offset
+        while goes_on:
+            by_candidate = seen.view(*shape, -1).transpose(1, 2).reshape(len(matrix), agents * self._each, -1)
+            actions = self._actions(matrix, by_candidate)
+            by_row = actions.view(learners, count, agents, self._each, -1).transpose(1, 2)
+            self._inputs.hand_in(by_row.reshape(learners, self._rows, -1))
+            wait()
+            self._steps += 1
+            seen = self._inputs.observed(learning=True)
+            rewards, ended = self._inputs.paid()
+            total += (rewards + offset).view(*shape).sum(dim=(1, 3))
+            goes_on = not ended.all()
+        return total
+
+    def _actions(self, matrix: Tensor, seen: Tensor) -> Tensor:
+        outputs = Perceptrons(layers_of(self._fields, matrix), self._activation).forward(seen)[-1]
+        return outputs.tanh() if self._squashes else outputs
+
+    def _log(self, returns: Tensor, spread: Tensor, size: Tensor, rate: float, std: float) -> None:
+        """Write what the algorithm writes of an update, for each learner that is kept."""
+        episodes = self._rows // self._copies * self._each
+        for i, model in enumerate(self._models):
+            if model.logger.output_formats:
+                model.logger.record("rollout/ep_rew_mean", float(returns[i].mean()) / episodes)
+                model.logger.record("rollout/return_std", float(spread[i]))
+                model.logger.record("train/step_size", float(size[i]))
+                model.logger.record("train/learning_rate", rate)
+                model.logger.record("train/delta_std", std)
+                model.logger.dump(self._steps * self._copies)
+
+
+def parts_of(policy: ARSPolicy) -> tuple[list[nn.Linear], nn.Linear, Activation]:
+    """Return hidden layers, last layer and activation of a policy.
+
+    Raises:
+        TypeError: if it is no such sequence, or there is no gradient-free form of its activation.
+    """
+    modules = list(policy.action_net.children())
+    if policy.squash_output:
+        modules = modules[:-1]
+    linear, kind = linear_layers(nn.Sequential(*modules[:-1]))
+    if type(modules[-1]) is not nn.Linear or (kind or nn.Tanh) not in ACTIVATIONS:
+        raise TypeError(f"not linear layers with Tanh or ReLU between them: {policy.action_net}")
+    return linear, modules[-1], ACTIVATIONS[kind or nn.Tanh]
+
+
+def copies_each(learner: Learner) -> int:
+    """Return in how many copies a candidate acts, for the episodes that it has; an episode is one row's.
+
+    Raises:
+        ValueError: if candidates do not fill the copies evenly.
+    """
+    model, seat = _search(learner), learner.seat
+    agents = seat.num_envs // seat.copies
+    each, left = divmod(model.n_eval_episodes, agents)
+    if left or not each or seat.copies % each or model.pop_size % (seat.copies // each):
+        raise ValueError(
+            f"{model.pop_size} candidates (2 n_delta) of {model.n_eval_episodes} episodes each (n_eval_episodes) "
+            f"do not fill {seat.copies} copies with {agents} rows evenly"
+        )
+    return each
+
+
+def _search(learner: Learner) -> ARS:
+    assert isinstance(learner.model, ARS)
+    return learner.model
+
+
+def _policy(model: ARS) -> ARSPolicy:
+    assert isinstance(model.policy, ARSPolicy)
+    return model.policy
