@@ -129,6 +129,53 @@ def test_steps_count_once(starts: int, updates: int, tmp_path: Path) -> None:
     assert training.run.config.recipe.learner.demonstrations == Demonstrations(controller="neutral", steps=20)
 
 
+ROLLOUTS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "n_epochs": 1, "policy_kwargs": {"net_arch": [32]}}
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "policy", "parameters"),
+    [
+        ("PPO", "MlpPolicy", ROLLOUTS),
+        ("A2C", "MlpPolicy", {"n_steps": 8}),
+        ("PPO", "CentralCriticPolicy", ROLLOUTS),
+    ],
+)
+def test_on_policy_learner_imitates(algorithm: str, policy: str, parameters: dict[str, Any]) -> None:
+    """What it has been shown it then does: much less of a random start is left; only then does it learn by itself."""
+    shown = {"controller": "neutral", "steps": 320}
+    far: dict[int, float] = {}
+    for steps in (8, 320):
+        asked = recipe(
+            shown | {"steps": steps},
+            320,
+            algorithm=algorithm,
+            policy=policy,
+            parameters=parameters,
+            normalise=NORMALISED,
+        )
+        training = trained(asked, steps=steps)
+        neutral, observations = named_controller("neutral"), training.env.reset(seed=[1, 2])
+        neutral.start(training.env, 0)
+        wanted, found = neutral.act(observations), 0.0
+        for name, learner in training.learners.items():
+            assert learner.model.num_timesteps == steps and learner.demonstrations == 0
+            assert isinstance(learner.env, VecNormalize)
+            seen = learner.env.normalize_obs(learner.seat.view.observe(observations, training.env.state))
+            action, _ = learner.model.predict(seen, deterministic=True)
+            found = max(found, float(np.abs(action - wanted[name]).max()))
+        far[steps] = found
+    assert far[320] < 0.05 and far[320] < far[8]
+
+
+def test_imitation_goes_on_after_it_was_stopped(tmp_path: Path, ctrl_c_after: Any) -> None:
+    """By the policy that was saved, for what is left of the demonstrations; then the learner learns by itself."""
+    asked = recipe({"controller": "neutral", "steps": 64}, 96, algorithm="PPO", parameters=ROLLOUTS)
+    with pytest.raises(KeyboardInterrupt):
+        trained(asked, directory=tmp_path / "run", report=ctrl_c_after(20))
+    found = resume(tmp_path / "run")
+    assert [each.model.num_timesteps for each in found.learners.values()] == [96] * 3
+
+
 def test_others_learn_from_the_start() -> None:
     """A learner without demonstrations does not wait for one that has them."""
     asked = recipe({"controller": "neutral", "steps": 20}).model_dump(mode="json")
@@ -250,7 +297,11 @@ demonstrations = { controller = "scripted", steps = 50 }
         ("steps = 50", "step = 50", "learner.demonstrations.step: unknown key 'step'. Did you mean 'steps'?"),
         ("steps = 50", "steps = 101", "learner.demonstrations.steps: 101 is more than the 100 steps of the run"),
         ("[learner]", "[learner]\nshare_of_steps = 0.4", "50 is more than the 100 steps of the run times share_of_"),
-        ('"SAC"', '"PPO"', "learner.demonstrations: PPO has no replay buffer to keep them in; use one of CrossQ, DDPG"),
+        (
+            '"SAC"',
+            '"ARS"',
+            "learner.demonstrations: ARS can neither keep nor imitate them; use one of A2C, CrossQ",
+        ),
     ],
 )
 def test_mistakes_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:

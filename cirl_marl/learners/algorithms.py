@@ -13,10 +13,12 @@ import numpy as np
 import sb3_contrib
 import stable_baselines3
 from pydantic import ConfigDict, TypeAdapter, ValidationError
+from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy, MultiInputActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -171,6 +173,12 @@ WRITTEN: Mapping[str, Callable[[str, object], Iterator[str]]] = {
 def has_replay_buffer(name: str) -> bool:
     """Return whether the algorithm learns from what it keeps of the past."""
     return issubclass(algorithm_class(name), OffPolicyAlgorithm)
+
+
+def can_be_shown(name: str) -> bool:
+    """Return whether the algorithm learns from demonstrations: keeps them, or imitates them by a policy of one step."""
+    kind = algorithm_class(name)
+    return has_replay_buffer(name) or (issubclass(kind, OnPolicyAlgorithm) and not issubclass(kind, RecurrentPPO))
 
 
 def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **fixed: Any) -> BaseAlgorithm:

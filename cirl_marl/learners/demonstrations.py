@@ -1,9 +1,9 @@
-"""Demonstrations: a controller acts in the place of an off-policy learner, which keeps what it sees.
+"""Demonstrations: a controller shows a learner what to do before it learns by itself.
 
 Tasks with a sparse reward are hardly ever solved by random exploration. The first steps of a run may therefore be those
-of a controller; their transitions are in the replay buffer when the learner, Stable-Baselines3's own, begins. They are
-steps and episodes of the run, in its budget and its metrics. Callbacks and the learning curves of TensorBoard begin
-with the learner itself.
+of a controller. Off-policy, their transitions are in the replay buffer when the learner, Stable-Baselines3's own,
+begins. On-policy, the learner imitates what it is shown. They are steps and episodes of the run, in its budget and its
+metrics. Callbacks and the learning curves of TensorBoard begin with the learner itself.
 """
 
 from __future__ import annotations
@@ -13,8 +13,13 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.controllers.scripted import Scripted
@@ -29,18 +34,29 @@ Act = Callable[[], NDArray[np.float32]]
 """Returns what the controller does now, a row for each row of the learner's environment."""
 
 
-def demonstrate(model: OffPolicyAlgorithm, steps: int, act: Act) -> None:
-    """Step the environment of ``model`` by ``act`` and keep the transitions, until the model has counted ``steps``.
+def demonstrate(model: BaseAlgorithm, steps: int, act: Act) -> None:
+    """Show ``model`` by ``act`` what to do, until it has counted ``steps`` in its environment.
 
-    ``model.learn(…, reset_num_timesteps=False)`` goes on from there. What is kept is what the model would have kept of
+    ``model.learn(…, reset_num_timesteps=False)`` goes on from there.
+    """
+    if model.num_timesteps >= steps:
+        return
+    model.learn(0, reset_num_timesteps=model.num_timesteps == 0)  # takes a seat: resets its environment, does no step
+    if isinstance(model, OffPolicyAlgorithm):
+        _keep(model, steps, act)
+    elif isinstance(model, OnPolicyAlgorithm):
+        _imitate(model, steps, act)
+
+
+def _keep(model: OffPolicyAlgorithm, steps: int, act: Act) -> None:
+    """Step the environment by ``act`` and keep the transitions.
+
+    What is kept is what the model would have kept of
     its own steps: observations and rewards before normalisation, the true last observation of an episode. Statistics of
     a normaliser are those of all steps. A model that was saved in the middle of its demonstrations gets the rest of
     them; one that has passed them gets none, and has them only if its replay buffer was saved as well. Its actions are
     those of Box(-1, 1), its steps rows.
     """
-    if model.num_timesteps >= steps:
-        return
-    model.learn(0, reset_num_timesteps=model.num_timesteps == 0)  # takes a seat: resets its environment, does no step
     env, buffer = model.get_env(), model.replay_buffer
     assert env is not None and buffer is not None
     while model.num_timesteps < steps:
@@ -48,6 +64,65 @@ def demonstrate(model: OffPolicyAlgorithm, steps: int, act: Act) -> None:
         observations, rewards, dones, infos = env.step(actions)
         model.num_timesteps += env.num_envs
         model._store_transition(buffer, actions, observations, rewards, dones, infos)  # type: ignore[arg-type]
+
+
+IMITATION_RATE, IMITATION_EPOCHS, IMITATION_BATCH = 1e-3, 10, 256
+"""Adam's learning rate, passes over all that was shown, and rows at a time, each time that a rollout has ended."""
+
+
+def _imitate(model: OnPolicyAlgorithm, steps: int, act: Act) -> None:
+    """Let ``model`` imitate what ``act`` does: DAgger (Ross, Gordon and Bagnell 2011).
+
+    During the first rollout the controller acts, afterwards the model; the controller says what it would have done in
+    each state that comes of it, also in those that it would never have met. After each rollout the likelihood of all
+    that it has said is maximised, so that the spread of the actions becomes what the model cannot imitate. The critic
+    learns nothing. Of a model that was saved in the middle the policy goes on, what it was shown is lost.
+    """
+    env = model.get_env()
+    assert env is not None
+    seen: list[Any] = []
+    shown: list[NDArray[np.float32]] = []
+    while model.num_timesteps < steps:
+        copying = not seen
+        for _ in range(min(model.n_steps, -(-(steps - model.num_timesteps) // env.num_envs))):
+            seen.append(env.get_original_obs() if isinstance(env, VecNormalize) else model._last_obs)
+            shown.append(act())
+            assert model._last_obs is not None
+            actions = shown[-1] if copying else model.predict(model._last_obs)[0]
+            model._last_obs, _, model._last_episode_starts, _ = env.step(actions)  # type: ignore[assignment]
+            model.num_timesteps += env.num_envs
+        _fit(model, _stacked(seen), np.concatenate(shown))
+
+
+def _stacked(seen: Sequence[Any]) -> Any:
+    """Return the observations of several steps as one; those of a dict key by key."""
+    if isinstance(seen[0], dict):
+        return {key: np.concatenate([each[key] for each in seen]) for key in seen[0]}
+    return np.concatenate(seen)
+
+
+def _rows(observations: Any, rows: Any) -> Any:
+    """Return some rows of observations, which may be those of a dict."""
+    if isinstance(observations, dict):
+        return {key: each[rows] for key, each in observations.items()}
+    return observations[rows]
+
+
+def _fit(model: OnPolicyAlgorithm, seen: Any, shown: NDArray[np.float32]) -> None:
+    """Maximise the likelihood of what was ``shown``, by the statistics that the normaliser has now."""
+    env, policy = model.get_env(), model.policy
+    assert isinstance(policy, ActorCriticPolicy)
+    observations, _ = policy.obs_to_tensor(env.normalize_obs(seen) if isinstance(env, VecNormalize) else seen)
+    actions = torch.as_tensor(shown)
+    optimiser = torch.optim.Adam(policy.parameters(), lr=IMITATION_RATE)
+    policy.set_training_mode(True)
+    for _ in range(IMITATION_EPOCHS):
+        for rows in torch.split(torch.randperm(len(actions)), IMITATION_BATCH):
+            _, likelihood, _ = policy.evaluate_actions(_rows(observations, rows), actions[rows])
+            optimiser.zero_grad()
+            (-likelihood.mean()).backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+    policy.set_training_mode(False)
 
 
 class Demonstrator:

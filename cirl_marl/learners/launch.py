@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.environments.vector import VectorEnv
-from cirl_marl.errors import CirlError, RunError, unknown
+from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run import RunConfig, RunDirectory
@@ -159,7 +159,10 @@ def prepared(
         envs=copies,
         options=settings,
     )
-    return Training(config, env)
+    training = Training(config, env)
+    if not any(learner.spec.share_of_steps for learner in training.learners.values()):
+        raise RecipeError(f"recipe '{found.name}': nobody learns: share_of_steps is 0 for all of {list(env.agents)}")
+    return training
 
 
 def resume(

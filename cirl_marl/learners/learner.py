@@ -150,7 +150,6 @@ class Learner:
         """
         if self.demonstrator is not None:
             leader, view = self.demonstrator, self.seat.view
-            assert isinstance(self.model, OffPolicyAlgorithm)
             demonstrate(self.model, self.demonstrations, lambda: view.join(leader.act()))
         done = self.model.num_timesteps
         rows = self.seat.num_envs // self.seat.copies

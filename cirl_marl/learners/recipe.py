@@ -79,6 +79,16 @@ class Demonstrations(Settings):
     )
 
 
+class Start(Settings):
+    """What was learnt in another run, with which a learner begins."""
+
+    run: Annotated[StrictStr, Field(min_length=1)] = Field(
+        description="directory of the run; a relative path counts from the working directory, as that of cirl train; "
+        "{seed} stands for the seed of the training"
+    )
+    agent: StrictStr | None = Field(None, description="learner of that run; None is the one of the same name")
+
+
 class LearnerSettings(Settings):
     """One algorithm with its parameters."""
 
@@ -94,11 +104,14 @@ class LearnerSettings(Settings):
     bootstrap: StrictBool = Field(
         True, description="whether the learner expects more to come after a time limit; if not, the episode is all"
     )
-    share_of_steps: Annotated[Number, Field(gt=0, le=1)] = Field(
-        1.0, description="share of the run during which the agent learns; after it, it only acts"
+    share_of_steps: Annotated[Number, Field(ge=0, le=1)] = Field(
+        1.0, description="share of the run during which the agent learns; after it, it only acts; 0 needs a start"
+    )
+    start: Start | None = Field(
+        None, description="policy of another run to begin with, of the same algorithm and for the same spaces"
     )
     demonstrations: Demonstrations | None = Field(
-        None, description="of an off-policy learner: whose transitions fill its replay buffer before it acts itself"
+        None, description="what fills the replay buffer of an off-policy learner, and what an on-policy one imitates"
     )
 
     def steps_of(self, steps: int) -> int:
@@ -111,16 +124,18 @@ class LearnerSettings(Settings):
 
     def mistakes(self, steps: int) -> Iterator[str]:
         """Yield what is wrong whatever the network, in a run of ``steps``: key, value and what would do."""
-        from cirl_marl.learners.algorithms import algorithm_mistakes, algorithms, has_replay_buffer
+        from cirl_marl.learners.algorithms import algorithm_mistakes, algorithms, can_be_shown
 
         yield from algorithm_mistakes(self.algorithm, self.policy, self.parameters)
         if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
             yield f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true"
+        if self.share_of_steps == 0 and self.start is None:
+            yield "share_of_steps: 0, so that it never learns: give a start by which it acts, or a share above 0"
         if self.demonstrations is None or self.algorithm not in algorithms():
             return
-        if not has_replay_buffer(self.algorithm):
-            fit = ", ".join(filter(has_replay_buffer, algorithms()))
-            yield f"demonstrations: {self.algorithm} has no replay buffer to keep them in; use one of {fit}"
+        if not can_be_shown(self.algorithm):
+            fit = ", ".join(filter(can_be_shown, algorithms()))
+            yield f"demonstrations: {self.algorithm} can neither keep nor imitate them; use one of {fit}"
         if self.demonstrations.steps > self.steps_of(steps):
             share = "" if self.share_of_steps == 1 else f" times share_of_steps {self.share_of_steps}"
             yield f"demonstrations.steps: {self.demonstrations.steps} is more than the {steps} steps of the run{share}"

@@ -45,12 +45,22 @@ from cirl_marl.records.machine import versions
 STATES = ("running", "complete", "interrupted", "failed")
 
 
+class Origin(Settings):
+    """From where a learner had its first policy: a checkpoint of another run, and the hashes of what was read."""
+
+    run: str
+    agent: str
+    checkpoint: str
+    sha256: dict[str, str]
+
+
 class RunConfig(Settings):
     """What a run was asked to do, fully resolved.
 
     ``steps`` are environment steps, summed over the copies, of which there are ``envs``. Every random stream derives
     from ``seed``; ``options`` are those of ``VectorEnv``. Of a definition with regions, ``region`` is the one that was
     trained on; ``data_sha256`` are the hashes of the data files by the names that the definition gives them.
+    ``origins`` say for each learner that had a start where that came from; going on with the run does not need it.
     """
 
     network: str
@@ -63,6 +73,7 @@ class RunConfig(Settings):
     options: dict[str, Any]
     region: str = ""
     data_sha256: dict[str, str] = Field(default_factory=dict)
+    origins: dict[str, Origin] = Field(default_factory=dict)
 
     @field_validator("options")
     @classmethod

@@ -30,6 +30,7 @@ from cirl_marl.learners.price import ServicePrice
 from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory
 from cirl_marl.learners.selection import Evaluation, Score, score_of
 from cirl_marl.learners.stacked.conditions import Stack, first_obstacle, obstacle, stacks
+from cirl_marl.learners.start import begin_from
 from cirl_marl.learners.streams import Streams
 
 CHECKPOINTS = 10
@@ -85,6 +86,8 @@ class Training:
             for name, seat in self.world.seats.items():
                 learner = Learner(seat, self.groups[name].spec, config.seed, done=self.done)
                 self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
+        if checkpoint is None:
+            self._begin_from_others()
         self._price = self._priced(checkpoint)
         asked = config.recipe.run
         self._evaluation: Evaluation | None = None
@@ -109,6 +112,16 @@ class Training:
             price.load(checkpoint)
         return price
 
+    def _begin_from_others(self) -> None:
+        """Give learners their starts, and say in the configuration from where."""
+        asked = {name: each.spec.start for name, each in self.learners.items()}
+        origins = {
+            name: begin_from(start, self.learners[name], self.env, self.config.seed)
+            for name, start in asked.items()
+            if start is not None
+        }
+        self.config = self.config.model_copy(update={"origins": origins})
+
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs, checkpoints and the best of them in ``run`` from now on."""
         self.run = run
@@ -118,6 +131,8 @@ class Training:
         best = run.status["best"]
         self._best = score_of(best["figures"]) if best is not None else None
         self._evaluations = EvaluationsFile(run.path / "evaluations.csv", self.done)
+        if self.config.origins and self.joint_steps == 0:
+            self.save("running")  # so that the run does not need those from which it started any more
 
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""

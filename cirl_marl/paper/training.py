@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from cirl_marl.definitions.catalogue import load_network
@@ -186,7 +185,6 @@ def _train_copies(
 
     elapsed = _stopwatch()
     if learner.demonstrations is not None:
-        assert isinstance(model, OffPolicyAlgorithm)
         seeds = [derived_seed(row.seed, "demonstrations", i) for i in range(copies)]
         act = in_copies(learner.demonstrations.controller, monitors, seeds)
 

@@ -42,6 +42,10 @@ def stacks(learners: Iterable[Learner], device: str) -> list[Stack]:
 def obstacle(learner: Learner) -> str | None:
     """Return why a learner cannot be stacked, in words that name what its recipe asks for; None if it can be."""
     model = learner.model
+    if learner.demonstrator is not None:
+        return "demonstrations: each learner imitates by itself"
+    if learner.spec.start is not None:
+        return "start: its statistics of observations stay as they are"
     if type(model) in (PPO, A2C):
         assert isinstance(model, PPO | A2C)
         return _on_policy_obstacle(model, learner.spec.policy)

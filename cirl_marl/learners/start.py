@@ -1,0 +1,163 @@
+"""A start from what was learnt in another run: its policy and the statistics of its observations.
+
+The policy comes whole, with critics and a learnt entropy coefficient. Optimiser, replay buffer, statistics of rewards
+and schedules begin anew, as rewards, copies and steps may be others now. The statistics of observations stay as they
+were: another environment shows other states more often, and a policy that sees the same state in other numbers forgets.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from sb3_contrib import ARS
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError, RecipeError, unknown
+from cirl_marl.learners.learner import Learner, load_model, load_normaliser
+from cirl_marl.learners.recipe import LearnerSettings, Start
+from cirl_marl.learners.run import Origin, RunDirectory
+from cirl_marl.learners.views import CENTRAL_CRITIC
+
+SHOWN = 3
+"""Entries that a message lists of those that differ."""
+
+Bounds = tuple[float, float]
+
+
+class Settled(RunningMeanStd):
+    """Statistics that no longer follow what is seen."""
+
+    def __init__(self, known: RunningMeanStd) -> None:
+        """Stay with what is ``known``."""
+        super().__init__(shape=known.mean.shape)
+        self.mean, self.var, self.count = known.mean.copy(), known.var.copy(), known.count
+
+    def update_from_moments(self, batch_mean: Any, batch_var: Any, batch_count: float) -> None:
+        """Do nothing."""
+
+
+def begin_from(start: Start, learner: Learner, env: VectorEnv, seed: int) -> Origin:
+    """Give a fresh ``learner`` in ``env`` the policy that ``start`` names; return where it comes from.
+
+    In the name of the run ``{seed}`` stands for ``seed``, so that one recipe serves several seeds.
+
+    Raises:
+        RecipeError: if there is no such run or learner, if its run is not whole, or if it learnt something else.
+    """
+    try:
+        run = RunDirectory(start.run.replace("{seed}", str(seed)))
+        return _begin_from(run, start.agent or learner.name, learner, env)
+    except CirlError as error:
+        raise RecipeError(f"{learner.seat.title}: start: {error}") from error
+
+
+def _begin_from(run: RunDirectory, name: str, learner: Learner, env: VectorEnv) -> Origin:
+    groups = {group.name: group for group in run.groups()}
+    if name not in groups:
+        raise RecipeError(f"{run.path}: {unknown('agent', name, groups)}")
+    there, source, folder = groups[name], run.make_env(1), run.chosen
+    _refuse(f"{run.path}: '{name}'", [*_other_settings(there.spec, learner.spec)])
+    seen = [_entries(*pair, learner.spec) for pair in ((source, there.agents), (env, learner.seat.view.agents))]
+    _refuse(f"{run.path}: '{name}'", [*_other_entries(*seen), *_other_actions(there.view(source), learner.seat.view)])
+    model = load_model(folder, name, there.spec.algorithm)
+    normaliser = load_normaliser(folder, name, there.spec)
+    path = folder / f"{name}.zip"
+    _refuse(f"{path}:", [*_other_shapes(model, learner.model)])
+    _take_over(model, normaliser, learner)
+    files = (path, folder / f"{name}.normaliser.pkl")
+    hashes = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files if file.is_file()}
+    return Origin(run=str(run.path.resolve()), agent=name, checkpoint=folder.name, sha256=hashes)
+
+
+def _refuse(what: str, mistakes: Sequence[str]) -> None:
+    if mistakes:
+        raise RecipeError(f"{what} {'; '.join(mistakes)}")
+
+
+def _take_over(model: BaseAlgorithm, normaliser: VecNormalize | None, learner: Learner) -> None:
+    """Copy the policy, a learnt entropy coefficient and the statistics of observations."""
+    mine = learner.model
+    mine.policy.load_state_dict(model.policy.state_dict())
+    if isinstance(mine, ARS):  # which learns a vector, of which its policy is a copy
+        weights = torch.nn.utils.parameters_to_vector(mine.policy.parameters())
+        mine.weights = weights.detach()  # type: ignore[assignment]
+    theirs, own = (getattr(each, "log_ent_coef", None) for each in (model, mine))
+    if theirs is not None and own is not None:
+        own.data.copy_(theirs.data)
+    if normaliser is not None and isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
+        known = normaliser.obs_rms
+        settled = {key: Settled(each) for key, each in known.items()} if isinstance(known, dict) else Settled(known)
+        learner.env.obs_rms = settled  # type: ignore[assignment]
+
+
+def _other_settings(there: LearnerSettings, here: LearnerSettings) -> Iterator[str]:
+    """Yield which settings that a policy depends on differ."""
+    for key in ("scheme", "algorithm", "policy", "normalise.observation", "normalise.clip_observation"):
+        old, new = (_at(settings, key) for settings in (there, here))
+        if old != new and not (key == "normalise.clip_observation" and not there.normalise.observation):
+            yield f"has {key} = {_written(old)}, not {_written(new)}"
+
+
+def _at(settings: Any, key: str) -> Any:
+    for part in key.split("."):
+        settings = getattr(settings, part)
+    return settings
+
+
+def _written(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _entries(env: VectorEnv, agents: Sequence[str], spec: LearnerSettings) -> dict[str, Bounds]:
+    """Return what a learner of ``agents`` sees, in order, with its bounds."""
+    found: dict[str, Bounds] = {}
+    for agent in agents:
+        space, whose = env.observation_spaces[agent], f"{agent}: " if spec.scheme != "independent" else ""
+        for name, low, high in zip(env.layout.names[agent], space.low.tolist(), space.high.tolist(), strict=True):
+            found[whose + name] = low, high
+    if spec.policy == CENTRAL_CRITIC:
+        found |= {f"state: {name}": (0.0, 0.0) for name in env.state_names}
+    return found
+
+
+def _other_entries(there: Mapping[str, Bounds], here: Mapping[str, Bounds]) -> Iterator[str]:
+    """Yield which entries of the observation are only there or only here, have another place or other bounds."""
+    sides = (("only there", there, here), ("only here", here, there))
+    alone = [(side, [name for name in one if name not in other]) for side, one, other in sides]
+    if any(names for _, names in alone):
+        told = (f"{side} {_some(names)}" for side, names in alone if names)
+        yield f"sees other things, {len(there)} entries there and {len(here)} here: {'; '.join(told)}"
+    elif moved := [name for name, other in zip(there, here, strict=True) if name != other]:
+        yield f"sees the same in another order, from {_some(moved)} on"
+    else:
+        yield from (
+            f"sees '{name}' in {list(there[name])}, not in {list(here[name])}"
+            for name in here
+            if there[name] != here[name]
+        )
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(f"'{name}'" for name in names[:SHOWN]) + more
+
+
+def _other_actions(there: Any, here: Any) -> Iterator[str]:
+    if there.action_space != here.action_space:
+        yield f"acts in {there.action_space}, not in {here.action_space}"
+
+
+def _other_shapes(there: BaseAlgorithm, here: BaseAlgorithm) -> Iterator[str]:
+    """Yield which weights the policies do not have in common; the first says enough."""
+    old, new = ({key: tuple(value.shape) for key, value in each.policy.state_dict().items()} for each in (there, here))
+    for key in (*old, *new):
+        if old.get(key) != new.get(key):
+            shapes = [str(shapes[key]) if key in shapes else "missing" for shapes in (old, new)]
+            yield f"weights '{key}' are {shapes[0]} there and {shapes[1]} here; write policy_kwargs as there"
+            return

@@ -1,0 +1,295 @@
+"""A start from another run: the policy is that of the run, whoever only acts keeps it, and mistakes are named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
+
+from cirl_marl import CirlError, DefinitionError, LearnerError, RecipeError
+from cirl_marl.learners import Recipe, RunDirectory, Training, load_recipe, resume, train
+from cirl_marl.learners.launch import prepared
+from cirl_marl.learners.learner import Learner, load_model
+from cirl_marl.learners.trained import Trained
+
+AGENTS = ["mine", "use"]
+OPTIONS: dict[str, Any] = {"agents": AGENTS, "horizon": 4}
+PPO: dict[str, Any] = {"n_steps": 4, "batch_size": 8, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
+BUFFER: dict[str, Any] = {"learning_starts": 4, "buffer_size": 100, "batch_size": 4, "policy_kwargs": {"net_arch": [8]}}
+ALGORITHMS: dict[str, dict[str, Any]] = {
+    "PPO": PPO,
+    "ARS": {"n_delta": 1},
+    "SAC": BUFFER,
+    "TQC": BUFFER,
+    "TD3": BUFFER,
+    "RecurrentPPO": PPO,
+}
+
+
+def recipe(algorithm: str = "PPO", matches: list[dict[str, Any]] | None = None, **learner: Any) -> Recipe:
+    """Return a recipe in which everybody learns by ``algorithm`` in two copies, but for ``matches``."""
+    common = {"algorithm": algorithm, "parameters": ALGORITHMS[algorithm]}
+    if algorithm == "RecurrentPPO":
+        common["policy"] = "MlpLstmPolicy"
+    told = [common | match for match in matches or []]
+    return Recipe.model_validate(
+        {
+            "name": "a",
+            "title": "a",
+            "run": {"steps": 24, "envs": 2, "evaluations": 0},
+            "learner": common | learner,
+            "match": told,
+        }
+    )
+
+
+def from_run(run: Path, agent: str | None = None, **others: Any) -> dict[str, Any]:
+    """Return the keys of a learner that starts from ``run``."""
+    return {"start": {"run": str(run), "agent": agent}, **others}
+
+
+def weights(learner: Learner) -> dict[str, torch.Tensor]:
+    """Return the weights of a learner, critics and a learnt entropy coefficient included."""
+    found = {key: value.clone() for key, value in learner.model.policy.state_dict().items()}
+    if isinstance(coefficient := getattr(learner.model, "log_ent_coef", None), torch.Tensor):
+        found["log_ent_coef"] = coefficient.detach().clone()
+    return found
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    """Return whether weights are bit-equal."""
+    return one.keys() == other.keys() and all(torch.equal(value, other[key]) for key, value in one.items())
+
+
+def statistics(learner: Learner) -> list[float]:
+    """Return what a learner's normaliser knows of observations."""
+    assert isinstance(learner.env, VecNormalize)
+    known: Any = learner.env.obs_rms
+    return [*known.mean, *known.var, known.count]
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Training, Path]:
+    """Return a run of two PPO learners, and where it is."""
+    path = tmp_path_factory.mktemp("runs") / "first"
+    return train("copper_net", recipe(), directory=path, **OPTIONS), path
+
+
+@pytest.mark.parametrize("algorithm", list(ALGORITHMS))
+def test_policy_before_the_first_update_is_that_of_the_run(algorithm: str, tmp_path: Path) -> None:
+    """With critics, entropy coefficient and statistics of observations; optimiser, steps and rewards begin anew."""
+    source = train("copper_net", recipe(algorithm), directory=tmp_path / "first", **OPTIONS)
+    found = prepared("copper_net", recipe(algorithm, **from_run(tmp_path / "first")), seed=7, **OPTIONS)
+    fresh = prepared("copper_net", recipe(algorithm), seed=7, **OPTIONS)
+    for name in AGENTS:
+        old, new = source.learners[name], found.learners[name]
+        assert same(weights(new), weights(old)) and not same(weights(new), weights(fresh.learners[name]))
+        assert statistics(new) == statistics(old)
+        assert new.model.num_timesteps == 0
+        assert isinstance(new.env, VecNormalize) and new.env.ret_rms.count < 1.0
+        if algorithm == "ARS":
+            vector = torch.nn.utils.parameters_to_vector(new.model.policy.parameters())
+            assert torch.equal(torch.as_tensor(new.model.weights), vector)  # type: ignore[attr-defined]
+
+
+def test_whoever_has_no_share_of_the_steps_only_acts(first: tuple[Training, Path], tmp_path: Path) -> None:
+    """Weights are bit-equal in the end, and its actions those of the other run; the other learns on."""
+    source, path = first
+    acting = [{"agents": ["mine"], **from_run(path, share_of_steps=0)}]
+    found = train("copper_net", recipe(matches=acting, **from_run(path)), directory=tmp_path / "run", **OPTIONS)
+    mine, use = (found.learners[name] for name in AGENTS)
+    assert same(weights(mine), weights(source.learners["mine"]))
+    for learner in (mine, use):
+        assert statistics(learner) == statistics(source.learners[learner.name])
+    assert not same(weights(use), weights(source.learners["use"])) and use.model.num_timesteps == 24
+    before, after = Trained(path), Trained(tmp_path / "run")
+    observations = found.env.reset(seed=[1, 2])
+    for each in (before, after):
+        each.start(found.env, 0)
+    np.testing.assert_array_equal(before.act(observations)["mine"], after.act(observations)["mine"])
+
+
+def test_shared_policy_has_a_start_too(tmp_path: Path) -> None:
+    """Its name is that of the learner, and None is the one of the same name."""
+    shared = recipe(scheme="shared")
+    source = train("copper_net", shared, directory=tmp_path / "first", **OPTIONS)
+    asked = recipe(scheme="shared", **from_run(tmp_path / "first"))
+    (found,) = prepared("copper_net", asked, **OPTIONS).learners.values()
+    assert same(weights(found), weights(source.learners["shared-learner"]))
+
+
+def test_start_is_the_best_checkpoint(tmp_path: Path) -> None:
+    """Where evaluations chose one, as whoever evaluates the run sees it."""
+    asked = recipe()
+    chosen = asked.model_copy(update={"run": asked.run.model_copy(update={"evaluations": 6, "episodes": 2})})
+    train("copper_net", chosen, directory=tmp_path / "first", **OPTIONS)
+    found = prepared("copper_net", recipe(**from_run(tmp_path / "first")), **OPTIONS)
+    folder = RunDirectory(tmp_path / "first").chosen
+    assert folder.name.endswith("-best") and found.config.origins["use"].checkpoint == folder.name
+    expected = load_model(folder, "use", "PPO").policy.state_dict()
+    assert same(weights(found.learners["use"]), expected)
+
+
+class FailsAtOnce(BaseCallback):
+    """Fails at the first step of its learner."""
+
+    def _on_step(self) -> bool:
+        raise ValueError("no more")
+
+
+def test_run_goes_on_without_the_one_it_started_from(first: tuple[Training, Path], tmp_path: Path) -> None:
+    """From the first moment on: the policies are saved before the first step, and where they came from is on record."""
+    source, path = tmp_path / "first", first[1]
+    shutil.copytree(path, source)
+    run = RunDirectory(tmp_path / "run")
+    acting = [{"agents": ["mine"], **from_run(source, "mine", share_of_steps=0)}]
+    with pytest.raises(LearnerError):
+        train(
+            "copper_net",
+            recipe(matches=acting, **from_run(source)),
+            directory=run.path,
+            callbacks={"use": FailsAtOnce()},
+            steps=80,
+            **OPTIONS,
+        )
+    assert run.status["checkpoint"] == "000000000-running"
+    origin = run.config.origins["mine"]
+    assert (origin.run, origin.agent, origin.checkpoint) == (str(source), "mine", "000000012-complete")
+    assert set(origin.sha256) == {"mine.zip", "mine.normaliser.pkl"} and set(run.config.origins) == set(AGENTS)
+    shutil.rmtree(source)
+    found = resume(run.path)
+    assert run.status["state"] == "complete" and run.config.origins["mine"] == origin
+    assert same(weights(found.learners["mine"]), weights(first[0].learners["mine"]))
+    assert resume(run.path, steps=88).joint_steps == 44
+
+
+def test_same_seed_gives_the_same_bits(first: tuple[Training, Path]) -> None:
+    """With a start as without."""
+    one, other = (train("copper_net", recipe(**from_run(first[1])), seed=3, **OPTIONS) for _ in range(2))
+    assert all(same(weights(one.learners[name]), weights(other.learners[name])) for name in AGENTS)
+
+
+def spoilt(path: Path, spoil: Callable[[Path], object]) -> None:
+    """Spoil what the newest checkpoint of a run holds of the mine."""
+    (folder,) = (path / "checkpoints").iterdir()
+    spoil(folder)
+
+
+def cut(path: Path) -> None:
+    """Leave half of a file."""
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def nothing_saved(path: Path) -> None:
+    """Say that nothing was saved yet."""
+    status = {"state": "running", "joint_steps": 0, "checkpoint": None, "reason": ""}
+    (path / "status.json").write_text(json.dumps(status))
+
+
+MISTAKES: list[tuple[Callable[[Path], object], str | None, dict[str, Any], str]] = [
+    (lambda p: p.rename(p.with_name("frist")), None, {}, "unknown run '{run}'. Did you mean '{parent}/frist'?"),
+    (lambda p: shutil.rmtree(p), None, {}, "no run in {run} (it has no config.json)"),
+    (lambda p: (p / "config.json").write_text("{"), None, {}, "{run}/config.json: cannot be read"),
+    (lambda p: (p / "status.json").unlink(), None, {}, "{run}/status.json: missing; the run directory is incomplete"),
+    (nothing_saved, None, {}, "{run}: nothing was saved in this run yet (state: running)"),
+    (lambda p: spoilt(p, lambda c: (c / "mine.zip").unlink()), None, {}, "the checkpoint lacks the policies of mine"),
+    (lambda p: spoilt(p, lambda c: cut(c / "mine.zip")), None, {}, "/mine.zip: cannot be read"),
+    (lambda p: spoilt(p, lambda c: (c / "mine.normaliser.pkl").unlink()), None, {}, "mine.normaliser.pkl: cannot be"),
+    (lambda p: None, "mnie", {}, "{run}: unknown agent 'mnie'. Did you mean 'mine'? Known: mine, use."),
+    (lambda p: None, "use", {}, "'use' sees other things, 7 entries there and 4 here: only there 'stock "),
+    (lambda p: None, None, {"observe": "full"}, "{run}: 'mine' sees other things, "),
+    (lambda p: None, None, {"algorithm": "A2C", "parameters": {}}, "'mine' has algorithm = 'PPO', not 'A2C'"),
+    (
+        lambda p: None,
+        None,
+        {"parameters": PPO | {"policy_kwargs": {"net_arch": [9]}}},
+        "there and (9, 4) here; write policy_kwargs as there",
+    ),
+    (
+        lambda p: None,
+        None,
+        {"normalise": {"observation": False}},
+        "'mine' has normalise.observation = true, not false",
+    ),
+]
+
+
+@pytest.mark.parametrize(("spoil", "agent", "others", "message"), MISTAKES)
+def test_starts_that_do_not_fit_are_named(
+    spoil: Callable[[Path], object],
+    agent: str | None,
+    others: dict[str, Any],
+    message: str,
+    first: tuple[Training, Path],
+    tmp_path: Path,
+) -> None:
+    """Before anything is written, and the other run is left as it is."""
+    source = tmp_path / "runs" / "first"
+    shutil.copytree(first[1], source)
+    spoil(source)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    told = {key: value for key, value in others.items() if key != "observe"}
+    asked = recipe(matches=[{"agents": ["mine"], **from_run(source, agent), **told}])
+    with pytest.raises(RecipeError) as raised:
+        train("copper_net", asked, directory=tmp_path / "run", observe=others.get("observe"), **OPTIONS)
+    assert str(raised.value).startswith("agent 'mine': start: ")
+    assert message.format(run=source, parent=source.parent) in str(raised.value)
+    assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+
+
+def test_one_recipe_serves_several_seeds(first: tuple[Training, Path], tmp_path: Path) -> None:
+    """In the name of the run ``{seed}`` is that of the training."""
+    shutil.copytree(first[1], tmp_path / "first-seed3")
+    asked = recipe(**from_run(tmp_path / "first-seed{seed}"))
+    assert same(
+        weights(prepared("copper_net", asked, seed=3, **OPTIONS).learners["use"]), weights(first[0].learners["use"])
+    )
+    with pytest.raises(RecipeError, match=r"unknown run '.*first-seed4'. Did you mean '.*first-seed3'\?"):
+        prepared("copper_net", asked, seed=4, **OPTIONS)
+
+
+def test_somebody_has_to_learn(first: tuple[Training, Path]) -> None:
+    """If all only act, nothing is left of a training."""
+    with pytest.raises(RecipeError, match=r"nobody learns: share_of_steps is 0 for all of \['mine', 'use'\]"):
+        train("copper_net", recipe(**from_run(first[1], share_of_steps=0)), **OPTIONS)
+
+
+GOOD = """
+name = "mine"
+title = "a recipe"
+[learner]
+algorithm = "PPO"
+share_of_steps = 0
+start = { run = "runs/first", agent = "mine" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"runs/first"', "3", "learner.start.run: Input should be a valid string, got 3"),
+        ('"runs/first"', '""', "learner.start.run: String should have at least 1 character, got ''"),
+        ("run =", "runn =", "learner.start.runn: unknown key 'runn'. Did you mean 'run'? Known: run, agent."),
+        ('{ run = "runs/first", agent = "mine" }', '"runs/first"', "learner.start: must be a table { run = … }, got"),
+        ("share_of_steps = 0", "share_of_steps = -0.1", "share_of_steps: Input should be greater than or equal to 0"),
+        ("start =", "# start =", "learner.share_of_steps: 0, so that it never learns: give a start by which it acts"),
+    ],
+)
+def test_mistakes_in_the_file_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    """Each is an error that names file, key, value and what would do."""
+    path = tmp_path / "recipe.toml"
+    path.write_text(GOOD)
+    assert load_recipe(path).learner.start is not None
+    path.write_text(GOOD.replace(old, new))
+    with pytest.raises(DefinitionError) as raised:
+        load_recipe(path)
+    assert isinstance(raised.value, CirlError) and str(path) in str(raised.value)
+    assert message in str(raised.value)
