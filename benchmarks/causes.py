@@ -80,7 +80,6 @@ VARIANTS = {
     ),
     "ppo_mixed": Variant("reward `mixed`: own set-points count as well", environment={"reward": "mixed"}),
     "ppo_difference": Variant("credit: `mixed_difference`", environment={"reward": "mixed_difference"}),
-    "ppo_price": Variant("price of service fixed, circularity weight 0.9", run={"price_rate": 0.0}),
     "ppo_dear": Variant(
         "price of service fixed, weight 0.5", run={"price_rate": 0.0}, environment={"circularity_weight": 0.5}
     ),
@@ -97,7 +96,6 @@ VARIANTS = {
         "exploration e⁻² instead of e⁻¹ at first", parameters={"policy_kwargs": {"log_std_init": -2.0}}
     ),
     "ppo_critic": Variant("critics see the whole state", learner={"policy": "CentralCriticPolicy"}),
-    "ppo_full": Variant("everyone sees everything", environment={"observe": "full"}),
     "ppo_order": Variant(
         "arcs learn in the first half only, nodes throughout", match=[{"kind": "arc", "share_of_steps": 0.5}]
     ),
@@ -108,8 +106,6 @@ VARIANTS = {
     "ars_linear": Variant("linear policies", base=ARS, parameters={"policy_kwargs": {"net_arch": []}}),
     "ars_best": Variant("the best quarter of the pairs counts", base=ARS, parameters={"n_top": 8}),
     "ars_small": Variant("perturbations of 0.02", base=ARS, parameters={"delta_std": 0.02}),
-    "ars_mixed": Variant("reward `mixed`", base=ARS, environment={"reward": "mixed"}),
-    "ars_price": Variant("price of service fixed, circularity weight 0.9", base=ARS, run={"price_rate": 0.0}),
     "ars_joint": Variant("one learner for all", base=ARS, learner={"scheme": "joint"}),
 }
 
