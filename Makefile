@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
 	rm -rf runs/demo
-	$(BIN)/cirl train copper_net --recipe independent_ppo --seed 0 --out runs/demo
+	$(BIN)/cirl train copper_net --steps 4000000 --seed 0 --out runs/demo
 
 check: lint types fast  ## lint, types and the fast tests, in under 2 minutes on 2 cores
 

@@ -67,7 +67,7 @@ RECIPES = ("independent_ars", "independent_ppo", "shared_ppo", "mappo", "joint_p
 CASES = {
     "copper_net": Case(RECIPES, ("random", "neutral", "mpc", "optimum")),
     "carbo_net": Case(RECIPES, ("random", "neutral", "mpc", "optimum")),
-    "net_zero": Case(("independent_ars",), options={"min_service": 0.999, "circularity_weight": 0.75, "steps": 1_000_000}),
+    "net_zero": Case(("independent_ars",), options={"min_service": 0.999, "steps": 1_000_000}),
 }
 LQR_CASES: tuple[tuple[str, str, dict[str, float] | None], ...] = (
     ("copper_net", "use_to_collection", None),

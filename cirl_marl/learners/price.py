@@ -11,6 +11,9 @@ from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.records.files import write_json
 
+FIRST = 0.5
+"""Share of a run after which the price moves: a multiplier has to be slower than those who learn under it."""
+
 STEEPEST = 1e3
 """Largest price, and the inverse of the smallest."""
 

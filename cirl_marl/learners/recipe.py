@@ -183,7 +183,7 @@ class Run(Settings):
     price_rate: Annotated[Number, Field(ge=0)] = Field(
         0.0,
         description="largest step of the logarithm of the price of a shortfall of service, which moves after each "
-        "evaluation until min_service is reached; 0: circularity_weight stays as it is",
+        "evaluation in the second half of a run, until min_service is reached; 0: circularity_weight stays as it is",
     )
 
 

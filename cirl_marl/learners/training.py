@@ -26,7 +26,7 @@ from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
 from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, World, wait
 from cirl_marl.learners.policies import Policies, Policy
-from cirl_marl.learners.price import ServicePrice
+from cirl_marl.learners.price import FIRST, ServicePrice
 from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory
 from cirl_marl.learners.selection import Evaluation, Score, score_of
 from cirl_marl.learners.stacked.conditions import Stack, first_obstacle, obstacle, stacks
@@ -225,7 +225,7 @@ class Training:
         if self._evaluations is not None:
             figures = score.said() | {"circularity_weight": self.env.circularity_weight}
             self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
-        if self._price is not None:
+        if self._price is not None and self.joint_steps * self.config.envs >= FIRST * self.config.steps:
             self._price.heed(score.assured)
 
     def _write(self, folder: Path, *, replay: bool) -> None:
