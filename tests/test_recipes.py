@@ -126,7 +126,7 @@ def test_published_schema_is_up_to_date() -> None:
         ("n_steps = 8", 'batch_size = "a"', "parameters.batch_size: PPO needs int of at least 1, got 'a'"),
         ("n_steps = 8", "n_epochs = 2.5", "parameters.n_epochs: PPO needs int of at least 1, got 2.5"),
         ("n_steps = 8", "n_steps = 0", "parameters.n_steps: PPO needs int of at least 1, got 0"),
-        ("n_steps = 8", "clip_range = -0.2", "parameters.clip_range: PPO needs float | Callable"),
+        ("n_steps = 8", "clip_range = -0.2", "parameters.clip_range: needs a number of at least 0, or two"),
         ("n_steps = 8", "target_kl = -1", "parameters.target_kl: PPO needs float | None of at least 0, got -1"),
         (
             "n_steps = 8",

@@ -18,7 +18,7 @@ from cirl_marl.evaluation import compare
 from cirl_marl.learners import RunDirectory, resume, train
 from cirl_marl.learners.price import STEEPEST, ServicePrice
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
-from cirl_marl.learners.selection import SEEDS, Evaluation, Score
+from cirl_marl.learners.selection import SEEDS, Score, Selection
 from cirl_marl.learners.trained import Trained
 from cirl_marl.report.run import choice
 
@@ -176,7 +176,7 @@ def test_an_evaluation_has_episodes_of_its_own() -> None:
     env = VectorEnv("copper_net", num_envs=2, horizon=HORIZON)
     from cirl_marl.learners.policies import Policies
 
-    evaluation = Evaluation(env)
+    evaluation = Selection(env)
 
     class Still(Policies):
         def act(self, observations: Any) -> Any:

@@ -30,8 +30,8 @@ from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Node, Observe, Reward, Role
 
-Engine = Literal["auto", "lockstep", "stacked"]
-ENGINES: tuple[Engine, ...] = ("auto", "lockstep", "stacked")
+EngineName = Literal["auto", "lockstep", "stacked"]
+ENGINES: tuple[EngineName, ...] = ("auto", "lockstep", "stacked")
 Count = Annotated[int, Field(strict=True, gt=0)]
 Limit = Annotated[Number, Field(gt=0)]
 
@@ -166,7 +166,7 @@ class Run(Settings):
         description="whether episodes that run side by side begin alike and draw the same, so that they differ by what "
         "was done alone; the next ones begin elsewhere",
     )
-    engine: Engine = Field(
+    engine: EngineName = Field(
         "auto",
         description="lockstep: each learner's own learn(), unmodified; stacked: learners of the same settings as one, "
         "the same algorithm up to rounding and several times as fast; auto: stacks those that can be",

@@ -51,7 +51,7 @@ class Score:
         return asdict(self)
 
 
-class Evaluation:
+class Selection:
     """The episodes that choose: the same ones each time, each in a copy of the environment of its own."""
 
     def __init__(self, env: VectorEnv) -> None:

@@ -28,7 +28,7 @@ from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, Worl
 from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.price import FIRST, ServicePrice
 from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory
-from cirl_marl.learners.selection import Evaluation, Score, score_of
+from cirl_marl.learners.selection import Score, Selection, score_of
 from cirl_marl.learners.stacked.conditions import Stack, first_obstacle, obstacle, stacks
 from cirl_marl.learners.start import begin_from
 from cirl_marl.learners.streams import Streams
@@ -57,7 +57,7 @@ class Progress:
     episode: bool
 
 
-Report = Callable[[Progress], None]
+TrainingReport = Callable[[Progress], None]
 
 
 class Training:
@@ -90,10 +90,10 @@ class Training:
             self._begin_from_others()
         self._price = self._priced(checkpoint)
         asked = config.recipe.run
-        self._evaluation: Evaluation | None = None
+        self._evaluation: Selection | None = None
         if asked.evaluations:
             own = VectorEnv(env.network, num_envs=asked.episodes, agents=env.agents, **config.options)
-            self._evaluation = Evaluation(own)
+            self._evaluation = Selection(own)
         self._evaluated = -1
         self._appoint_demonstrators()
 
@@ -173,8 +173,8 @@ class Training:
         """Joint steps done, those before a resumption included."""
         return self.world.joint_steps
 
-    def after_step(self, began: float, report: Report | None, infos: Infos, ended: NDArray[np.bool_]) -> None:
-        """Report, record finished episodes, evaluate, save checkpoints."""
+    def after_step(self, began: float, report: TrainingReport | None, infos: Infos, ended: NDArray[np.bool_]) -> None:
+        """TrainingReport, record finished episodes, evaluate, save checkpoints."""
         seconds, copies, steps = time.perf_counter() - began, self.env.num_envs, self.joint_steps
         finished = bool(ended.any())
         if finished or report is not None:
@@ -208,7 +208,7 @@ class Training:
         if self.run is not None:
             self.run.save_checkpoint(self.joint_steps, partial(self._write, replay=state != "complete"), state, reason)
 
-    def _evaluate(self, evaluation: Evaluation) -> None:
+    def _evaluate(self, evaluation: Selection) -> None:
         """Play its episodes by the policies of now, keep these if they are the best so far, and move the price."""
         self._bring_up_to_date()
         policies = {
@@ -243,7 +243,7 @@ def run_together(
     trainings: Sequence[Training],
     *,
     callbacks: Mapping[str, BaseCallback] | None = None,
-    report: Report | None = None,
+    report: TrainingReport | None = None,
     device: str = "cpu",
 ) -> None:
     """Train to the end of the budget; several trainings step by step together, learners of all of them stacked.
@@ -268,7 +268,7 @@ def run_together(
 
     for training in trainings:
         training.runs_stacked(bring_up_to_date)
-    reports: list[Report | None] = [report] + [None] * (len(trainings) - 1)
+    reports: list[TrainingReport | None] = [report] + [None] * (len(trainings) - 1)
     try:
         with one_torch_thread(), _interruption() as interrupted:
             hooks = [partial(t.after_step, began, told) for t, told in zip(trainings, reports, strict=True)]

@@ -26,7 +26,7 @@ class Field:
         return matrix.detach()[:, self._columns].view(-1, *self._shape)
 
 
-class Layout:
+class ParameterLayout:
     """A matrix with a row for each of N policies.
 
     Policies with fewer entries of observation or action than the largest are padded by parameters that are zero and

@@ -12,9 +12,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
 
 from cirl_marl.learners.learner import Learner
+from cirl_marl.learners.stacked.experience import Experience
 from cirl_marl.learners.stacked.inputs import Inputs
 from cirl_marl.learners.stacked.perceptrons import pieces
-from cirl_marl.learners.stacked.rollout import Rollout
 from cirl_marl.learners.stacked.update import LOG_SQRT_2PI, Rules, Update
 from cirl_marl.learners.stacked.weights import Weights
 
@@ -50,7 +50,7 @@ class RolloutStack:
         self._noise = [torch.Generator().set_state(learner.streams.torch_state) for learner in members]
         self._shuffles = [np.random.RandomState(learner.streams.bit_generator) for learner in members]
         shape = (len(members), self._rows, self._steps)
-        self._rollout = Rollout.empty(shape, self._inputs.entries, self._acts.shape[2], self._device)
+        self._rollout = Experience.empty(shape, self._inputs.entries, self._acts.shape[2], self._device)
         self._episodes: list[deque[float]] = [deque(maxlen=EPISODES) for _ in members]
         self._moves, self._given = 0, 0
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.stacked.inputs import Inputs
-from cirl_marl.learners.stacked.layout import Layout, layers_of
+from cirl_marl.learners.stacked.layout import ParameterLayout, layers_of
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, Activation, Perceptrons, linear_layers
 
 
@@ -34,7 +34,7 @@ class SearchStack:
         self._models = [_search(each) for each in members]
         first = self._models[0]
         self._inputs = Inputs(members, self._device)
-        self._layout = Layout(len(members))
+        self._layout = ParameterLayout(len(members))
         policies = [_policy(model) for model in self._models]
         parts = [parts_of(policy) for policy in policies]
         self._fields = self._layout.layers([[*linear, head] for linear, head, _ in parts], self._inputs.seen)

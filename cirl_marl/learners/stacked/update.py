@@ -12,8 +12,8 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.utils import update_learning_rate
 from torch import Tensor
 
+from cirl_marl.learners.stacked.experience import Experience, Samples
 from cirl_marl.learners.stacked.perceptrons import pieces
-from cirl_marl.learners.stacked.rollout import Rollout, Samples
 from cirl_marl.learners.stacked.weights import Weights
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
@@ -94,7 +94,7 @@ def value_loss(values: Tensor, samples: Samples, clip: float | None) -> tuple[Te
 class Update:
     """One update of all learners by their rollouts; ``acts`` is 1 where a learner has an entry of its action."""
 
-    def __init__(self, weights: Weights, rules: Rules, rollout: Rollout, acts: Tensor, local: int) -> None:
+    def __init__(self, weights: Weights, rules: Rules, rollout: Experience, acts: Tensor, local: int) -> None:
         """``local`` is the number of columns of what is seen at which actors look."""
         self._weights, self._rules, self._rollout = weights, rules, rollout
         self._acts, self._local = acts, local

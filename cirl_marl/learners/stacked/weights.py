@@ -10,7 +10,7 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor, nn
 
-from cirl_marl.learners.stacked.layout import Layout, layers_of
+from cirl_marl.learners.stacked.layout import ParameterLayout, layers_of
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, Perceptrons, linear_layers
 from cirl_marl.network import Integers
 
@@ -42,7 +42,7 @@ class Weights:
         ``seen`` and ``criticised`` are, by learner, the columns of the padded inputs at which its actor and its critic
         look.
         """
-        self._policies, self._layout = policies, (layout := Layout(len(policies)))
+        self._policies, self._layout = policies, (layout := ParameterLayout(len(policies)))
         log_std = layout.field([p.log_std for p in policies], [np.arange(len(p.log_std)) for p in policies])
         extractors = [policy.mlp_extractor for policy in policies]
         heads = [(policy.action_net, policy.value_net) for policy in policies]

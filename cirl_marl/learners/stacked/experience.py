@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass(slots=True)
-class Rollout:
+class Experience:
     """T steps of B rows of N learners; shapes are (N, B, T), with entries last where there are some.
 
     Attributes:
@@ -36,7 +36,7 @@ class Rollout:
     cut: list[tuple[int, Tensor, Tensor]] = field(default_factory=list)
 
     @classmethod
-    def empty(cls, shape: tuple[int, int, int], entries: int, actions: int, device: torch.device) -> Rollout:
+    def empty(cls, shape: tuple[int, int, int], entries: int, actions: int, device: torch.device) -> Experience:
         """Return one to be filled, of shape (N, B, T)."""
 
         def zeros(*last: int) -> Tensor:
