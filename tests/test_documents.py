@@ -289,12 +289,13 @@ def test_own_model_in_the_guide_is_valid(tmp_path: Path) -> None:
 def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The recipe shown to newcomers learns in the network that it is shown for, and what is added to it reads."""
     path = tmp_path / "my_recipe.toml"
-    whole, addition = blocks((ROOT / "agents" / "README.md").read_text(), "toml")
+    whole, start, addition = blocks((ROOT / "agents" / "README.md").read_text(), "toml")
     path.write_text(whole)
     training = train("copper_net", path, steps=640, envs=8)
     assert type(training.learners["mine"].model).__name__ == "SAC"
-    path.write_text(whole + addition)
-    assert load_recipe(path).match[1].algorithm == "TQC"
+    path.write_text(whole + start + addition)
+    added = load_recipe(path).match[1:]
+    assert added[0].start is not None and added[1].algorithm == "TQC"
 
 
 @pytest.mark.medium

@@ -138,6 +138,22 @@ def test_start_is_the_best_checkpoint(tmp_path: Path) -> None:
     assert same(weights(found.learners["use"]), expected)
 
 
+@pytest.mark.parametrize(
+    ("learner", "why"),
+    [
+        ({"start": True}, "start: its statistics of observations stay as they are"),
+        ({"demonstrations": {"controller": "neutral", "steps": 8}}, "demonstrations: each learner imitates by itself"),
+    ],
+)
+def test_such_learners_are_not_stacked(learner: dict[str, Any], why: str, first: tuple[Training, Path]) -> None:
+    """They run in lockstep with the others, and whoever asks for a stack is told why there is none."""
+    asked = recipe(**(from_run(first[1]) if "start" in learner else learner))
+    stacked = asked.model_copy(update={"run": asked.run.model_copy(update={"engine": "stacked"})})
+    with pytest.raises(RecipeError, match=f"agent 'mine': engine stacked: {why}; use engine auto or lockstep"):
+        train("copper_net", stacked, **OPTIONS)
+    assert train("copper_net", asked, **OPTIONS).joint_steps == 12
+
+
 class FailsAtOnce(BaseCallback):
     """Fails at the first step of its learner."""
 
