@@ -39,7 +39,7 @@ def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.slow
 def test_a_trial_writes_a_document_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer recipes, seeds or steps than the study has change nothing that is published."""
-    case = study.Case(("joint_sac",), options={"horizon": 8})
+    case = study.Case(("joint_sac",), episodes=2, options={"horizon": 8})
     monkeypatch.setitem(study.CASES, "net_zero", case)
     published = {path: path.read_bytes() for path in (ROOT / "docs" / "study.md", *study.RESULTS.rglob("*.json"))}
     study.main(out=tmp_path, only=["net_zero"], recipes=["joint_sac"], seeds=1, steps=320, episodes=2, jobs=1)

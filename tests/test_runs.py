@@ -157,7 +157,7 @@ def test_recurrent_policies_remember_within_an_episode_and_forget_after_it(tmp_p
     learner = LearnerSettings(
         algorithm="RecurrentPPO", policy="MlpLstmPolicy", parameters=parameters, normalise=normalise
     )
-    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=2), learner=learner)
+    recipe = Recipe(name="x", title="x", run=Run(steps=40, envs=2, evaluations=0), learner=learner)
     training = train("copper_net", recipe, agents=["use"], directory=tmp_path / "run", horizon=5)
     env = RunDirectory(tmp_path / "run").make_env(2)
     controller, model = Trained(tmp_path / "run"), training.learners["use"].model

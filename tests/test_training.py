@@ -382,7 +382,7 @@ def test_schedules_run_from_their_first_value_to_their_last(algorithm: str) -> N
     rate = {"linear_from": 1e-3, "linear_to": 1e-5}
     policy = "LinearPolicy" if algorithm == "ARS" else "MlpPolicy"
     learner = LearnerSettings(algorithm=algorithm, policy=policy, parameters={**parameters, "learning_rate": rate})
-    recipe = Recipe(name="x", title="x", run=Run(steps=480, envs=2), learner=learner)
+    recipe = Recipe(name="x", title="x", run=Run(steps=480, envs=2, evaluations=0), learner=learner)
     training = train("copper_net", recipe, agents=["use"], horizon=10, callbacks={"use": Rates()})
     assert training.joint_steps == 240
     assert seen == sorted(seen, reverse=True)

@@ -1,0 +1,119 @@
+"""solids_net: what a slower robot brings, and who acts how beside which sorter (docs/study.md).
+
+python -m benchmarks.solids                       # a script that waits in each attempt
+python -m benchmarks.solids SORTER_RUN [OTHERS]   # a learnt sorter; truck and incinerator of a run, or by script
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.evaluation.statistics import over_episodes
+from cirl_marl.learners.learner import load_model, load_normaliser
+from cirl_marl.learners.run import RunDirectory
+from cirl_marl.network import Floats
+
+EPISODES = 8
+WAITS = ((0, 0), (0, 10), (0, 28), (28, 28))
+"""Steps that the robot waits in each attempt at an item of the first and of the second batch."""
+SECOND_BATCH = 200
+"""Interval in which the second batch leaves the reservoir: after 8 s of 0.04 s each."""
+REST = np.array([0.0, 0.0, 0.0, 1.0])
+"""Action of the robot that moves nothing and keeps the gripper open."""
+
+Actions = dict[str, NDArray[np.floating]]
+Act = Callable[[VectorEnv, int, Actions, Actions], Actions]
+"""From the environment, the interval, what is seen and what the script does to what is done instead."""
+
+
+@dataclass
+class Episodes:
+    """What came of the episodes: mass, levels, and numbers of items and loads, shape (episodes,)."""
+
+    circularity: Floats
+    service: Floats
+    sorted: Floats
+    missed: Floats
+    loads: Floats
+
+    def __str__(self) -> str:
+        """Return a row of a table."""
+        found = over_episodes(self.circularity)
+        items = (self.sorted, self.missed, self.loads)
+        numbers = ", ".join(
+            f"{name} {each.mean():.2f}" for name, each in zip(("sorted", "missed", "loads"), items, strict=True)
+        )
+        return f"λ̄ {found.value:.1f} ± {found.high - found.value:.1f} kg, service {self.service.mean():.4f}, {numbers}"
+
+
+def main(
+    sorter: Annotated[Path | None, typer.Argument(help="Run that has a sorter; default: scripts that wait.")] = None,
+    others: Annotated[Path | None, typer.Argument(help="Run of truck and incinerator; default: the script.")] = None,
+) -> None:
+    """Play episodes and print what came of them."""
+    if sorter is None:
+        for waits in WAITS:
+            typer.echo(f"waits {waits}: {played(partial(_waiting, waits))}")
+        return
+    policies = {"sorter": _policy(sorter, "sorter")}
+    if others is not None:
+        policies |= {agent: _policy(others, agent) for agent in ("truck", "incinerator")}
+    typer.echo(
+        str(played(lambda _env, _t, seen, _script: {agent: act(seen[agent]) for agent, act in policies.items()}))
+    )
+
+
+def played(act: Act) -> Episodes:
+    """Play episodes by script, but for what ``act`` gives."""
+    env, script = VectorEnv("solids_net", num_envs=EPISODES), Scripted()
+    seen = env.reset(seed=first_seed(0))
+    script.start(env, 0)
+    place = {name: env.state_names.index(name) for name in ("sorter.sorted_now", "sorter.missed_now")}
+    bound = env.state_names.index("truck.destination_m")
+    items, loads, before = np.zeros((2, EPISODES)), np.zeros(EPISODES), np.zeros(EPISODES)
+    infos: dict[str, Any] = {}
+    for t in range(env.network.episode.horizon):
+        actions: Actions = dict(script.act(seen))
+        seen, _, _, _, infos = env.step(actions | act(env, t, dict(seen), actions))
+        last = infos["sorter"].get("final_state")
+        state = env.state() if last is None else last
+        items += state[:, list(place.values())].T
+        loads += (before > 0) & (state[:, bound] == 0)
+        before = state[:, bound]
+    told = infos["sorter"]
+    return Episodes(told["episode_circularity"], told["episode_service_level"], items[0], items[1], loads)
+
+
+def _waiting(waits: tuple[int, int], env: VectorEnv, t: int, _seen: Actions, script: Actions) -> Actions:
+    """Rest in the first steps of each attempt."""
+    attempt = env.state()[:, env.state_names.index("sorter.attempt_step")]
+    rests = attempt < waits[t >= SECOND_BATCH]
+    return {"sorter": np.where(rests[:, None], REST, script["sorter"])}
+
+
+def _policy(run: Path, agent: str) -> Callable[[NDArray[np.floating]], NDArray[np.floating]]:
+    directory = RunDirectory(run)
+    spec = next(group.spec for group in directory.groups() if group.name == agent)
+    model = load_model(directory.chosen, agent, spec.algorithm)
+    normaliser = load_normaliser(directory.chosen, agent, spec)
+
+    def act(seen: NDArray[np.floating]) -> NDArray[np.floating]:
+        shown: Any = seen if normaliser is None else normaliser.normalize_obs(seen)
+        return model.predict(shown, deterministic=True)[0]
+
+    return act
+
+
+if __name__ == "__main__":
+    typer.run(main)
