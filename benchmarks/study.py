@@ -40,7 +40,7 @@ from cirl_marl.records.files import write_json
 from cirl_marl.report.comparison import write_comparison
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
-FIRST_SEED, SEEDS, EPISODES = 100, 5, 16
+FIRST_SEED, SEEDS, EPISODES = 200, 5, 64
 """No tuning looked at these training seeds; ``python -m benchmarks.causes`` has others."""
 RESULTS = Path(__file__).parent / "results" / "study"
 console = Console(width=None if sys.stdout.isatty() else 140)
