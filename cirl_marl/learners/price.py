@@ -15,7 +15,7 @@ FIRST = 0.5
 """Share of a run after which the price moves: a multiplier has to be slower than those who learn under it."""
 
 STEEPEST = 1e3
-"""Largest price, and the inverse of the smallest."""
+"""Largest price."""
 
 
 class ServicePrice:
@@ -26,18 +26,23 @@ class ServicePrice:
     evaluation that assures the level s of every service::
 
         log p ← log p + rate · clip((s* − s)/(1 − s*), −1, 1)
+
+    but p does not fall below what it was at first, where learners that serve more than is demanded would give up at
+    once what takes them long to learn.
     """
 
     def __init__(self, env: VectorEnv, demanded: float, rate: float) -> None:
         """Begin with the weight that ``env`` has."""
         self._env, self._demanded, self._rate = env, demanded, rate
+        weight = max(env.circularity_weight, 1.0 / (1.0 + STEEPEST))
+        self._least = (1.0 - weight) / weight
 
     def heed(self, assured: float) -> None:
         """Move the price after an evaluation."""
         lacks = (self._demanded - assured) / max(1.0 - self._demanded, 1.0 / STEEPEST)
         weight = self._env.circularity_weight
         price = (1.0 - weight) / weight * np.exp(self._rate * np.clip(lacks, -1.0, 1.0))
-        self._env.circularity_weight = 1.0 / (1.0 + float(np.clip(price, 1.0 / STEEPEST, STEEPEST)))
+        self._env.circularity_weight = 1.0 / (1.0 + float(np.clip(price, self._least, STEEPEST)))
 
     def save(self, folder: Path) -> None:
         """Keep the weight in a checkpoint."""
