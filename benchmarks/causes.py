@@ -60,7 +60,7 @@ class Variant:
         """Return the recipe that differs."""
         plain = load_recipe(self.base).model_dump()
         plain["name"] = name
-        plain["run"] |= self.run
+        plain["run"] |= {"evaluations": 5, "episodes": 64} | self.run
         plain["environment"] |= self.environment
         plain["learner"] |= self.learner
         plain["learner"]["parameters"] |= self.parameters
@@ -142,6 +142,7 @@ def _is_done(out: Path, name: str, steps: int) -> bool:
 
 
 def _train(out: Path, name: str, steps: int) -> str:
+    """Train all seeds of a variant together."""
     for seed in SEEDS:
         shutil.rmtree(f"{out / name}-seed{seed}", ignore_errors=True)
     began = time.process_time()
