@@ -60,7 +60,7 @@ class Variant:
         """Return the recipe that differs."""
         plain = load_recipe(self.base).model_dump()
         plain["name"] = name
-        plain["run"] |= {"evaluations": 5, "episodes": 64} | self.run
+        plain["run"] |= {"evaluations": 5, "episodes": 64, **self.run}
         plain["environment"] |= self.environment
         plain["learner"] |= self.learner
         plain["learner"]["parameters"] |= self.parameters

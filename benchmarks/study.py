@@ -66,9 +66,8 @@ class Case:
 
 RECIPES = ("independent_ars", "independent_ppo", "shared_ppo", "mappo", "joint_ppo")
 CASES = {
-    "copper_net": Case(RECIPES, ("random", "neutral", "mpc", "optimum")),
-    "carbo_net": Case(RECIPES, ("random", "neutral", "mpc", "optimum")),
-    "net_zero": Case(("net_zero_ppo",), ("random", "neutral", "optimum"), service=0.999, episodes=4),
+    "copper_net": Case(RECIPES),
+    "carbo_net": Case(RECIPES),
 }
 LQR_CASES: tuple[tuple[str, str, dict[str, float] | None], ...] = (
     ("copper_net", "use_to_collection", None),
