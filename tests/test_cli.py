@@ -121,7 +121,7 @@ def test_check_takes_names_and_recipes(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert run(monkeypatch, "check", "copper_net", "independent_ppo", "mine.toml") == 0
     said = capsys.readouterr().out
     assert said.count("no mistakes") == 3
-    assert "mine.toml: recipe of PPO, 200,000 steps in 32 copies" in said
+    assert "mine.toml: recipe of PPO, 600,000 steps in 32 copies" in said
     Path("mine.toml").write_text(recipe.replace('algorithm = "PPO"', 'algorithm = "PPQ"'))
     assert run(monkeypatch, "check", "mine.toml") == 2
     assert "Did you mean 'PPO'?" in capsys.readouterr().err
@@ -400,7 +400,22 @@ def test_short_trainings_say_that_there_are_no_curves(
 ) -> None:
     """No empty picture is drawn, and the number of steps that would do is given."""
     Path("bottles.toml").write_text(guide(days=60))
-    assert run(monkeypatch, "train", "bottles.toml", "--steps", "640", "--out", "run", "--episodes", "2") == 0
+    assert (
+        run(
+            monkeypatch,
+            "train",
+            "bottles.toml",
+            "--recipe",
+            "independent_ppo",
+            "--steps",
+            "640",
+            "--out",
+            "run",
+            "--episodes",
+            "2",
+        )
+        == 0
+    )
     assert "no learning curves, as no episode ended: 32 copies need 1,920 steps" in capsys.readouterr().out
     assert {path.name for path in Path("run/pictures").iterdir()} == {"flows_before_after.png", "circularity.png"}
     monkeypatch.setattr(sys, "argv", [])
