@@ -406,7 +406,7 @@ def test_short_trainings_say_that_there_are_no_curves(
             "train",
             "bottles.toml",
             "--recipe",
-            "independent_ppo",
+            "independent_a2c",
             "--steps",
             "640",
             "--out",
