@@ -44,14 +44,10 @@ def test_there_is_room_above_neutral(network: str) -> None:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize(
-    ("steps", "horizon", "episodes"), [(10_240, 40, 8), pytest.param(35_840, None, 7, marks=pytest.mark.slow)]
-)
-def test_learners_raise_their_returns_together(steps: int, horizon: int | None, episodes: int, tmp_path: Path) -> None:
-    """A part of the default run already lifts the mean return of the sixteen agents well above where it began."""
-    train("copper_net", "independent_ppo", directory=tmp_path / "run", steps=steps, seed=0, horizon=horizon)
+def test_learners_raise_their_returns_together(tmp_path: Path) -> None:
+    """A twentieth of the default run already lifts the mean return of the sixteen agents well above where it began."""
+    train("copper_net", directory=tmp_path / "run", steps=300_000, seed=0)
     metrics = RunDirectory(tmp_path / "run").metrics()
     returns = np.mean([values for name, values in metrics.items() if name.startswith("return:")], axis=0)
-    assert len(returns) == episodes
     assert returns[-1] - returns[0] > 0.2 * abs(returns[0])
     assert metrics["service_level"][-1] > metrics["service_level"][0]

@@ -29,7 +29,8 @@ from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.price import FIRST, ServicePrice
 from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory
 from cirl_marl.learners.selection import Score, Selection, score_of
-from cirl_marl.learners.stacked.conditions import Stack, first_obstacle, obstacle, stacks
+from cirl_marl.learners.stacked.conditions import first_obstacle, obstacle, stacks
+from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.start import begin_from
 from cirl_marl.learners.streams import Streams
 

@@ -19,8 +19,8 @@ from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.stacked.on_policy import RolloutStack
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, linear_layers
 from cirl_marl.learners.stacked.search import SearchStack, copies_each, parts_of
+from cirl_marl.learners.stacked.stack import Stack
 
-Stack = RolloutStack | SearchStack
 OPTIMISERS = (torch.optim.Adam, torch.optim.AdamW, torch.optim.RMSprop, torch.optim.SGD, RMSpropTFLike)
 """Optimisers that work element by element, so that zeros stay zero."""
 EXTRACTORS = {ActorCriticPolicy: FlattenExtractor, CentralCriticPolicy: CombinedExtractor}

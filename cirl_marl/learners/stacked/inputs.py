@@ -14,7 +14,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import Tensor
 
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.stacked.moments import Moments
 from cirl_marl.network import Integers
 
 
@@ -49,10 +48,11 @@ class Inputs:
         if states:
             self._parts["state"] = np.zeros((len(members), rows, states))
         self._returns = np.zeros((len(members), rows))
-        self._moments = {key: Moments(len(members), part.shape[2]) for key, part in self._parts.items()}
-        self._paid_moments = Moments(len(members), 1)
-        for i, columns, own_moments, kept in self._kept():
-            own_moments.take(i, columns, kept)
+        # of all learners at once, shape (N, entries): they have seen the same number of samples
+        self._moments = {key: RunningMeanStd(shape=(len(members), part.shape[2])) for key, part in self._parts.items()}
+        self._paid_moments = RunningMeanStd(shape=(len(members), 1))
+        for i, columns, ours, kept in self._kept():
+            ours.mean[i, columns], ours.var[i, columns], ours.count = kept.mean, kept.var, kept.count
 
     def begin(self) -> Tensor:
         """Return what is seen, as at a reset: it counts in the moments, and discounted returns begin anew."""
@@ -65,7 +65,7 @@ class Inputs:
             self._enter(i, learner.seat.reset())
         if learning and self._members[0].spec.normalise.observation:
             for key, part in self._parts.items():
-                self._moments[key].update(part)
+                _update(self._moments[key], part)
         return self._normalised()
 
     def last_seen(self, ended: NDArray[np.bool_]) -> Tensor:
@@ -81,10 +81,10 @@ class Inputs:
         env = self._members[0].env
         if isinstance(env, VecNormalize):
             self._returns = self._returns * env.gamma + rewards
-            self._paid_moments.update(self._returns[..., None])
+            _update(self._paid_moments, self._returns[..., None])
             self._returns[ended] = 0.0
             if env.norm_reward:
-                rewards = rewards / self._paid_moments.scale(env.epsilon)[..., 0]
+                rewards = rewards / np.sqrt(self._paid_moments.var + env.epsilon)
                 rewards = np.clip(rewards, -env.clip_reward, env.clip_reward)
         return torch.as_tensor(rewards, dtype=torch.float32, device=self._device), ended
 
@@ -95,10 +95,12 @@ class Inputs:
 
     def give(self) -> None:
         """Give normalisers what they would know by themselves."""
-        for i, columns, own, kept in self._kept():
-            own.give(i, columns, kept)
+        for i, columns, ours, kept in self._kept():
+            shape = np.shape(kept.mean)
+            kept.mean, kept.var = (np.array(own[i, columns]).reshape(shape) for own in (ours.mean, ours.var))
+            kept.count = ours.count
 
-    def _kept(self) -> Iterator[tuple[int, slice, Moments, RunningMeanStd]]:
+    def _kept(self) -> Iterator[tuple[int, slice, RunningMeanStd, RunningMeanStd]]:
         """Yield each learner's own moments beside ours, with its row and columns."""
         for i, learner in enumerate(self._members):
             env = learner.env
@@ -123,11 +125,16 @@ class Inputs:
         for key, part in self._parts.items():
             own = self._moments[key]
             if isinstance(env, VecNormalize) and env.norm_obs:
-                scaled = (part - own.mean[:, None]) / own.scale(env.epsilon)
+                scaled = (part - own.mean[:, None]) / np.sqrt(own.var + env.epsilon)[:, None]
                 parts.append(np.clip(scaled, -env.clip_obs, env.clip_obs))
             else:
                 parts.append(part)
         return torch.as_tensor(np.concatenate(parts, axis=2), dtype=torch.float32, device=self._device)
+
+
+def _update(moments: RunningMeanStd, samples: NDArray[np.floating]) -> None:
+    """Add samples, shape (N, samples, entries); their own moments are of their own precision."""
+    moments.update_from_moments(samples.mean(axis=1), samples.var(axis=1), samples.shape[1])
 
 
 def _box(space: spaces.Space[Any]) -> spaces.Box:

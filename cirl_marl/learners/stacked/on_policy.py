@@ -13,8 +13,8 @@ from torch import Tensor
 
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.stacked.experience import Experience
-from cirl_marl.learners.stacked.inputs import Inputs
 from cirl_marl.learners.stacked.perceptrons import pieces
+from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.stacked.update import LOG_SQRT_2PI, Rules, Update
 from cirl_marl.learners.stacked.weights import Weights
 
@@ -25,34 +25,26 @@ EPISODES = 100
 """Last episodes whose mean return is logged, as Stable-Baselines3 does."""
 
 
-class RolloutStack:
-    """PPO or A2C learners of the same settings, from which it takes everything and to which ``give`` brings it back.
-
-    Attributes:
-        members: the learners, whose order is that of all leading axes.
-    """
+class RolloutStack(Stack):
+    """PPO or A2C learners."""
 
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
         """Take over what the learners know."""
-        self.members = list(members)
-        self._device = torch.device(device)
+        super().__init__(members, device)
         self._models = [_stackable(each) for each in members]
         first = self._models[0]
         self._rows, self._steps = members[0].seat.num_envs, first.n_steps
         self._timesteps, self._updates = first.num_timesteps, first._n_updates
-        self._inputs = Inputs(members, self._device)
         policies = [_policy(model) for model in self._models]
         self._weights = Weights(policies, self._inputs.seen, self._inputs.criticised, self._device)
         self._acts = torch.zeros(len(members), 1, self._weights.log_std.shape[1], device=self._device)
         for own, space in zip(self._acts, self._inputs.spaces, strict=True):
             own[:, : space.shape[0]] = 1.0
-        # Noise comes from a copy of each learner's torch stream, minibatches from its NumPy stream itself.
-        self._noise = [torch.Generator().set_state(learner.streams.torch_state) for learner in members]
+        # Minibatches come from each learner's NumPy stream itself.
         self._shuffles = [np.random.RandomState(learner.streams.bit_generator) for learner in members]
         shape = (len(members), self._rows, self._steps)
         self._rollout = Experience.empty(shape, self._inputs.entries, self._acts.shape[2], self._device)
         self._episodes: list[deque[float]] = [deque(maxlen=EPISODES) for _ in members]
-        self._moves, self._given = 0, 0
 
     def learn(self, steps: int, wait: Callable[[], None]) -> None:
         """Learn for the share of ``steps`` that is the learners'; ``wait`` returns when the environments have moved."""
@@ -70,22 +62,13 @@ class RolloutStack:
             self._updates += rules.epochs
             self._log(update)
 
-    def act(self, wait: Callable[[], None]) -> None:
-        """Act for ever by the means of the policies, learning nothing."""
-        while True:
-            self._inputs.hand_in(self._means(self._inputs.observed(learning=False)))
-            wait()
+    def _best(self, seen: Tensor) -> Tensor:
+        return self._weights.actor.forward(seen[..., : self._inputs.local])[-1]
 
-    def give(self) -> None:
-        """Bring models, normalisers and random streams up to date, as if each learner had learnt by itself."""
-        if self._given == self._moves:
-            return
-        self._given = self._moves
+    def _give_models(self) -> None:
         self._weights.give()
-        self._inputs.give()
-        for learner, model, noise in zip(self.members, self._models, self._noise, strict=True):
+        for model in self._models:
             model.num_timesteps, model._n_updates = self._timesteps, self._updates
-            learner.streams.torch_state = noise.get_state()
 
     def _collect(self, wait: Callable[[], None]) -> None:
         """Fill the rollout by the policies of now."""
@@ -94,14 +77,11 @@ class RolloutStack:
         std, rest = log_std.exp(), -log_std - LOG_SQRT_2PI
         for t in range(self._steps):
             noise = self._drawn()
-            actions = self._means(self._current) + std * noise
+            actions = self._best(self._current) + std * noise
             rollout.seen[:, :, t], rollout.actions[:, :, t] = self._current, actions
             rollout.log_probabilities[:, :, t] = ((rest - 0.5 * noise.square()) * self._acts).sum(dim=-1)
             rollout.starts[:, :, t] = self._starts
-            self._inputs.hand_in(actions)
-            wait()
-            self._moves += 1
-            self._current = self._inputs.observed(learning=True)
+            self._current = self._move(actions, wait)
             rollout.rewards[:, :, t], ended = self._inputs.paid()
             self._starts = torch.as_tensor(ended, dtype=torch.float32, device=self._device)
             if ended.any():
@@ -115,9 +95,6 @@ class RolloutStack:
         for t, cut, last in rollout.cut:
             rollout.rewards[:, :, t] += model.gamma * self._values(last) * cut
         rollout.estimate(self._values(self._current), self._starts, model.gamma, model.gae_lambda)
-
-    def _means(self, seen: Tensor) -> Tensor:
-        return self._weights.actor.forward(seen[..., : self._inputs.local])[-1]
 
     def _drawn(self) -> Tensor:
         """Return standard normal noise, each learner's from its own stream, in the shape in which it draws it."""

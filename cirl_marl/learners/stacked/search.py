@@ -10,30 +10,25 @@ from sb3_contrib.ars.policies import ARSPolicy
 from torch import Tensor, nn
 
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.stacked.inputs import Inputs
 from cirl_marl.learners.stacked.layout import ParameterLayout, layers_of
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, Activation, Perceptrons, linear_layers
+from cirl_marl.learners.stacked.stack import Stack
 
 
-class SearchStack:
+class SearchStack(Stack):
     """ARS learners of the same settings (Mania et al. 2018, arXiv 1803.07055), who all try their candidates at once.
 
     Candidate k of every learner acts beside candidate k of the others. If all are paid the same, the search is that of
     one learner whose parameters are those of all, though nobody sees more than its own observation. A candidate has
     ``n_eval_episodes`` episodes, each in a copy of its own; with as many of them as there are copies, candidates take
     turns, which is what the algorithm does by itself.
-
-    Attributes:
-        members: the learners, whose order is that of all leading axes.
     """
 
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
         """Take over what the learners know."""
-        self.members = list(members)
-        self._device = torch.device(device)
+        super().__init__(members, device)
         self._models = [_search(each) for each in members]
         first = self._models[0]
-        self._inputs = Inputs(members, self._device)
         self._layout = ParameterLayout(len(members))
         policies = [_policy(model) for model in self._models]
         parts = [parts_of(policy) for policy in policies]
@@ -45,13 +40,11 @@ class SearchStack:
             for parameter, columns in self._layout.places(i):
                 self._centre[i, columns] = parameter.detach().flatten().to(self._device)
         self._columns = [torch.cat([c for _, c in self._layout.places(i)]) for i in range(len(members))]
-        self._noise = [torch.Generator().set_state(learner.streams.torch_state) for learner in members]
         seat = members[0].seat
         self._rows, self._copies = seat.num_envs, seat.copies
         self._each = copies_each(members[0])
         # the algorithm counts a step of all its rows once for each of them
-        self._steps, self._updates = first.num_timesteps // self._rows**2, first._n_updates
-        self._given = self._steps
+        self._before, self._updates = first.num_timesteps // self._rows**2, first._n_updates
 
     def learn(self, steps: int, wait: Callable[[], None]) -> None:
         """Learn for the share of ``steps`` that is the learners'; ``wait`` returns when the environments have moved.
@@ -79,25 +72,19 @@ class SearchStack:
             self._updates += 1
             self._log(returns, spread, size, rate, std)
 
-    def act(self, wait: Callable[[], None]) -> None:
-        """Act for ever by what was found, learning nothing."""
-        while True:
-            seen = self._inputs.observed(learning=False)
-            self._inputs.hand_in(self._actions(self._centre, seen))
-            wait()
+    @property
+    def _steps(self) -> int:
+        return self._before + self._moves
 
-    def give(self) -> None:
-        """Bring models, normalisers and random streams up to date, as if each learner had learnt by itself."""
-        if self._given == self._steps:
-            return
-        self._given = self._steps
-        self._inputs.give()
-        for i, (learner, model) in enumerate(zip(self.members, self._models, strict=True)):
+    def _best(self, seen: Tensor) -> Tensor:
+        return self._actions(self._centre, seen)
+
+    def _give_models(self) -> None:
+        for i, model in enumerate(self._models):
             found = self._centre[i, self._columns[i]].cpu()
             model.policy.load_from_vector(found.numpy())
             model.weights = found  # type: ignore[assignment]
             model.num_timesteps, model._n_updates = self._steps * self._rows**2, self._updates
-            learner.streams.torch_state = self._noise[i].get_state()
 
     def _drawn(self) -> Tensor:
         """Return the directions of all learners, each drawn as it draws them, shape (learners, K, columns)."""
@@ -128,10 +115,7 @@ class SearchStack:
             by_candidate = seen.view(*shape, -1).transpose(1, 2).reshape(len(matrix), agents * self._each, -1)
             actions = self._actions(matrix, by_candidate)
             by_row = actions.view(learners, count, agents, self._each, -1).transpose(1, 2)
-            self._inputs.hand_in(by_row.reshape(learners, self._rows, -1))
-            wait()
-            self._steps += 1
-            seen = self._inputs.observed(learning=True)
+            seen = self._move(by_row.reshape(learners, self._rows, -1), wait)
             rewards, ended = self._inputs.paid()
             total += (rewards + offset).view(*shape).sum(dim=(1, 3))
             goes_on = not ended.all()
