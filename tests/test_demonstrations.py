@@ -9,7 +9,9 @@ from typing import Any, get_args
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
+from sb3_contrib import ARS
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -138,9 +140,10 @@ ROLLOUTS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "n_epochs": 1, "polic
         ("PPO", "MlpPolicy", ROLLOUTS),
         ("A2C", "MlpPolicy", {"n_steps": 8}),
         ("PPO", "CentralCriticPolicy", ROLLOUTS),
+        ("ARS", "MlpPolicy", {"n_delta": 1, "zero_policy": False, "policy_kwargs": {"net_arch": [32]}}),
     ],
 )
-def test_on_policy_learner_imitates(algorithm: str, policy: str, parameters: dict[str, Any]) -> None:
+def test_learner_without_a_buffer_imitates(algorithm: str, policy: str, parameters: dict[str, Any]) -> None:
     """What it has been shown it then does: much less of a random start is left; only then does it learn by itself."""
     shown = {"controller": "neutral", "steps": 320}
     far: dict[int, float] = {}
@@ -158,7 +161,11 @@ def test_on_policy_learner_imitates(algorithm: str, policy: str, parameters: dic
         neutral.start(training.env, 0)
         wanted, found = neutral.act(observations), 0.0
         for name, learner in training.learners.items():
-            assert learner.model.num_timesteps == steps and learner.demonstrations == 0
+            counted = learner.seat.num_envs if algorithm == "ARS" else 1
+            assert learner.model.num_timesteps == steps * counted and learner.demonstrations == 0
+            if isinstance(learner.model, ARS):
+                parameters_now = torch.nn.utils.parameters_to_vector(learner.model.policy.parameters())
+                assert learner.model.weights is not None and torch.equal(learner.model.weights, parameters_now)
             assert isinstance(learner.env, VecNormalize)
             seen = learner.env.normalize_obs(learner.seat.view.observe(observations, training.env.state))
             action, _ = learner.model.predict(seen, deterministic=True)
@@ -299,8 +306,8 @@ demonstrations = { controller = "scripted", steps = 50 }
         ("[learner]", "[learner]\nshare_of_steps = 0.4", "50 is more than the 100 steps of the run times share_of_"),
         (
             '"SAC"',
-            '"ARS"',
-            "learner.demonstrations: ARS can neither keep nor imitate them; use one of A2C, CrossQ",
+            '"RecurrentPPO"\npolicy = "MlpLstmPolicy"',
+            "learner.demonstrations: RecurrentPPO can neither keep nor imitate them; use one of A2C, ARS, CrossQ",
         ),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 from cirl_marl import VectorEnv
 from cirl_marl.controllers import Constant, Controller, Neutral
 from cirl_marl.controllers.rollout import Rollout, rollout
-from cirl_marl.learners import RunDirectory, train
+from cirl_marl.learners import RunDirectory, load_recipe, train
 
 BETTER = {
     "copper_net": {"mine": -0.5, "use_to_landfill": -1.0, "use_to_collection": 0.5, "use": -0.5},
@@ -46,7 +46,9 @@ def test_there_is_room_above_neutral(network: str) -> None:
 @pytest.mark.medium
 def test_learners_raise_their_returns_together(tmp_path: Path) -> None:
     """A twentieth of the default run already lifts the mean return of the sixteen agents well above where it began."""
-    train("copper_net", directory=tmp_path / "run", steps=300_000, seed=0)
+    recipe = load_recipe("independent_ars")
+    brief = recipe.model_copy(update={"run": recipe.run.model_copy(update={"evaluations": 1, "episodes": 8})})
+    train("copper_net", brief, directory=tmp_path / "run", steps=300_000, seed=0)
     metrics = RunDirectory(tmp_path / "run").metrics()
     returns = np.mean([values for name, values in metrics.items() if name.startswith("return:")], axis=0)
     assert returns[-1] - returns[0] > 0.2 * abs(returns[0])

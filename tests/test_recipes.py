@@ -185,8 +185,8 @@ def test_mistakes_of_all_kinds_are_named_together(tmp_path: Path) -> None:
     """Those that the shape of the file shows, and those of what it says, in every table; none that is not there."""
     text = GOOD.replace("title", "titel").replace("n_steps = 8", "gamma = 2.0, clip_range = nan")
     text += '[run]\nsteps = 0\n[environment]\nreward = "mix"\nhorizon = 0\n'
-    text += '[[match]]\nrole = "landfill"\nalgorithm = "ARS"\npolicy = "MlpPolcy"\n'
-    text += 'demonstrations = { controller = "neutral", steps = 9 }\nparameters = { delta_std = -inf }\n'
+    text += '[[match]]\nrole = "landfill"\nalgorithm = "RecurrentPPO"\npolicy = "MlpPolcy"\n'
+    text += 'demonstrations = { controller = "neutral", steps = 9 }\nparameters = { learning_rate = -inf }\n'
     with pytest.raises(DefinitionError) as raised:
         load_recipe(write(tmp_path, text))
     assert sorted(problem.partition(": ")[0] for problem in raised.value.problems) == [
@@ -195,7 +195,7 @@ def test_mistakes_of_all_kinds_are_named_together(tmp_path: Path) -> None:
         "learner.parameters.clip_range",
         "learner.parameters.gamma",
         "match.0.demonstrations",
-        "match.0.parameters.delta_std",
+        "match.0.parameters.learning_rate",
         "match.0.policy",
         "run.steps",
         "titel",

@@ -125,15 +125,17 @@ def test_a_status_of_something_else_is_refused(tmp_path: Path, best: object) -> 
         assert run.chosen
 
 
+@pytest.mark.parametrize("damping", [0.0, 0.7])
 @pytest.mark.parametrize(("assured", "step"), [(0.5, 0.2), (0.985, 0.1), (0.99, 0.0), (0.995, -0.1), (1.0, -0.2)])
-def test_the_price_moves_by_what_lacks(assured: float, step: float) -> None:
+def test_the_price_moves_by_what_lacks(assured: float, step: float, damping: float) -> None:
     """In closed form, at once in what is paid, and never without end."""
     env = VectorEnv("copper_net", num_envs=2, reward="team", circularity="mean", circularity_weight=0.8)
-    price = ServicePrice(env, 0.99, 0.2)
+    price = ServicePrice(env, 0.99, 0.2, damping)
     price.heed(0.0)
     price.heed(assured)
     weight = env.circularity_weight
-    assert np.log((1 - weight) / weight) == pytest.approx(np.log(0.25) + 0.2 + step)
+    moved = 0.2 + step + damping * step / 0.2
+    assert np.log((1 - weight) / weight) == pytest.approx(np.log(0.25) + max(moved, 0.0))
     env.reset(seed=0)
     outcome = env.advance(np.full((len(env.agents), 2), -1.0))
     objective, services = env.network.objective, env.network.services
@@ -149,14 +151,17 @@ def test_the_price_moves_by_what_lacks(assured: float, step: float) -> None:
 
 def test_a_price_that_moves_is_kept(tmp_path: Path) -> None:
     """It follows the evaluations of the run, is written beside them, and a resumption goes on with it."""
-    run = learnt(tmp_path / "run", recipe(min_service=1.0, price_rate=0.5))
+    run = learnt(tmp_path / "run", recipe(min_service=1.0, price_rate=0.5, price_damping=0.25))
     rows = evaluations(run)
     assert rows[0]["circularity_weight"] == 0.5
     prices = [np.log((1 - row["circularity_weight"]) / row["circularity_weight"]) for row in rows]
-    steps = [0.0] * 3 + [0.5] * 4  # in the second half; never served wholly, so the largest step each time
+    # in the second half; never served wholly, so the largest step each time, and all the damping at the first one
+    steps = [0.0] * 3 + [0.75] + [0.5] * 3
     np.testing.assert_allclose(np.diff(prices), steps, rtol=1e-6, atol=1e-9)
-    kept = json.loads((run.checkpoint / "price.json").read_text())["circularity_weight"]
+    told = json.loads((run.checkpoint / "price.json").read_text())
+    kept = told["circularity_weight"]
     assert kept < rows[-1]["circularity_weight"]
+    assert told["lasting_price"] * np.exp(0.25) == pytest.approx((1 - kept) / kept)
     assert resume(run.path, steps=STEPS + 12).env.circularity_weight <= kept
     (run.checkpoint / "price.json").write_text("{}")
     with pytest.raises(RunError, match=r"price\.json: cannot be read: .* it holds the price of service"):

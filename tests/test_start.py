@@ -138,20 +138,23 @@ def test_start_is_the_best_checkpoint(tmp_path: Path) -> None:
     assert same(weights(found.learners["use"]), expected)
 
 
-@pytest.mark.parametrize(
-    ("learner", "why"),
-    [
-        ({"start": True}, "start: its statistics of observations stay as they are"),
-        ({"demonstrations": {"controller": "neutral", "steps": 8}}, "demonstrations: each learner imitates by itself"),
-    ],
-)
-def test_such_learners_are_not_stacked(learner: dict[str, Any], why: str, first: tuple[Training, Path]) -> None:
+def test_learners_that_imitate_are_not_stacked() -> None:
     """They run in lockstep with the others, and whoever asks for a stack is told why there is none."""
-    asked = recipe(**(from_run(first[1]) if "start" in learner else learner))
-    stacked = asked.model_copy(update={"run": asked.run.model_copy(update={"engine": "stacked"})})
+    asked = recipe(demonstrations={"controller": "neutral", "steps": 8})
+    why = "demonstrations: each learner imitates by itself"
     with pytest.raises(RecipeError, match=f"agent 'mine': engine stacked: {why}; use engine auto or lockstep"):
-        train("copper_net", stacked, **OPTIONS)
+        train("copper_net", asked, engine="stacked", **OPTIONS)
     assert train("copper_net", asked, **OPTIONS).joint_steps == 12
+
+
+def test_a_stack_of_starts_learns_what_lockstep_does(first: tuple[Training, Path]) -> None:
+    """Statistics of observations stay as they were in both."""
+    asked = recipe(**from_run(first[1]))
+    lone, together = (train("copper_net", asked, engine=engine, **OPTIONS) for engine in ("lockstep", "stacked"))
+    for name, learner in together.learners.items():
+        for key, value in weights(lone.learners[name]).items():
+            torch.testing.assert_close(weights(learner)[key], value, rtol=1e-5, atol=1e-6)
+        assert statistics(learner) == statistics(first[0].learners[name])
 
 
 class FailsAtOnce(BaseCallback):

@@ -13,7 +13,7 @@ import numpy as np
 import sb3_contrib
 import stable_baselines3
 from pydantic import ConfigDict, TypeAdapter, ValidationError
-from sb3_contrib import RecurrentPPO
+from sb3_contrib import ARS, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
@@ -178,7 +178,8 @@ def has_replay_buffer(name: str) -> bool:
 def can_be_shown(name: str) -> bool:
     """Return whether the algorithm learns from demonstrations: keeps them, or imitates them by a policy of one step."""
     kind = algorithm_class(name)
-    return has_replay_buffer(name) or (issubclass(kind, OnPolicyAlgorithm) and not issubclass(kind, RecurrentPPO))
+    imitates = issubclass(kind, OnPolicyAlgorithm | ARS) and not issubclass(kind, RecurrentPPO)
+    return imitates or has_replay_buffer(name)
 
 
 def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **fixed: Any) -> BaseAlgorithm:

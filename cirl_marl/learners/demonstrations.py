@@ -2,7 +2,7 @@
 
 Tasks with a sparse reward are hardly ever solved by random exploration. The first steps of a run may therefore be those
 of a controller. Off-policy, their transitions are in the replay buffer when the learner, Stable-Baselines3's own,
-begins. On-policy, the learner imitates what it is shown. They are steps and episodes of the run, in its budget and its
+begins. Others imitate what they are shown. They are steps and episodes of the run, in its budget and its
 metrics. Callbacks and the learning curves of TensorBoard begin with the learner itself.
 """
 
@@ -15,11 +15,13 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sb3_contrib import ARS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import Tensor
 
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.controllers.scripted import Scripted
@@ -34,6 +36,11 @@ Act = Callable[[], NDArray[np.float32]]
 """Returns what the controller does now, a row for each row of the learner's environment."""
 
 
+def steps_counted(model: BaseAlgorithm, num_envs: int) -> int:
+    """Return by how much ``num_timesteps`` grows with a step of all rows; ARS counts each row once for every row."""
+    return num_envs**2 if isinstance(model, ARS) else num_envs
+
+
 def demonstrate(model: BaseAlgorithm, steps: int, act: Act) -> None:
     """Show ``model`` by ``act`` what to do, until it has counted ``steps`` in its environment.
 
@@ -44,7 +51,7 @@ def demonstrate(model: BaseAlgorithm, steps: int, act: Act) -> None:
     model.learn(0, reset_num_timesteps=model.num_timesteps == 0)  # takes a seat: resets its environment, does no step
     if isinstance(model, OffPolicyAlgorithm):
         _keep(model, steps, act)
-    elif isinstance(model, OnPolicyAlgorithm):
+    else:
         _imitate(model, steps, act)
 
 
@@ -70,27 +77,31 @@ IMITATION_RATE, IMITATION_EPOCHS, IMITATION_BATCH = 1e-3, 10, 256
 """Adam's learning rate, passes over all that was shown, and rows at a time, each time that a rollout has ended."""
 
 
-def _imitate(model: OnPolicyAlgorithm, steps: int, act: Act) -> None:
+def _imitate(model: BaseAlgorithm, steps: int, act: Act) -> None:
     """Let ``model`` imitate what ``act`` does: DAgger (Ross, Gordon and Bagnell 2011).
 
     During the first rollout the controller acts, afterwards the model; the controller says what it would have done in
-    each state that comes of it, also in those that it would never have met. After each rollout the likelihood of all
-    that it has said is maximised, so that the spread of the actions becomes what the model cannot imitate. The critic
-    learns nothing. Of a model that was saved in the middle the policy goes on, what it was shown is lost.
+    each state that comes of it, also in those that it would never have met. A rollout is that of the algorithm, or an
+    episode if it has none. After each the likelihood of all that was said is maximised, so that the spread of the
+    actions becomes what the model cannot imitate; a policy without a spread comes as close as its mean square allows.
+    The critic learns nothing. Of a model that was saved in the middle the policy goes on, what it was shown is lost.
     """
     env = model.get_env()
     assert env is not None
     seen: list[Any] = []
     shown: list[NDArray[np.float32]] = []
+    rollout = model.n_steps if isinstance(model, OnPolicyAlgorithm) else None
     while model.num_timesteps < steps:
-        copying = not seen
-        for _ in range(min(model.n_steps, -(-(steps - model.num_timesteps) // env.num_envs))):
+        copying, before = not seen, len(seen)
+        ended = np.zeros(env.num_envs, dtype=bool)
+        while model.num_timesteps < steps and (not ended.any() if rollout is None else len(seen) < before + rollout):
             seen.append(env.get_original_obs() if isinstance(env, VecNormalize) else model._last_obs)
             shown.append(act())
             assert model._last_obs is not None
             actions = shown[-1] if copying else model.predict(model._last_obs)[0]
-            model._last_obs, _, model._last_episode_starts, _ = env.step(actions)  # type: ignore[assignment]
-            model.num_timesteps += env.num_envs
+            model._last_obs, _, ended, _ = env.step(actions)  # type: ignore[assignment]
+            model._last_episode_starts = ended
+            model.num_timesteps += steps_counted(model, env.num_envs)
         _fit(model, _stacked(seen), np.concatenate(shown))
 
 
@@ -108,21 +119,35 @@ def _rows(observations: Any, rows: Any) -> Any:
     return observations[rows]
 
 
-def _fit(model: OnPolicyAlgorithm, seen: Any, shown: NDArray[np.float32]) -> None:
-    """Maximise the likelihood of what was ``shown``, by the statistics that the normaliser has now."""
+def _fit(model: BaseAlgorithm, seen: Any, shown: NDArray[np.float32]) -> None:
+    """Bring the policy close to what was ``shown``, by the statistics that the normaliser has now."""
     env, policy = model.get_env(), model.policy
-    assert isinstance(policy, ActorCriticPolicy)
     observations, _ = policy.obs_to_tensor(env.normalize_obs(seen) if isinstance(env, VecNormalize) else seen)
     actions = torch.as_tensor(shown)
     optimiser = torch.optim.Adam(policy.parameters(), lr=IMITATION_RATE)
     policy.set_training_mode(True)
     for _ in range(IMITATION_EPOCHS):
         for rows in torch.split(torch.randperm(len(actions)), IMITATION_BATCH):
-            _, likelihood, _ = policy.evaluate_actions(_rows(observations, rows), actions[rows])
             optimiser.zero_grad()
-            (-likelihood.mean()).backward()  # type: ignore[no-untyped-call]
+            _unlike(policy, _rows(observations, rows), actions[rows]).backward()  # type: ignore[no-untyped-call]
             optimiser.step()
     policy.set_training_mode(False)
+    keep_parameters(model)
+
+
+def _unlike(policy: BasePolicy, seen: Any, shown: Tensor) -> Tensor:
+    """Return minus the mean log-likelihood of what was shown; without a spread the mean square of the difference."""
+    if isinstance(policy, ActorCriticPolicy):
+        return -policy.evaluate_actions(seen, shown)[1].mean()
+    difference: Tensor = policy(seen) - shown
+    return difference.square().mean()
+
+
+def keep_parameters(model: BaseAlgorithm) -> None:
+    """Let an algorithm go on from the parameters that its policy has now: ARS learns a vector of its own of them."""
+    if isinstance(model, ARS):
+        weights = torch.nn.utils.parameters_to_vector(model.policy.parameters())
+        model.weights = weights.detach()  # type: ignore[assignment]
 
 
 class Demonstrator:

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cirl_marl.errors import RecipeError, RunError
 from cirl_marl.learners.algorithms import algorithm_class, build
-from cirl_marl.learners.demonstrations import Demonstrator, demonstrate
+from cirl_marl.learners.demonstrations import Demonstrator, demonstrate, steps_counted
 from cirl_marl.learners.lockstep import BudgetSpent
 from cirl_marl.learners.recipe import LearnerSettings
 from cirl_marl.learners.seat import Seat
@@ -140,7 +140,8 @@ class Learner:
     def demonstrations(self) -> int:
         """Number of the learner's own steps by which its demonstrations are over; 0 if it needs none, or no more."""
         asked = self.spec.demonstrations
-        steps = 0 if asked is None else asked.steps * (self.seat.num_envs // self.seat.copies)
+        joint = 0 if asked is None else math.ceil(asked.steps / self.seat.copies)
+        steps = joint * steps_counted(self.model, self.seat.num_envs)
         return steps if steps > self.model.num_timesteps else 0
 
     def learn(self, steps: int, callback: BaseCallback | None) -> None:
@@ -156,7 +157,7 @@ class Learner:
         total = self.spec.steps_of(steps) * rows - done
         if isinstance(self.model, ARS):
             # It counts each step of its copies once for every copy, and schedules by this number, done before or not.
-            total = self.budget(steps) * self.seat.num_envs**2
+            total = self.budget(steps) * steps_counted(self.model, self.seat.num_envs)
         if total > 0:
             try:
                 self.model.learn(total, callback=callback, reset_num_timesteps=done == 0)

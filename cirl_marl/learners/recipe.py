@@ -111,7 +111,7 @@ class LearnerSettings(Settings):
         None, description="policy of another run to begin with, of the same algorithm and for the same spaces"
     )
     demonstrations: Demonstrations | None = Field(
-        None, description="what fills the replay buffer of an off-policy learner, and what an on-policy one imitates"
+        None, description="what fills the replay buffer of an off-policy learner, and what others imitate"
     )
 
     def steps_of(self, steps: int) -> int:
@@ -184,6 +184,11 @@ class Run(Settings):
         0.0,
         description="largest step of the logarithm of the price of a shortfall of service, which moves after each "
         "evaluation in the second half of a run, until min_service is reached; 0: circularity_weight stays as it is",
+    )
+    price_damping: Annotated[Number, Field(ge=0)] = Field(
+        0.0,
+        description="by how much the logarithm of that price is higher still, only as long as service is short by as "
+        "much as it may be at all; lower as long as there is too much",
     )
 
 

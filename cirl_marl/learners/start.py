@@ -11,14 +11,13 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import torch
-from sb3_contrib import ARS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RecipeError, unknown
+from cirl_marl.learners.demonstrations import keep_parameters
 from cirl_marl.learners.learner import Learner, load_model, load_normaliser
 from cirl_marl.learners.recipe import LearnerSettings, Start
 from cirl_marl.learners.run import Origin, RunDirectory
@@ -84,9 +83,7 @@ def _take_over(model: BaseAlgorithm, normaliser: VecNormalize | None, learner: L
     """Copy the policy, a learnt entropy coefficient and the statistics of observations."""
     mine = learner.model
     mine.policy.load_state_dict(model.policy.state_dict())
-    if isinstance(mine, ARS):  # which learns a vector, of which its policy is a copy
-        weights = torch.nn.utils.parameters_to_vector(mine.policy.parameters())
-        mine.weights = weights.detach()  # type: ignore[assignment]
+    keep_parameters(mine)
     theirs, own = (getattr(each, "log_ent_coef", None) for each in (model, mine))
     if theirs is not None and own is not None:
         own.data.copy_(theirs.data)

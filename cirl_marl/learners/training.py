@@ -108,7 +108,7 @@ class Training:
                 f"recipe '{self.config.recipe.name}': run.price_rate: reward '{self.env.reward_mode}' has no price of "
                 f"service that could move; choose {', '.join(WEIGHED)}, or a price_rate of 0"
             )
-        price = ServicePrice(self.env, asked.min_service, asked.price_rate)
+        price = ServicePrice(self.env, asked.min_service, asked.price_rate, asked.price_damping)
         if checkpoint is not None:
             price.load(checkpoint)
         return price

@@ -44,8 +44,6 @@ def obstacle(learner: Learner) -> str | None:
     model = learner.model
     if learner.demonstrator is not None:
         return "demonstrations: each learner imitates by itself"
-    if learner.spec.start is not None:
-        return "start: its statistics of observations stay as they are"
     if type(model) in (PPO, A2C):
         assert isinstance(model, PPO | A2C)
         return _on_policy_obstacle(model, learner.spec.policy)

@@ -51,6 +51,8 @@ class Inputs:
         # of all learners at once, shape (N, entries): they have seen the same number of samples
         self._moments = {key: RunningMeanStd(shape=(len(members), part.shape[2])) for key, part in self._parts.items()}
         self._paid_moments = RunningMeanStd(shape=(len(members), 1))
+        spec = members[0].spec
+        self._follows = spec.normalise.observation and spec.start is None  # statistics stay as they are after a start
         for i, columns, ours, kept in self._kept():
             ours.mean[i, columns], ours.var[i, columns], ours.count = kept.mean, kept.var, kept.count
 
@@ -63,7 +65,7 @@ class Inputs:
         """Return what the learners see now, shape (N, B, entries); while learning, it counts in the moments."""
         for i, learner in enumerate(self._members):
             self._enter(i, learner.seat.reset())
-        if learning and self._members[0].spec.normalise.observation:
+        if learning and self._follows:
             for key, part in self._parts.items():
                 _update(self._moments[key], part)
         return self._normalised()
