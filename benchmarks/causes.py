@@ -28,7 +28,10 @@ from cirl_marl.learners import Recipe, RunDirectory, load_recipe, train_seeds
 from cirl_marl.records.files import write_json
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
-NETWORK, SEEDS, STEPS, EPISODES = "copper_net", (0, 1), 300_000, 16
+ARS = "independent_ars"
+NETWORK, SEEDS, EPISODES = "copper_net", (0, 1), 16
+STEPS = {"independent_ppo": 300_000, ARS: 3_000_000}
+"""Environment steps of each run, by recipe: about a minute of processor time."""
 BEFORE = {"n_steps": 40, "batch_size": 640, "gamma": 0.98, "gae_lambda": 0.95, "learning_rate": 1e-3}
 """Parameters of the recipe that the study had before."""
 console = Console(width=None if sys.stdout.isatty() else 140)
@@ -68,7 +71,6 @@ class Variant:
         return Recipe.model_validate(plain)
 
 
-ARS = "independent_ars"
 VARIANTS = {
     "ppo": Variant("PPO, the recipe"),
     "ppo_before": Variant(
@@ -103,6 +105,10 @@ VARIANTS = {
     "ppo_joint": Variant("one learner for all", learner={"scheme": "joint"}),
     "ars": Variant("ARS, the recipe", base=ARS),
     "ars_starts": Variant("candidates begin in different states", base=ARS, run={"common_random_numbers": False}),
+    "ars_dear": Variant(
+        "service dear from the beginning, weight 0.85", base=ARS, environment={"circularity_weight": 0.85}
+    ),
+    "ars_mixed": Variant("reward `mixed`: own set-points count as well", base=ARS, environment={"reward": "mixed"}),
     "ars_linear": Variant("linear policies", base=ARS, parameters={"policy_kwargs": {"net_arch": []}}),
     "ars_best": Variant("the best quarter of the pairs counts", base=ARS, parameters={"n_top": 8}),
     "ars_small": Variant("perturbations of 0.02", base=ARS, parameters={"delta_std": 0.02}),
@@ -113,7 +119,6 @@ VARIANTS = {
 def main(
     out: Annotated[Path, typer.Option(help="Where the training runs are kept.")] = Path("runs/causes"),
     only: Annotated[list[str] | None, typer.Option(help="Variants; default: all.")] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Environment steps of each run.")] = STEPS,
     jobs: Annotated[int, typer.Option(min=1, help="Variants at a time.")] = 1,
     table: Annotated[bool, typer.Option("--table", help="Train nothing.")] = False,
     document: Annotated[Path, typer.Option(help="With a section 'causes'.")] = DOCUMENT,
@@ -123,30 +128,34 @@ def main(
         if name not in VARIANTS:
             raise CirlError(unknown("variant", name, VARIANTS))
     names = only or list(VARIANTS)
-    missing = [name for name in names if not table and not _is_done(out, name, steps)]
+    missing = [name for name in names if not table and not _is_done(out, name)]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        for done in as_completed([pool.submit(_train, out, name, steps) for name in missing]):
+        for done in as_completed([pool.submit(_train, out, name) for name in missing]):
             console.print(f"{done.result()}: trained", highlight=False)
-    rows = [row for name in names if _is_done(out, name, steps) for row in _row(out, name)]
-    columns = ("what differs", "λ̄ (kt)", "lowest service", "gap", "CPU min a seed")
+    rows = [row for name in names if _is_done(out, name) for row in _row(out, name)]
+    columns = ("what differs", "steps", "λ̄ (kt)", "lowest service", "gap", "CPU min a seed")
     write_sections(document, {"causes": markdown_table(columns, rows)})
 
 
-def _is_done(out: Path, name: str, steps: int) -> bool:
+def _is_done(out: Path, name: str) -> bool:
     """Whether every seed has a complete run of the variant of now."""
     found = [RunDirectory(f"{out / name}-seed{seed}") for seed in SEEDS]
     if not all((run.path / "causes.json").is_file() for run in found):
         return False
     now = VARIANTS[name].recipe(name)
-    return all((run.config.steps, run.config.recipe) == (steps, now) for run in found)
+    return all((run.config.steps, run.config.recipe) == (_steps(name), now) for run in found)
 
 
-def _train(out: Path, name: str, steps: int) -> str:
+def _steps(name: str) -> int:
+    return STEPS[VARIANTS[name].base]
+
+
+def _train(out: Path, name: str) -> str:
     """Train all seeds of a variant together."""
     for seed in SEEDS:
         shutil.rmtree(f"{out / name}-seed{seed}", ignore_errors=True)
     began = time.process_time()
-    train_seeds(NETWORK, VARIANTS[name].recipe(name), seeds=SEEDS, directory=out / name, steps=steps)
+    train_seeds(NETWORK, VARIANTS[name].recipe(name), seeds=SEEDS, directory=out / name, steps=_steps(name))
     minutes = (time.process_time() - began) / 60 / len(SEEDS)
     for seed in SEEDS:
         write_json(Path(f"{out / name}-seed{seed}") / "causes.json", {"cpu_minutes": minutes})
@@ -162,7 +171,8 @@ def _row(out: Path, name: str) -> Iterator[tuple[str, ...]]:
     def each(figure: str) -> str:
         return ", ".join(figure.format(**_figures(entry)) for entry in entries)
 
-    yield VARIANTS[name].what, each("{circularity:.1f}"), each("{service:.3f}"), each("{gap:.1%}"), f"{minutes:.1f}"
+    figures = each("{circularity:.1f}"), each("{service:.3f}"), each("{gap:.1%}")
+    yield VARIANTS[name].what, f"{_steps(name):,}", *figures, f"{minutes:.1f}"
 
 
 def _figures(entry: Entry) -> dict[str, float]:

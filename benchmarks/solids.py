@@ -1,7 +1,7 @@
-"""solids_net: what a slower robot brings, and who acts how beside which sorter (docs/study.md).
+"""solids_net: what a slower robot brings, and what learners do there (docs/study.md).
 
-python -m benchmarks.solids                       # a script that waits in each attempt
-python -m benchmarks.solids SORTER_RUN [OTHERS]   # a learnt sorter; truck and incinerator of a run, or by script
+python -m benchmarks.solids             # scripts that wait in each attempt
+python -m benchmarks.solids RUN [RUN …]  # whom a run has acts as it learnt, the others by script
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.controllers.scripted import Scripted
 from cirl_marl.environments.vector import VectorEnv
-from cirl_marl.evaluation.statistics import over_episodes
+from cirl_marl.evaluation.statistics import over_episodes, over_seeds
 from cirl_marl.learners.learner import load_model, load_normaliser
+from cirl_marl.learners.recipe import LearnerSettings
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats
 
-EPISODES = 8
-WAITS = ((0, 0), (0, 10), (0, 28), (28, 28))
+EPISODES = 16
+WAITS = ((0, 0), (0, 10), (0, 28), (28, 28), (50, 50))
 """Steps that the robot waits in each attempt at an item of the first and of the second batch."""
 SECOND_BATCH = 200
 """Interval in which the second batch leaves the reservoir: after 8 s of 0.04 s each."""
@@ -58,20 +59,22 @@ class Episodes:
 
 
 def main(
-    sorter: Annotated[Path | None, typer.Argument(help="Run that has a sorter; default: scripts that wait.")] = None,
-    others: Annotated[Path | None, typer.Argument(help="Run of truck and incinerator; default: the script.")] = None,
+    runs: Annotated[list[Path] | None, typer.Argument(help="Runs in solids_net; default: scripts that wait.")] = None,
 ) -> None:
-    """Play episodes and print what came of them."""
-    if sorter is None:
+    """Play episodes and print what came of them: a row for each run, and what they have in common."""
+    if not runs:
         for waits in WAITS:
             typer.echo(f"waits {waits}: {played(partial(_waiting, waits))}")
         return
-    policies = {"sorter": _policy(sorter, "sorter")}
-    if others is not None:
-        policies |= {agent: _policy(others, agent) for agent in ("truck", "incinerator")}
-    typer.echo(
-        str(played(lambda _env, _t, seen, _script: {agent: act(seen[agent]) for agent, act in policies.items()}))
-    )
+    found = [played(_learnt(run)) for run in runs]
+    for run, each in zip(runs, found, strict=True):
+        typer.echo(f"{run.name}: {each}")
+    if len(found) > 1:
+        means = [
+            over_seeds([[float(getattr(each, name).mean()) for each in found]]) for name in ("circularity", "service")
+        ]
+        told = ", ".join(f"{each.value:.4g} [{each.low:.4g}, {each.high:.4g}]" for each in means)
+        typer.echo(f"interquartile means of λ̄ (kg) and service over {len(found)} seeds, bootstrap intervals: {told}")
 
 
 def played(act: Act) -> Episodes:
@@ -102,9 +105,16 @@ def _waiting(waits: tuple[int, int], env: VectorEnv, t: int, _seen: Actions, scr
     return {"sorter": np.where(rests[:, None], REST, script["sorter"])}
 
 
-def _policy(run: Path, agent: str) -> Callable[[NDArray[np.floating]], NDArray[np.floating]]:
+def _learnt(run: Path) -> Act:
+    """Return what the learners of a run do, each for its own agent."""
     directory = RunDirectory(run)
-    spec = next(group.spec for group in directory.groups() if group.name == agent)
+    policies = {group.name: _policy(directory, group.name, group.spec) for group in directory.groups()}
+    return lambda _env, _t, seen, _script: {agent: act(seen[agent]) for agent, act in policies.items()}
+
+
+def _policy(
+    directory: RunDirectory, agent: str, spec: LearnerSettings
+) -> Callable[[NDArray[np.floating]], NDArray[np.floating]]:
     model = load_model(directory.chosen, agent, spec.algorithm)
     normaliser = load_normaliser(directory.chosen, agent, spec)
 
