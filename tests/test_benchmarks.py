@@ -39,12 +39,12 @@ def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.slow
 def test_a_trial_writes_a_document_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer recipes, seeds or steps than the study has change nothing that is published."""
-    case = study.Case(("joint_sac",), episodes=2, options={"horizon": 8})
+    case = study.Case(("joint_ppo",), episodes=2, options={"horizon": 8})
     monkeypatch.setitem(study.CASES, "carbo_net", case)
     published = {path: path.read_bytes() for path in (ROOT / "docs" / "study.md", *study.RESULTS.rglob("*.json"))}
-    study.main(out=tmp_path, only=["carbo_net"], recipes=["joint_sac"], seeds=1, steps=320, episodes=2, jobs=1)
+    study.main(out=tmp_path, only=["carbo_net"], recipes=["joint_ppo"], seeds=1, steps=320, episodes=2, jobs=1)
     assert all(path.read_bytes() == text for path, text in published.items())
-    assert "| joint_sac | SAC | joint | team | 320 |" in (tmp_path / "trial" / "study.md").read_text()
+    assert "| joint_ppo | PPO | joint | team | 320 |" in (tmp_path / "trial" / "study.md").read_text()
     assert (tmp_path / "trial" / "results" / "carbo_net" / "summary.json").is_file()
     assert (tmp_path / "trial" / "pictures" / "study_carbo_net.png").is_file()
 
