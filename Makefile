@@ -23,6 +23,9 @@ lint: $(VENV)/.dev
 types: $(VENV)/.dev
 	$(BIN)/mypy
 
+# two workers have two cores
+fast unit every: export OMP_NUM_THREADS = 1
+
 fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 -m 'not slow and not medium' tests
 
