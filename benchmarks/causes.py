@@ -112,6 +112,8 @@ VARIANTS = {
     "ars_linear": Variant("linear policies", base=ARS, parameters={"policy_kwargs": {"net_arch": []}}),
     "ars_best": Variant("the best quarter of the pairs counts", base=ARS, parameters={"n_top": 8}),
     "ars_small": Variant("perturbations of 0.02", base=ARS, parameters={"delta_std": 0.02}),
+    "ars_neighbours": Variant("agents see their neighbours", base=ARS, environment={"observe": "neighbours"}),
+    "ars_full": Variant("agents see the whole network", base=ARS, environment={"observe": "full"}),
     "ars_joint": Variant("one learner for all", base=ARS, learner={"scheme": "joint"}),
 }
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from sb3_contrib import ARS
-from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -172,6 +172,31 @@ def test_learner_without_a_buffer_imitates(algorithm: str, policy: str, paramete
             found = max(found, float(np.abs(action - wanted[name]).max()))
         far[steps] = found
     assert far[320] < 0.05 and far[320] < far[8]
+
+
+class Told(DummyVecEnv):
+    """Keeps the actions that it is told."""
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep them as they come."""
+        self.told = [*getattr(self, "told", []), actions.copy()]
+        super().step_async(actions)
+
+
+def test_the_learner_acts_after_its_first_rollout() -> None:
+    """The controller says what it would do in states that the learner brings about itself."""
+    env = Told([lambda: gymnasium.make("MountainCarContinuous-v0")] * COPIES)
+    model = PPO("MlpPolicy", env, n_steps=4, batch_size=8, n_epochs=1, seed=1, device="cpu")
+    shown: list[NDArray[np.float32]] = []
+
+    def act() -> NDArray[np.float32]:
+        shown.append(np.full((COPIES, 1), 0.25 + len(shown) / 100, dtype=np.float32))
+        return shown[-1]
+
+    demonstrate(model, 12 * COPIES, act)
+    assert model.num_timesteps == 12 * COPIES and len(shown) == len(env.told) == 12
+    assert all((told == said).all() for told, said in zip(env.told[:4], shown[:4], strict=True))
+    assert all((told != said).any() for told, said in zip(env.told[4:], shown[4:], strict=True))
 
 
 def test_imitation_goes_on_after_it_was_stopped(tmp_path: Path, ctrl_c_after: Any) -> None:

@@ -61,6 +61,22 @@ def test_trainings_are_kept(bottles: Network, tmp_path: Path) -> None:
         swept(bottles, tmp_path)
 
 
+def test_swept_weights_stay_as_they_are(bottles: Network, tmp_path: Path) -> None:
+    """Also by a recipe that moves the price of service for what it demands; the best checkpoint is paid most."""
+    given = load_recipe("independent_a2c")
+    moving = {"min_service": 1.0, "price_rate": 1.0, "evaluations": 8, "episodes": 2}
+    given = given.model_copy(update={"run": given.run.model_copy(update=moving)})
+    options = {"directory": tmp_path, "points": 2, "steps": 5120, "episodes": 2}
+    for weight, run in zip((0.0, 1.0), pareto(bottles, given, **options).runs, strict=True):  # type: ignore[arg-type]
+        with (run.path / "evaluations.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert len(rows) > 4
+        assert {float(row["circularity_weight"]) for row in rows} == {weight}
+        paid = [float(row["paid"]) for row in rows]
+        best = [value > max(paid[:i], default=-np.inf) for i, value in enumerate(paid)]
+        assert [row["best"] == "1" for row in rows] == best
+
+
 @pytest.mark.slow
 def test_runs_without_a_checkpoint_are_begun_again_by_their_owner_only(bottles: Network, tmp_path: Path) -> None:
     """What another process trains is left alone, even before its first checkpoint; what nobody trains is begun anew."""

@@ -271,6 +271,17 @@ def test_an_optimiser_goes_on_where_it_was(tmp_path: Path) -> None:
     assert_same(resume(tmp_path / "lockstep", steps=80), resume(tmp_path / "stacked", steps=80))
 
 
+def test_a_search_goes_on_where_it_was(tmp_path: Path) -> None:
+    """What is resumed does what is left of the steps, in either engine."""
+    search = recipe("ARS", parameters={"n_delta": 2, "zero_policy": False, "policy_kwargs": {"net_arch": [8]}})
+    search = search.model_copy(update={"run": search.run.model_copy(update={"steps": 2 * 4 * 7})})
+    for engine in ("lockstep", "stacked"):
+        run = tmp_path / engine
+        train("copper_net", search, directory=run, engine=engine, agents=AGENTS, horizon=7)
+        model = resume(run, steps=3 * 2 * 4 * 7).learners["use"].model
+        assert (model._n_updates, model.num_timesteps) == (3, 3 * 2 * 4 * 7 * 2)
+
+
 class Counts(BaseCallback):
     """Counts steps."""
 

@@ -82,8 +82,8 @@ def pareto(
 
     The bound and its plans start in the middle of all initial ranges. They demand the same mean level of every service,
     from the least that the highest circularity leaves one to the most that all can have at once. Learners are trained
-    with circularity weights from 0 to 1, in ``directory/runs``; a finished run there is not repeated, an interrupted
-    one goes on.
+    with circularity weights from 0 to 1, in ``directory/runs``, which stay as they are; the checkpoint that counts is
+    the one that is paid most. A finished run there is not repeated, an interrupted one goes on.
 
     Args:
         network: catalogue name, definition file, or network.
@@ -104,7 +104,7 @@ def pareto(
     if points < 2 or seeds < 1:
         raise CirlError(f"points must be at least 2 and seeds at least 1, got {points} and {seeds}")
     found = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
-    chosen = load_recipe(recipe) if isinstance(recipe, str | Path) else recipe
+    chosen = _unpriced(load_recipe(recipe) if isinstance(recipe, str | Path) else recipe)
     if chosen is not None:
         _check_fit(found, chosen)
     share = 1.0 if chosen is None else points / (points + points * seeds)
@@ -166,6 +166,14 @@ class _Asked:
         found += ["another recipe of this name"] if config.recipe != self.recipe else []
         if found:
             raise RunError(f"{run.path}: is of another sweep ({'; '.join(found)}); choose another folder")
+
+
+def _unpriced(recipe: Recipe | None) -> Recipe | None:
+    """Return a recipe without a demanded service and its price, as what is swept must not move."""
+    if recipe is None:
+        return None
+    fixed = {"min_service": None, "price_rate": 0.0, "price_damping": 0.0}
+    return recipe.model_copy(update={"run": recipe.run.model_copy(update=fixed)})
 
 
 def _env(network: Network, recipe: Recipe) -> VectorEnv:
