@@ -8,6 +8,7 @@ import shutil
 import signal
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,8 @@ from hypothesis import strategies as st
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Series, Service
 from cirl_marl.definitions.reading import Definition
 from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.network.elements import FIXED, Lifetime
+from cirl_marl.network.lifetimes import SURVIVALS
 
 if TYPE_CHECKING:
     from cirl_marl.learners import Progress
@@ -130,8 +133,11 @@ def own_copper_run(copper_run: Path, tmp_path: Path) -> Path:
     return shutil.copytree(copper_run, tmp_path / "run")
 
 
-def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = False) -> Network:
-    """Return a network with every law, role and kind of control, drawn from ``seed``; half have shares and series."""
+def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = False, lifetimes: bool = False) -> Network:
+    """Return a network with every law, role and kind of control, drawn from ``seed``; half have shares and series.
+
+    With ``lifetimes`` some nodes have one, in networks that are otherwise the same.
+    """
     rng = np.random.default_rng(seed)
     ends = [rng.choice(nodes, 2, replace=False) for _ in range(arcs if nodes > 1 else 0)]
     laws: list[Law] = [LAWS[rng.integers(len(LAWS))] for _ in ends]
@@ -139,13 +145,21 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
     real = bool(rng.integers(2))
     passing = {i for i in range(1, nodes) if real and rng.random() < 0.4}
     dividing = passing | {i for i in range(nodes) if real and nodes > len(passing) + 1 and rng.random() < 0.2}
+    further = np.random.default_rng([seed, 1])
+    living = {i for i in range(1, nodes) if lifetimes and real and nodes > len(passing) + 1 and further.random() < 0.4}
+    living -= passing
+    dividing |= living
     for k, (i, j) in enumerate(ends):
+        if int(i) in living:
+            laws[k] = Law.SHARE
+        elif int(j) in living and laws[k] in (Law.BATCH, Law.RECIPIENT):
+            laws[k] = Law.DONOR
         if laws[k] in (Law.BATCH, Law.RECIPIENT) and {int(i), int(j)} & passing:
             laws[k] = Law.DONOR
         if int(i) in passing or (int(i) in dividing and laws[k] is Law.DONOR):
             laws[k] = Law.SHARE
     orders = np.bincount([i for (i, _), law in zip(ends, laws, strict=True) if law is Law.CONTROLLED], minlength=nodes)
-    sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) and i not in passing for i in range(nodes)]
+    sets_flow = [bool(orders[i] == 1 and rng.random() < 0.5) and i not in passing | living for i in range(nodes)]
     batched = {f"node_{i}" for (i, _), law in zip(ends, laws, strict=True) if law is Law.BATCH}
     values = _Values(rng, interval * horizon, real)
     drawn = [
@@ -157,9 +171,12 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
     for i in sorted(dividing):
         to = int(rng.choice([j for j in sinks if j != i]))
         drawn.append(Arc(id=f"rest_{i}", donor=f"node_{i}", recipient=f"node_{to}", law=Law.SHARE))
+    made = [_node(values, i, sets_flow[i], i not in passing, i in dividing) for i in range(nodes)]
+    for i in sorted(living):
+        made[i] = _living(further, made[i], interval, horizon)
     network = Network(
         name="random",
-        nodes=tuple(_node(values, i, sets_flow[i], i not in passing, i in dividing) for i in range(nodes)),
+        nodes=tuple(made),
         arcs=tuple(drawn),
         services=tuple(_services(values, nodes, len(ends), batched, passing)),
         episode=Episode(control_interval=interval, horizon=horizon),
@@ -223,6 +240,36 @@ def _node(values: _Values, i: int, sets_flow: bool, stores: bool, divides: bool)
         set_point=float(rng.uniform(0, 300)) if rng.random() < 0.5 else None,
         scale=float(rng.uniform(1, 300)),
         control=control,
+    )
+
+
+def _living(rng: np.random.Generator, node: Node, interval: float, horizon: int) -> Node:
+    """Return a node with a lifetime in place of a rate, perhaps with a history, or a stretch that changes."""
+    kind, mean = str(rng.choice([*SURVIVALS, FIXED])), interval * float(10 ** rng.uniform(0, 1.5))
+    control, stretch = node.control, float(rng.uniform(0.5, 2))
+    if kind == FIXED:
+        mean, control, stretch = round(mean / interval) * interval, None, 1.0
+    elif control is not None:
+        low, neutral, high = np.sort(rng.uniform(0.5, 3.0, 3)).tolist()
+        control = Control(kind=ControlKind.STRETCH, low=low, neutral=neutral, high=high)
+    history = None
+    if rng.random() < 0.5:
+        begins = sorted({float(t) for t in rng.uniform(-3 * mean, -interval, 3)})
+        history = Series(times=tuple(begins), values=tuple(rng.uniform(1, 50, len(begins)).tolist()))
+    changing = Series(times=(0.0, interval), values=(stretch, 1.2 * stretch)) if rng.random() < 0.5 else stretch
+    return replace(
+        node,
+        rate=0.0,
+        control=control,
+        lifetime=Lifetime(
+            mean=mean,
+            deviation=mean * float(rng.uniform(0.25, 1)) if kind not in (FIXED, "exponential") else None,
+            distribution=kind,
+        ),
+        stretch=changing if kind != FIXED else 1.0,
+        history=history,
+        growth=float(rng.uniform(-0.1, 0.3) / mean) if rng.random() < 0.5 else None,
+        initial=None if history is not None and rng.random() < 0.5 else node.initial,
     )
 
 
@@ -301,5 +348,6 @@ st.register_type_strategy(
         st.integers(1, 12),
         st.integers(0, 20),
         runge_kutta=st.sampled_from([False, False, True]),
+        lifetimes=st.booleans(),
     ),
 )

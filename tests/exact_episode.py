@@ -205,5 +205,5 @@ def _levels(network: Network, stock: Floats, flow: Floats, step: int) -> Floats:
         else:
             q = sum(f for f, arc in zip(flow, network.arcs, strict=True) if arc.donor == service.provider)
         low, high = (mean_of(network, end, step) for end in (service.low, service.high))
-        levels.append(max(0.0, min(1.0, q / low if low > 0 else 1.0, high / q if q > 0 else 1.0)))
+        levels.append(max(0.0, min(1.0, q / low if low > 0 else 1.0, high / q if q > high else 1.0)))
     return np.array(levels)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, Service
@@ -114,3 +118,25 @@ def cycle(interval: float = 1.0, hoarded: float = 40.0) -> Network:
     )
     episode = Episode(control_interval=interval, horizon=4)
     return Network(name="cycle", nodes=nodes, arcs=arcs, services=services, episode=episode)
+
+
+def without_lifetimes(network: Network) -> Network:
+    """Return the network with a rate and a valve wherever it has a lifetime and a stretch."""
+    nodes = []
+    for node in network.nodes:
+        if node.lifetime is not None:
+            control = None if node.control is None else replace(node.control, kind=ControlKind.RATE)
+            initial = node.initial or (0.0, 100.0)
+            plain: dict[str, Any] = {
+                "lifetime": None,
+                "stretch": 1.0,
+                "history": None,
+                "growth": None,
+                "rate": 1 / node.lifetime.mean,
+            }
+            node = replace(node, control=control, initial=initial, **plain)
+        nodes.append(node)
+    return replace(network, nodes=tuple(nodes))
+
+
+plain_networks = st.from_type(Network).map(without_lifetimes)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import sparse
+from small_networks import plain_networks
 
 from cirl_marl import (
     Arc,
@@ -114,7 +115,7 @@ def test_presolve_is_not_believed(make_network: Callable[[int, int, int], Networ
 
 @pytest.mark.medium
 @given(
-    network=st.from_type(Network),
+    network=plain_networks,
     interval=st.floats(0.02, 0.4),
     seed=st.integers(0, 1000),
     weight=st.sampled_from([None, 0.3, 3.0]),
@@ -136,7 +137,7 @@ def test_no_episode_exceeds_the_bound(network: Network, interval: float, seed: i
 
 
 @pytest.mark.medium
-@given(network=st.from_type(Network), interval=st.floats(0.02, 0.4), seed=st.integers(0, 1000))
+@given(network=plain_networks, interval=st.floats(0.02, 0.4), seed=st.integers(0, 1000))
 def test_no_episode_with_the_service_exceeds_its_bound(network: Network, interval: float, seed: int) -> None:
     """Episodes that keep each service at a mean level of its own have at most the λ̄ that the bound allows for these."""
     network = certifiable(network, interval, pulls=False)
@@ -151,7 +152,7 @@ def test_no_episode_with_the_service_exceeds_its_bound(network: Network, interva
         assert best <= found.objective + 1e-9 * (abs(found.objective) + np.abs(circularity).max()) + 1e-12 * mass
 
 
-@given(network=st.from_type(Network), interval=st.floats(0.02, 0.4), seed=st.integers(0, 1000))
+@given(network=plain_networks, interval=st.floats(0.02, 0.4), seed=st.integers(0, 1000))
 def test_reach(network: Network, interval: float, seed: int) -> None:
     """No simulated stock leaves its bounds, and scheduled flows said to be uncut are what was asked for."""
     network = certifiable(network, interval, pulls=False)
@@ -168,7 +169,7 @@ def test_reach(network: Network, interval: float, seed: int) -> None:
     np.testing.assert_allclose(run.flow[sure], asked[sure], rtol=1e-9)
 
 
-@given(network=st.from_type(Network))
+@given(network=plain_networks)
 def test_ranges_are_those_of_the_flow_laws(network: Network) -> None:
     """With every compartment acting, the highest coefficients are the laws' own, or less if they change in time."""
     network = certifiable(network, 0.3, pulls=True)
@@ -317,7 +318,11 @@ def test_gap_falls_with_the_degree() -> None:
     assert gaps[-1] < 1e-5 * abs(happens)
 
 
-@given(network=st.from_type(Network), seed=st.integers(0, 1000), size=st.sampled_from([0.0, 0.1, 10.0]))
+@given(
+    network=plain_networks,
+    seed=st.integers(0, 1000),
+    size=st.sampled_from([0.0, 0.1, 10.0]),
+)
 def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float) -> None:
     """Multipliers that are perturbed, or none at all, prove a weaker bound than the solver's, never a smaller one."""
     found = bounded(network, 0.2)
@@ -337,7 +342,7 @@ def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float)
 
 @pytest.mark.medium
 @settings(max_examples=settings().max_examples // 2)
-@given(network=st.from_type(Network), seed=st.integers(0, 1000), weight=st.sampled_from([None, 0.3]))
+@given(network=plain_networks, seed=st.integers(0, 1000), weight=st.sampled_from([None, 0.3]))
 def test_multipliers_of_one_start_bound_another(network: Network, seed: int, weight: float | None) -> None:
     """``at`` is the bound itself at its own start, and nowhere less than what is solved there."""
     network = certifiable(network, 0.2, pulls=False)
@@ -481,7 +486,7 @@ def test_networks_without_certificate(name: str, scenario: str | None, said: str
         bound(name, scenario=scenario)
 
 
-@given(network=st.from_type(Network), interval=st.floats(0.02, 0.4))
+@given(network=plain_networks, interval=st.floats(0.02, 0.4))
 def test_large_networks_are_reached_by_the_same_formula(network: Network, interval: float) -> None:
     """The series that stands for matrices of nodes by nodes gives the same bounds, no closer than they are."""
     network = certifiable(network, interval, pulls=False)

@@ -277,7 +277,7 @@ LOOP = [share("m0", "m1", asking(0.0, 0.5, 1.0)), share("m0", "use"), share("m1"
          "arc 'm0_mine': share: its control sets it; leave it out"),
         (1, [share("m0", "use"), share("m0", "mine", asking(-0.5, 0, 1.5))], r"lie in \[0, 1\], got \[-0.5, 1.5\]"),
         (1, [share("m0", "use"), share("use", "mine")],
-         "node 'use': rate = 0.0: arc 'use_mine' shares what it releases; give the node a rate, 1/time, or stores"),
+         "node 'use': rate = 0.0: arc 'use_mine' shares what it releases; give the node a rate, 1/time, a life"),
     ],
 )  # fmt: skip
 def test_what_cannot_pass_is_refused(count: int, arcs: list[Arc], said: str) -> None:

@@ -16,7 +16,7 @@ from exact_episode import Controls, Interval, control_of, imbalance, intervals, 
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from small_networks import cycle
+from small_networks import cycle, plain_networks
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, VectorEnv
 from cirl_marl.network.series import Series
@@ -213,7 +213,7 @@ def assert_holds(played: Played, degree: int, weight: float | None = None, merge
 
 
 @given(
-    network=st.from_type(Network),
+    network=plain_networks,
     interval=st.floats(0.02, 3.0),
     pulls=st.booleans(),
     seed=st.integers(0, 1000),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
-from small_networks import advanced, neutral_rate, small, start
+from small_networks import advanced, neutral_rate, plain_networks, small, start
 
 from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Network, Node, VectorEnv, parallel_env
 from cirl_marl.controllers import Neutral
@@ -31,7 +31,7 @@ def continuous(network: Network) -> Network:
     return replace(network, arcs=tuple(arcs)).with_options(episode={"solver": "exact", "solver_step": None})
 
 
-any_network = st.from_type(Network).map(continuous)
+any_network = plain_networks.map(continuous)
 
 
 def system(network: Network) -> Floats:

@@ -64,7 +64,7 @@ def show(
     env = VectorEnv(found, num_envs=1)
     begun = beginning(env, seed)
     begun.reset(env)
-    stock, flow = env.physical.stock[env.rows.nodes, 0], env.physical.flow[:, 0]
+    stock, flow = env.rows.stocks(env.physical.stock)[:, 0], env.physical.flow[:, 0]
     console.print(nodes_table(found, stock))
     console.print(arcs_table(found, flow))
     for service in found.services:

@@ -119,14 +119,14 @@ def rollout(
         service[:, t], levels[:, :, t] = outcome.service_level, outcome.levels.T
         local += outcome.local
         returns += outcome.reward
-        stock[t], flow[t] = env.physical.stock[rows.nodes, 0], outcome.flow[:, 0]
+        stock[t], flow[t] = rows.stocks(env.physical.stock)[:, 0], outcome.flow[:, 0]
         load[t], inner[t] = batches.loads(env.physical.stock)[:, 0], env.physical.inner[physics.visible, 0]
         total_flow += outcome.flow.mean(axis=1)
         observations = env.by_agent(outcome.observation)
         if progress is not None:
             progress(t + 1)
     unmet *= env.network.episode.control_interval
-    final = env.physical.stock[rows.nodes].mean(axis=1)
+    final = rows.stocks(env.physical.stock).mean(axis=1)
     flows = total_flow / steps
     return Rollout(circularity, mean, service, levels, local, returns, stock, flow, load, inner, unmet, final, flows)
 
@@ -139,7 +139,8 @@ def beginning(env: VectorEnv, seed: int | None = None) -> Beginning:
     """
     if seed is not None:
         return Beginning(first_seed(seed), {}, f"the first episode of evaluation {seed}")
-    middle = dict(zip(env.rows.start_names, env.network.initial.mean(axis=0).tolist(), strict=False))
+    nodes = (node.id for node in env.network.stores)
+    middle = dict(zip(nodes, env.network.initial.mean(axis=0).tolist(), strict=True))
     inner = env.dynamics.inner
     rows = zip(inner.ranged.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
     middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}

@@ -12,7 +12,7 @@ from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
 from cirl_marl.definitions.series import Clock, column_value, inline_series
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network import Network, elements
-from cirl_marl.network.declared import Declared, Numbers, Quantity, declarations
+from cirl_marl.network.declared import Declared, Nested, Numbers, Quantity, declarations
 from cirl_marl.network.elements import TAKEN, Arc, Control, ControlKind, Law, Node
 from cirl_marl.network.series import Value
 from cirl_marl.network.units import factor
@@ -103,12 +103,16 @@ class Converter:
         """Return what a declared field is in Python."""
         if isinstance(declared, Quantity):
             kind = declared.kind(table)
+            if declared.shared:
+                return given * self._factor(table.unit, kind, where)
             value: Any = None if given == declared.none else self._value(given, kind, where)
             if kind != "steps":
                 return value
             if value != int(value):
                 self.mistakes.append(f"{where}: {value} must be a whole number of control intervals")
             return int(value)
+        if isinstance(declared, Nested) and declared.of == "lifetime":
+            return self._part(elements.Lifetime, given, where)
         if isinstance(given, Range):
             assert isinstance(declared, Numbers)
             scale = self._factor(given.unit, declared.of, where)

@@ -22,6 +22,7 @@ PARTS: dict[str, tuple[Any, str]] = {
     "node": (schema.NodeTable, "`[nodes.NAME]`"),
     "arc": (schema.ArcTable, "`[arcs.NAME]`"),
     "control": (schema.ControlTable, "`control` of a node or an arc"),
+    "lifetime": (schema.LifetimeTable, "`lifetime` of a node"),
     "model": (schema.ModelTable, "`model` of a node or an arc"),
     "service": (schema.ServiceTable, "`[services.NAME]`"),
     "quantity": (quantities.QuantityTable, "Every number with a unit"),

@@ -110,8 +110,12 @@ def _form(given: object) -> str:
 
 
 def varying(value: Any, series: Any, column: Any, word: str = "") -> Any:
-    """Return the type of a number that may be given in several forms, which its keys tell, or as a word."""
-    forms = [Annotated[value, Tag(VALUE)], Annotated[series, Tag(SERIES)], Annotated[column, Tag(COLUMN)]]
+    """Return the type of a number that may be given in several forms, which its keys tell, or as a word.
+
+    Without ``value`` it has to change in time.
+    """
+    given = [(value, VALUE), (series, SERIES), (column, COLUMN)]
+    forms = [Annotated[kind, Tag(tag)] for kind, tag in given if kind is not None]
     if not word:
         return Annotated[Union[*forms], Discriminator(_form)]
     either = Discriminator(lambda given: WORD if isinstance(given, str) else _form(given))

@@ -33,7 +33,7 @@ from cirl_marl.network.declared import (
     default_of,
     is_required,
 )
-from cirl_marl.network.elements import Arc, Control, Episode, Node, Objective, Observation, Service
+from cirl_marl.network.elements import Arc, Control, Episode, Lifetime, Node, Objective, Observation, Service
 from cirl_marl.network.validate import IDENTIFIER
 
 Identifier = Annotated[str, Field(pattern=IDENTIFIER)]
@@ -84,7 +84,7 @@ def table_of(made: type[Any], **more: Any) -> Any:
         raise TypeError(f"{made.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
     spelled = {name: _spelled(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
     keys = {name: _key(made, name, kind) for name, kind in spelled.items() if kind is not None}
-    if VaryingAmount in spelled.values():
+    if VaryingAmount in spelled.values() or any(isinstance(each, Quantity) and each.shared for each in told.values()):
         more |= {"unit": (str, ...), "source": (Source, ...)}
     summary = str(made.__doc__).partition("\n")[0]
     return create_model(f"{made.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
@@ -109,9 +109,13 @@ def _spelled(declared: Declared, hint: Any) -> Any:
         tables = {"range": Range, "batches": Batches, "amount": VaryingAmount}
         return tables[declared.spelled] if declared.spelled else None
     if isinstance(declared, Nested):
-        return ControlTable if declared.of == "control" else ModelTable
+        return {"control": ControlTable, "lifetime": LifetimeTable, "model": ModelTable}[declared.of]
     if isinstance(declared, CalendarTime):
         return Time
+    if isinstance(declared, Quantity) and declared.shared:
+        return Number
+    if isinstance(declared, Quantity) and declared.past:
+        return varying(None, SeriesTable, ColumnTable)
     if isinstance(declared, Quantity) and declared.varies:
         return varying(QuantityTable, SeriesTable, ColumnTable, declared.none)
     if isinstance(declared, Quantity):
@@ -121,6 +125,7 @@ def _spelled(declared: Declared, hint: Any) -> Any:
 
 TITLE: Any = (str, "")
 ControlTable = table_of(Control)
+LifetimeTable = table_of(Lifetime)
 NodeTable = table_of(Node, title=TITLE)
 ArcTable = table_of(Arc, title=TITLE)
 ServiceTable = table_of(Service, title=TITLE)

@@ -100,18 +100,25 @@ class _Writer:
                 continue
             if isinstance(declared, CalendarTime):
                 table[key] = value if isinstance(value, date) else float(value)
+            elif isinstance(declared, Quantity) and declared.shared:
+                table |= {key: float(value), "unit": self._units[declared.kind(part)], "source": SOURCE}
             elif isinstance(declared, Quantity):
                 table[key] = self._quantity(value, declared.kind(part))
             elif isinstance(declared, Numbers):
                 table |= self._numbers(part, value, declared, key)
             elif isinstance(declared, Nested):
-                table[key] = self._control(part) if declared.of == "control" else self._model(part)
+                table[key] = self._nested(part, value, declared)
             else:
                 table[key] = (
                     value if isinstance(value, bool) else list(value) if isinstance(value, tuple) else str(value)
                 )
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
+
+    def _nested(self, part: Any, value: Any, declared: Nested) -> dict[str, Any]:
+        if declared.of == "lifetime":
+            return self._part(value)
+        return self._control(part) if declared.of == "control" else self._model(part)
 
     def _numbers(self, part: Any, value: Any, declared: Numbers, key: str) -> dict[str, Any]:
         """Return the table, or tables, that definition files spell several numbers in."""

@@ -21,13 +21,16 @@ import numpy as np
 from cirl_marl.dynamics.routing import Routing
 from cirl_marl.dynamics.rows import Rows
 from cirl_marl.dynamics.shares import Shares
+from cirl_marl.dynamics.stages import StagedNetwork, staged
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Arc, ControlKind, Law
 from cirl_marl.network.rowsum import RowSum, narrowed
 from cirl_marl.network.series import Series, Value
 
-RATE, FLOW = ControlKind.RATE, ControlKind.FLOW
+FLOW = ControlKind.FLOW
+SCALING = (ControlKind.RATE, FLOW, ControlKind.STRETCH)
+"""Kinds of controls that are factors of flows, a stretch by its inverse."""
 
 
 @itemised
@@ -68,6 +71,7 @@ class FlowLaws:
 
     Attributes:
         network: whose laws they are.
+        inside: the same with lifetimes as stages; its arcs begin with those of ``network``.
         rows: which row of the masses is what.
         incidence: S with empty rows for batches and unit, shape (masses, arcs).
         driver: row of the extended stocks that drives each arc, shape (arcs,).
@@ -89,6 +93,8 @@ class FlowLaws:
     def __init__(self, network: Network) -> None:
         """Compile ``network``."""
         self.network = network
+        living = any(node.lifetime is not None for node in network.stores)
+        self.inside = network = staged(network) if living else network
         arcs = len(network.arcs)
         self.rows = rows = Rows(network)
         ends, twice = np.concatenate([network.donors, network.recipients]), np.tile(np.arange(arcs), 2)
@@ -116,12 +122,14 @@ class FlowLaws:
 
     def _bound_rates(self) -> None:
         """Bound what arcs carry and stocks drive with every control at its upper bound."""
-        self.max_rate: Floats = self._unshared(narrowed(self.control_high).max(axis=1, keepdims=True))[:, 0]
+        widest = narrowed(self.control_high).max(axis=1, keepdims=True)
+        widest[self._stretched] = self.control_low[self._stretched].min(axis=1, keepdims=True)
+        self.max_rate: Floats = self._unshared(widest)[:, 0]
         if len(self._series_arcs):
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
         # the arcs of a split carry together what one of them would carry alone
         stores = self.rows.nodes.stop
-        counted, ends = self.driver < stores, np.minimum(self.network.recipients, stores)
+        counted, ends = self.driver < stores, np.minimum(self.inside.recipients, stores)
         counted[self._shares.arcs] = False
         leading = self._shares.leading[self.driver[self._shares.leading] < stores]
         counted[leading], ends[leading] = True, stores
@@ -165,6 +173,9 @@ class FlowLaws:
 
     def _unshared(self, controls: Floats) -> Floats:
         """Return r, but for shares and time series."""
+        if len(self._stretched):
+            controls = controls.copy()
+            controls[self._stretched] = 1.0 / controls[self._stretched]
         if self._partial:  # some arc lacks a control: let a row of ones stand in for it
             controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
         own, base, donor = self._own_control, self._base, self._donor_control
@@ -193,14 +204,18 @@ class FlowLaws:
 
     def _compile_controls(self) -> None:
         """Find for each arc the rows of the control array that act on it; the row past the last is 1."""
-        network = self.network
-        acting = [network.compartments[id_] for id_ in network.controllable]
-        scaling = [c.id for c in acting if c.control is not None and c.control.kind in (RATE, FLOW)]
-        position = {id_: network.control_rows[id_].start for id_ in scaling}
+        network = self.inside
+        kinds = {c.id: c.control.kind for c in network.compartments.values() if c.control is not None}
+        position = {id_: network.control_rows[id_].start for id_, kind in kinds.items() if kind in SCALING}
+        stretched = [position[id_] for id_, kind in kinds.items() if kind is ControlKind.STRETCH]
+        self._stretched: Integers = np.array(stretched, dtype=np.intp)
         self.control_low, self.neutral, self.control_high = network.control_bounds
         none = len(self.neutral)
+        valves = network.valves if isinstance(network, StagedNetwork) else {}
 
         def acting_on(arc: Arc) -> tuple[int, int]:
+            if arc.donor in valves:
+                return none, position.get(valves[arc.donor], none)
             donor = network.compartments[arc.donor]
             own, valve = position.get(arc.id, none), position.get(arc.donor, none)
             if donor.control is not None and donor.control.kind is FLOW:

@@ -14,6 +14,7 @@ from cirl_marl.dynamics.batches import BatchTransport
 from cirl_marl.dynamics.inner import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.routing import Routed
+from cirl_marl.dynamics.stages import FixedLifetimes, StagedNetwork
 from cirl_marl.dynamics.taylor import Taylor
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
@@ -63,7 +64,8 @@ class Dynamics(FlowLaws):
     def __init__(self, network: Network) -> None:
         """Compile ``network``."""
         super().__init__(network)
-        rows = self.rows
+        rows, network = self.rows, self.inside
+        self._fixed = FixedLifetimes(network) if isinstance(network, StagedNetwork) and network.lines else None
         self.inner, self.batches = InnerPhysics(network, rows), BatchTransport(network, rows)
         episode = network.episode
         self.physical = episode.solver != "euler"
@@ -92,8 +94,9 @@ class Dynamics(FlowLaws):
         if not self.physical or not len(turnover):
             return
         node = int(turnover.argmax())
+        id_ = self.inside.nodes[node].id.partition(".")[0]
         rate = f"{turnover[node]:.4g}/{self.network.time_unit}"
-        where = f"network '{self.network.name}': node '{self.network.nodes[node].id}' turns over {rate}"
+        where = f"network '{self.network.name}': node '{id_}' turns over {rate}"
         if turnover[node] * episode.control_interval > MAX_STEPS * MAX_TURNOVER:
             raise CirlError(
                 f"{where}; a control interval of {episode.control_interval:g} {self.network.time_unit} would need more "
@@ -108,7 +111,7 @@ class Dynamics(FlowLaws):
 
     def _compile_orders(self) -> None:
         """Find the donors of scheduled flows, and their outflows by schedule and in proportion to their stock."""
-        network = self.network
+        network = self.inside
         self._order_arcs: Integers = np.flatnonzero(self.scheduled)
         self._order_donors, order_slot = np.unique(network.donors[self._order_arcs], return_inverse=True)
         self._order_slot: Integers = order_slot
@@ -135,6 +138,9 @@ class Dynamics(FlowLaws):
                 f"time series and batches depend on it, those of arc '{self._timed[0]}' for one"
             )
         rate = realised = self.rate(controls, step)
+        if self._fixed is not None:
+            stock = self._fixed.moved_on(stock)
+            self._fixed.come_out(stock, rate)
         routes = self.routing.routes(rate)
         sent = None
         if self.batches.lines and step is not None:
@@ -157,7 +163,8 @@ class Dynamics(FlowLaws):
             total[self.batches.arcs] = delivered
             batched = np.stack([sent, counted])
         self._check_finite(stock, inner)
-        return Transition(stock, inner, total, self._flow_at(stock, inner, controls, realised, routes), batched)
+        flow, arcs = self._flow_at(stock, inner, controls, realised, routes), len(self.network.arcs)
+        return Transition(stock, inner, total[:arcs], flow[:arcs], batched)
 
     def _check_finite(self, stock: Floats, inner: Floats) -> None:
         if np.isfinite(stock).all() and np.isfinite(inner).all():
@@ -174,19 +181,22 @@ class Dynamics(FlowLaws):
     def start_flow(self, stock: Floats, inner: Floats, controls: Floats) -> Floats:
         """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
         rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp))
+        if self._fixed is not None:
+            stock = self._fixed.moved_on(stock)
+            self._fixed.come_out(stock, rate)
         if self.physical:
             rate = self._limit_orders(stock, rate)
         routes = self.routing.routes(rate)
-        flow = self._flow_at(stock, inner, controls, rate, routes)
+        flow, arcs = self._flow_at(stock, inner, controls, rate, routes), len(self.network.arcs)
         if not self._heedless:
-            return flow
+            return flow[:arcs]
         out = self._outgoing(flow) * self.substep
         out[self.rows.unit] = 0.0
         share = np.divide(stock, out, out=np.ones_like(out), where=out > stock)
         flow *= share.take(self.rows.donors, axis=0)
         if routes is not None:
             self.routing.pass_on(flow, routes)
-        return flow
+        return flow[:arcs]
 
     def _flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Routed | None) -> Floats:
         if self._taylor is not None:

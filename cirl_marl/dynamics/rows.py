@@ -7,15 +7,17 @@ second array.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.network import Floats, Network
+from cirl_marl.dynamics.stages import StagedNetwork
+from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Law, Role
-from cirl_marl.network.rowsum import spans
+from cirl_marl.network.rowsum import RowSum, spans
 from cirl_marl.network.series import extremes
 
 
@@ -48,7 +50,8 @@ class Rows:
     """The rows of masses and inner states of a network, and their names.
 
     Attributes:
-        nodes: rows of the stocks.
+        nodes: rows of the stocks, those of nodes with a lifetime by stage.
+        stages: rows of the stages of each node with a lifetime, by the position of the node.
         batches: rows of the masses of batch arcs.
         unit: the unit row; the rows before it hold all the mass there is.
         masses: number of rows of the masses, the unit row included.
@@ -59,15 +62,21 @@ class Rows:
         owners: compartments with a model, in network order.
         states: rows of each owner's inner states.
         state_names: ``compartment.state`` of each inner state.
-        start_names: nodes with a stock, then inner states: what an episode starts from, and plans and snapshots are
-            compared by.
+        start_names: nodes with a stock, ``node.stage_i`` of those with a lifetime, then inner states: what an episode
+            starts from, and plans and snapshots are compared by.
         outputs: row of each owner's output, past the unit row.
         donors: row of each arc's donor, the unit row for one that stores nothing, shape (arcs,).
     """
 
     def __init__(self, network: Network) -> None:
-        """Lay out the rows of ``network``."""
+        """Lay out the rows of ``network``, which has its lifetimes as stages if it has any."""
         nodes = len(network.stores)
+        staged: Mapping[str, tuple[str, ...]] = {}
+        self.stages: dict[int, Integers] = {}
+        if isinstance(network, StagedNetwork):
+            staged, index = network.stages, network.node_index
+            self.stages = {index[node]: network.node_index_of(stages) for node, stages in staged.items()}
+        self._totals = _totals(nodes, self.stages) if staged else None
         names: list[str] = []
         self.lines = tuple(
             _line(network, k, nodes, names) for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH
@@ -81,19 +90,32 @@ class Rows:
         models = {c.id: c.model for c in network.compartments.values() if c.model is not None}
         self.owners = tuple(models)
         self.state_names = tuple(f"{owner}.{name}" for owner, model in models.items() for name in model.state_names)
-        self.start_names = (*(node.id for node in network.stores), *self.state_names)
+        last = {node: f"{node}.stage_{len(stages)}" for node, stages in staged.items()}
+        self.start_names = (*(last.get(node.id, node.id) for node in network.stores), *self.state_names)
         self.states = dict(zip(models, spans(len(model.state_names) for model in models.values()), strict=True))
         self.outputs = {owner: self.masses + i for i, owner in enumerate(self.owners)}
         # a node without stock has no row: what is asked of its row is asked of the unit row, which is never short
         self.donors = np.where(network.donors < nodes, network.donors, self.unit)
 
+    def stocks(self, masses: Floats) -> Floats:
+        """Return the stock of each node that has one, shape (stores, B), of masses or of their first rows."""
+        return masses[self.nodes] if self._totals is None else self._totals(masses[self.nodes])
+
     def start_of(self, masses: Floats, inner: Floats) -> Floats:
-        """Return stocks and inner states in one array, the rows of ``start_names``, shape (rows, B)."""
+        """Return the rows of ``start_names``, shape (rows, B)."""
         return np.concatenate([masses[self.nodes], inner])
 
     def split(self, start: Floats) -> tuple[Floats, Floats]:
-        """Return the stocks, shape (stores, B), and the inner states of what ``start_of`` returned."""
+        """Return stocks, those with a lifetime by stage, and inner states of what ``start_of`` returned."""
         return start[self.nodes], np.ascontiguousarray(start[self.nodes.stop :])
+
+
+def _totals(rows: int, stages: Mapping[int, Integers]) -> RowSum:
+    """Return the sum of the stages of each node, from the rows of all stocks."""
+    own = np.arange(rows - sum(len(each) - 1 for each in stages.values()))
+    parts = {**{int(i): np.array([i]) for i in own}, **stages}
+    places = np.concatenate([np.full(len(each), i) for i, each in parts.items()])
+    return RowSum(places, np.concatenate([*parts.values()]), 1.0, (len(own), rows))
 
 
 def _line(network: Network, k: int, nodes: int, names: list[str]) -> Line:

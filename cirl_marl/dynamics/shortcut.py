@@ -32,7 +32,7 @@ class Shortcut:
         """Compile the sums; ``factors`` are those of the derivatives in the series, from the innermost."""
         self._factors = factors
         routing, nodes, masses = laws.routing, laws.routing.nodes, laws.rows.masses
-        outer = laws.network.donors < laws.rows.nodes.stop
+        outer = laws.inside.donors < laws.rows.nodes.stop
         place = {i: n for n, i in enumerate(routing.detours.kept)}
         self._flowing = np.flatnonzero(outer & ~laws.fixed)
         self._drivers = laws.driver[self._flowing]
@@ -86,9 +86,9 @@ def _gathered(
     detours, stores, nodes = laws.routing.detours, laws.rows.nodes.stop, laws.routing.nodes
     number = dict(zip(flowing.tolist(), flows, strict=True))
     gives: dict[int, Onward] = {name: {} for name in (*masses, *flows)}
-    for k in np.flatnonzero(laws.network.donors < stores).tolist():
+    for k in np.flatnonzero(laws.inside.donors < stores).tolist():
         source, rate = (number[k], 1.0) if k in number else (masses[laws.driver[k]], float(rates[k]))
-        for end, part in ((laws.network.donors[k], -rate), (laws.network.recipients[k], rate)):
+        for end, part in ((laws.inside.donors[k], -rate), (laws.inside.recipients[k], rate)):
             name = int(end) - stores if end >= stores else nodes + int(end)
             gives[source][name] = gives[source].get(name, 0.0) + part
     return gives | {i: dict(parts) for i, parts in zip(detours.order, detours.out, strict=True)}

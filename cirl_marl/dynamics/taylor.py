@@ -29,10 +29,10 @@ class Taylor:
         self._laws, self._substep = laws, substep
         self.terms = self._number()
         factors = [substep / k for k in range(self.terms, 1, -1)]
-        self._pulls = any(arc.law is Law.RECIPIENT for arc in laws.network.arcs)
+        self._pulls = any(arc.law is Law.RECIPIENT for arc in laws.inside.arcs)
         self._horner = [laws.incidence.scaled(factor) for factor in factors]
         self._shortcut = Shortcut(laws, factors) if laws.routing.nodes else None
-        network, routing, stores = laws.network, laws.routing, laws.rows.nodes.stop
+        network, routing, stores = laws.inside, laws.routing, laws.rows.nodes.stop
         # throughputs stand below the masses, and drive what leaves nodes without stock
         self._driver = laws.driver.copy()
         self._driver[routing.arcs] = laws.rows.masses + routing.found
@@ -47,7 +47,7 @@ class Taylor:
         What is split, or enters a node that stores nothing, is taken to go where it drives most.
         """
         laws, stores = self._laws, self._laws.rows.nodes.stop
-        donors = laws.network.donors[laws.driven]
+        donors = laws.inside.donors[laws.driven]
         reach, term, k = np.ones(stores), 1.0, 0
         while term > TRUNCATION or k < 2:
             k += 1

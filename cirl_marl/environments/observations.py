@@ -34,7 +34,7 @@ class Signals:
         arcs, lines, services = len(network.arcs), len(dynamics.batches.lines), len(network.services)
         parts = spans((nodes, arcs, len(inner.names), len(inner.measure_names), lines, 1, services, nodes + arcs))
         self.nodes, self.flows, self.states, self.measures, self.loads, time, self.levels, self.set_points = parts
-        self.passing = slice(dynamics.rows.nodes.stop, nodes)
+        self.stocks, self.passing = slice(0, len(network.stores)), slice(len(network.stores), nodes)
         self.quantities, self.time, self.rows = self.loads.stop, time.start, self.set_points.stop
         self.inside = self.quantities > self.flows.stop  # whether there are quantities besides stocks and flows
 
@@ -187,11 +187,11 @@ class ObservationLayout:
             drive[dynamics.driver > dynamics.rows.unit] = np.inf
             flows = drive * dynamics.max_rate
             flows[dynamics.batches.arcs] = mass
-            through = dynamics.routing.most(flows)
-            flows[dynamics.routing.arcs] = (
-                through.take(dynamics.routing.donors) * dynamics.max_rate[dynamics.routing.arcs]
-            )
-            limits = np.concatenate([np.full(signals.passing.start, mass), through, flows]) / scales
+            routing = dynamics.routing
+            through = routing.most(flows)
+            flows[routing.arcs] = through.take(routing.donors) * dynamics.max_rate[routing.arcs]
+            passed, flows = through[: len(network.nodes) - signals.passing.start], flows[: len(network.arcs)]
+            limits = np.concatenate([np.full(signals.passing.start, mass), passed, flows]) / scales
             low[:known], high[:known] = 0.0, limits * (1 + 1e-6) + 1e-6
         low[known : signals.quantities], high[known : signals.quantities] = -np.inf, np.inf
         low[signals.loads] = 0.0

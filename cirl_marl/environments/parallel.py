@@ -165,7 +165,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             self._canvas = Canvas(self.network, window=self.render_mode == "human")
         state = self.batch.physical
         time = float(state.step[0]) * self.network.episode.control_interval
-        stock, flow = state.stock[self.batch.rows.nodes, 0], state.flow[:, 0]
+        stock, flow = self.batch.rows.stocks(state.stock)[:, 0], state.flow[:, 0]
         circularity = float(self.network.circularity(flow, state.batched[:, 0]))
         image: NDArray[np.uint8] = self._canvas.draw(stock, flow, time, circularity)
         return image if self.render_mode == "rgb_array" else None

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.errors import ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.ages import spread
 from cirl_marl.network.model import DiscreteTimeModel, GoalTask
 
 
@@ -19,7 +20,8 @@ class Starts:
     """Initial stocks and inner states of B copies, each with a random stream of its own.
 
     Attributes:
-        names: nodes, then ``compartment.state`` of the inner states; the rows of every array here.
+        names: nodes, ``node.stage_i`` of those with a lifetime, then ``compartment.state`` of the inner states; the
+            rows of every array here.
         streams: one generator per copy.
     """
 
@@ -28,16 +30,21 @@ class Starts:
 
         ``order`` names the rows that an array of initial values gives; it is empty if only mappings are taken.
         """
-        inner, nodes = dynamics.inner, dynamics.rows.nodes.stop
-        self.names = dynamics.rows.start_names
-        self._rows = {name: row for row, name in enumerate(self.names)}
+        rows, inner = dynamics.rows, dynamics.inner
+        self.names = rows.start_names
         self.streams = [np.random.default_rng() for _ in range(num_envs)]
         self._network, self._bounds, self._wholes = network, _bounds(network), _wholes(network)
+        self._rows = {name: np.array([row]) for row, name in enumerate(self.names)}
+        self._stages = {network.stores[i].id: stages for i, stages in rows.stages.items()}
+        self._rows |= self._stages
+        interval = network.episode.control_interval
+        self._spread = {id_: spread(network.stores[network.node_index[id_]], interval) for id_ in self._stages}
         inseparable = {name for names in self._wholes.values() for name in names}
         self._array_order = () if inseparable & set(order) else tuple(order)
-        self._physical, self._nodes, self._inner = dynamics.physical, dynamics.rows.nodes, inner
-        self._ranged = np.concatenate([np.arange(nodes), nodes + inner.ranged])
-        self._own = np.setdiff1d(np.arange(len(self.names)), self._ranged)
+        self._physical, self._stocks, self._inner = dynamics.physical, rows.nodes.stop, inner
+        stores = len(network.stores)
+        self._drawn = np.concatenate([np.arange(stores), self._stocks + inner.ranged])
+        self._own = np.setdiff1d(np.arange(self._stocks, len(self.names)), self._drawn)
         self._low = np.concatenate([network.initial[0], inner.low])
         self._width = np.concatenate([network.initial[1], inner.high]) - self._low
 
@@ -47,8 +54,12 @@ class Starts:
         given = self._given({} if options is None else options)
         self.streams = streams  # not before, so that what is refused changes nothing
         drawn = self.draw(range(len(streams)))
-        for row, values in given.items():
-            drawn[row] = values
+        for name, values in given.items():
+            if name in self._stages:
+                drawn[self._stages[name]] = self._spread[name][:, None] * values
+        for name, values in given.items():
+            if name not in self._stages:
+                drawn[self._rows[name]] = values
         return drawn
 
     def draw(self, which: Sequence[int] | range | Integers) -> Floats:
@@ -65,10 +76,12 @@ class Starts:
         uniform = np.ascontiguousarray(by_copy.T)
         uniform *= self._width[:, None]
         uniform += self._low[:, None]
-        if not len(own):
+        if len(uniform) == len(self.names):
             return uniform
         drawn = np.empty((len(self.names), len(which)))
-        drawn[self._ranged], drawn[self._own] = uniform, own
+        drawn[self._drawn], drawn[self._own] = uniform, own
+        for id_, rows in self._stages.items():
+            drawn[rows] = self._spread[id_][:, None] * uniform[self._network.node_index[id_]]
         return drawn
 
     def saved_streams(self) -> tuple[Mapping[str, Any], ...]:
@@ -90,8 +103,8 @@ class Starts:
             raise ControlError(f"seed {seed!r} must be a non-negative integer, or {copies} of them")
         return [np.random.default_rng(s) for s in seeds]
 
-    def _given(self, options: Mapping[str, Any]) -> dict[int, Floats]:
-        """Return the given initial stocks and inner states by their row."""
+    def _given(self, options: Mapping[str, Any]) -> dict[str, Floats]:
+        """Return the given initial stocks and inner states by name."""
         if not isinstance(options, Mapping):
             raise ControlError(f"reset options must be a mapping, not {options!r}")
         for key in options:
@@ -109,8 +122,8 @@ class Starts:
             given = dict(zip(names, values, strict=True))
         for id_ in given:
             if id_ not in self._rows:
-                raise ControlError(f"initial_state: {unknown('node or inner state', id_, self.names)}")
-        checked = {self._rows[id_]: self._initial(id_, values) for id_, values in given.items()}
+                raise ControlError(f"initial_state: {unknown('node or inner state', id_, self._rows)}")
+        checked = {id_: self._initial(id_, values) for id_, values in given.items()}
         for owner, whole in self._wholes.items():
             named = [name for name in whole if name in given]
             if named and len(named) < len(whole):
@@ -118,23 +131,31 @@ class Starts:
                     f"initial_state of '{named[0]}': a start of '{owner}' is the state of its simulator, all "
                     f"{len(whole)} entries together; snapshot() and restore() go back to one"
                 )
-        most = (self._low + self._width)[self._nodes]
-        limit = float(most.sum())
         if self._physical and checked:
-            held = [np.broadcast_to(checked.get(i, most[i]), len(self.streams)) for i in range(len(most))]
-            total = float(np.sum(held, axis=0).max())
-            if total > limit * (1 + 1e-9):
-                raise ControlError(
-                    f"initial_state: {total:.6g} {self._network.mass_unit} in all, but the observation space of "
-                    f"'{self._network.name}' covers {limit:.6g}; widen the initial ranges of the definition"
-                )
+            self._check_mass(checked)
         return checked
+
+    def _check_mass(self, given: Mapping[str, Floats]) -> None:
+        """Refuse more mass than the observation space covers; stages of which some are not given count as none."""
+        network = self._network
+        most = dict(zip((node.id for node in network.stores), network.initial[1], strict=True))
+        held = {id_: given.get(id_, stock) for id_, stock in most.items()}
+        for id_, rows in self._stages.items():
+            if parts := [given[self.names[row]] for row in rows if self.names[row] in given]:
+                held[id_] = np.sum([np.broadcast_to(part, len(self.streams)) for part in parts], axis=0)
+        limit = float(sum(most.values()))
+        total = float(np.sum([np.broadcast_to(each, len(self.streams)) for each in held.values()], axis=0).max())
+        if total > limit * (1 + 1e-9):
+            raise ControlError(
+                f"initial_state: {total:.6g} {network.mass_unit} in all, but the observation space of '{network.name}' "
+                f"covers {limit:.6g}; widen the initial ranges of the definition"
+            )
 
     def _initial(self, id_: str, values: ArrayLike) -> Floats:
         stock = _numbers(f"initial_state of '{id_}'", values)
         if stock.shape not in ((), (len(self.streams),)):
             raise ControlError(f"initial_state of '{id_}' has shape {stock.shape}, not () or {(len(self.streams),)}")
-        is_stock = self._physical and id_ in self._network.node_index
+        is_stock = self._physical and bool((self._rows[id_] < self._stocks).all())
         if not np.isfinite(stock).all() or (is_stock and (stock < 0).any()):
             raise ControlError(f"initial_state of '{id_}' is {values!r}: stocks are finite and not negative")
         low, high = self._bounds.get(id_, (-np.inf, np.inf))

@@ -304,7 +304,7 @@ class VectorEnv:
         quantities = np.empty((signals.quantities, self.num_envs))
         flow = quantities[signals.flows]
         np.divide(transition.moved, self.network.episode.control_interval, out=flow)
-        quantities[self.rows.nodes] = transition.stock[self.rows.nodes]
+        quantities[signals.stocks] = self.rows.stocks(transition.stock)
         if signals.passing.start < signals.passing.stop:
             quantities[signals.passing] = self.network.throughput(flow)
         if signals.inside:
@@ -317,7 +317,7 @@ class VectorEnv:
     def _quantities(self, state: State) -> Floats:
         loads = self.dynamics.batches.loads(state.stock)
         through = self.network.throughput(state.flow)
-        return np.concatenate([state.stock[self.rows.nodes], through, state.flow, state.inner, state.measures, loads])
+        return np.concatenate([self.rows.stocks(state.stock), through, state.flow, state.inner, state.measures, loads])
 
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)

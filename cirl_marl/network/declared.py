@@ -102,6 +102,8 @@ class Quantity(Declared):
     joint: Annotated[bool, "whether its bounds depend on other fields, so that they are checked with these"] = False
     varies: Annotated[bool, "whether it may change in time"] = False
     none: Annotated[str, "the word that definition files may give for None"] = ""
+    shared: Annotated[bool, "whether its unit and source are those of the table in which it stands"] = False
+    past: Annotated[bool, "whether it is about the time before the episode, and a series"] = False
 
     def kind(self, part: object) -> Kind:
         """Return the kind of quantity in ``part``, a part of a network or its table in a definition file."""
@@ -110,6 +112,8 @@ class Quantity(Declared):
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
+        if self.past:
+            return "" if isinstance(value, Changing) else f"a series, of times and values, got {value!r}"
         return "" if self.varies and isinstance(value, Changing) else _problem(value, "a number", ())
 
     def bound_problem(self, value: float) -> str:
@@ -167,7 +171,7 @@ class CalendarTime(Declared):
 class Nested(Declared):
     """A part of its own, with a table of its own."""
 
-    of: Literal["control", "model"] = "control"
+    of: Literal["control", "model", "lifetime"] = "control"
 
 
 def declarations(made: type[Any]) -> Mapping[str, Declared]:

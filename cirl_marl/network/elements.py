@@ -27,8 +27,9 @@ from cirl_marl.network.declared import (
     Word,
     frozen,
 )
+from cirl_marl.network.lifetimes import SURVIVALS, Chain, chain_of
 from cirl_marl.network.model import CompartmentModel
-from cirl_marl.network.series import Value
+from cirl_marl.network.series import Series, Value
 
 
 class Role(StrEnum):
@@ -56,13 +57,14 @@ class Law(StrEnum):
 class ControlKind(StrEnum):
     """What an agent sets.
 
-    A factor on flows (``rate``, a valve), the flow itself (``flow``), a share of what leaves the donor (``share``) or
-    an input of the model (``input``).
+    A factor on flows (``rate``, a valve), the flow itself (``flow``), a share of what leaves the donor (``share``), a
+    factor on the lifetime of all that is in use (``stretch``) or an input of the model (``input``).
     """
 
     RATE = "rate"
     FLOW = "flow"
     SHARE = "share"
+    STRETCH = "stretch"
     INPUT = "input"
 
 
@@ -103,7 +105,8 @@ class Control(Checked):
     kind: Annotated[
         ControlKind,
         Word(
-            "``rate``, a factor; ``flow``, mass/time; ``share``, of what leaves the donor; or ``input``, of a model",
+            "``rate``, a factor on flows; ``flow``, mass/time; ``share``, of what leaves the donor; ``stretch``, a "
+            "factor on the node's lifetime; or ``input``, of a model",
             of=ControlKind,
         ),
     ]
@@ -112,6 +115,44 @@ class Control(Checked):
     high: Annotated[Value, Amount("value at action +1, of each entry of the action")]
 
 
+FIXED = "fixed"
+"""The distribution of a lifetime that is the same for all."""
+
+
+@frozen
+class Lifetime(Checked):
+    """How long what enters a node stays there."""
+
+    mean: Annotated[
+        float, Positive("mean; of a folded normal distribution that before it is folded", of="time", shared=True)
+    ]
+    deviation: Annotated[
+        float | None,
+        Positive(
+            "standard deviation, likewise; a fixed lifetime has none, nor need an exponential one",
+            of="time",
+            shared=True,
+        ),
+    ] = None
+    distribution: Annotated[
+        str,
+        Word(
+            "``normal`` (what is below 0 leaves at once), ``folded_normal``, ``lognormal``, ``weibull``, ``gamma``, "
+            "``exponential``, or ``fixed``, a whole number of control intervals",
+            of=(*SURVIVALS, FIXED),
+            required=True,
+        ),
+    ] = "normal"
+
+    @property
+    def chain(self) -> Chain | None:
+        """The stages of which it is made, for a mean of 1; None if it is fixed."""
+        if self.distribution == FIXED:
+            return None
+        return chain_of(self.distribution, (self.deviation or self.mean) / self.mean)
+
+
+LIFETIME = Nested("how long what enters stays, for arcs of law ``share`` to split what leaves", of="lifetime")
 CONTROL = Nested("its actuator; None if it cannot act")
 MODEL = Nested("inner physics; None for a plain store or transport", of="model")
 INNER = Numbers(
@@ -147,7 +188,8 @@ class Node(Compartment):
     """A compartment that stores material, or hands it on at once, with an ``id`` of its own among nodes and arcs.
 
     A ``rate`` control scales every outflow, a ``flow`` control sets the one controlled outflow. Arcs of law ``share``
-    split what ``rate`` releases, or all that passes through a node that stores nothing.
+    split what ``rate`` releases, what leaves at the end of its ``lifetime``, or all that passes through a node that
+    stores nothing.
     """
 
     role: Annotated[Role, Word("decides which flows count as finite-time sustainable", of=Role, required=True)] = (
@@ -159,8 +201,9 @@ class Node(Compartment):
     initial: Annotated[
         Pair | None,
         Numbers(
-            "(low, high) of the initial stock, drawn uniformly, mass; if left out, a node whose outflows are all "
-            "scheduled starts with the most that they can ask for in an episode",
+            "(low, high) of the initial stock, drawn uniformly, mass; if left out, a node with a history starts with "
+            "what is left of that, and one whose outflows are all scheduled with the most that they can ask for in an "
+            "episode",
             "(low, high)",
             (2,),
             "range",
@@ -172,6 +215,30 @@ class Node(Compartment):
             "a, of a stock x the arcs of law ``share`` split a·x, 1/time; 0 without them", of="rate", varies=True
         ),
     ] = 0.0
+    lifetime: Annotated[Lifetime | None, LIFETIME] = None
+    stretch: Annotated[
+        Value,
+        Positive(
+            "factor on the lifetime of all that is in use; a control of kind ``stretch`` is a further one", varies=True
+        ),
+    ] = 1.0
+    history: Annotated[
+        Series | None,
+        NotNegative(
+            "what entered before the episode, from which the ages of the initial stock follow",
+            of="flow",
+            varies=True,
+            past=True,
+        ),
+    ] = None
+    growth: Annotated[
+        float | None,
+        Quantity(
+            "g, 1/time: before the history, or ever before the episode, what entered grew by e^(g·t); None: nothing "
+            "entered before the history, and always the same without one",
+            of="rate",
+        ),
+    ] = None
     set_point: Annotated[
         float | None, Quantity("stock aimed at, mass, or throughput, mass/time; None if there is none", of=LEVEL_OF)
     ] = None

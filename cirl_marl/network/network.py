@@ -24,6 +24,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from cirl_marl.errors import CirlError, NetworkError, unknown
+from cirl_marl.network.ages import remaining
 from cirl_marl.network.declared import declarations
 from cirl_marl.network.elements import SINKS, Compartment, ControlKind, Law, Node, Role, Service
 from cirl_marl.network.parts import Parts
@@ -113,11 +114,15 @@ class Network(Parts):
     def initial(self) -> Floats:
         """Lowest and highest stock at the start, shape (2, stores), mass.
 
-        A source without a known reserve starts with the most that its scheduled outflows can ask for in an episode.
+        A source without a known reserve starts with the most that its scheduled outflows can ask for in an episode, a
+        node with a history with what is left of it.
         """
         ranges = [node.initial or (0.0, 0.0) for node in self.stores]
         initial = np.array(ranges, dtype=float).reshape(-1, 2).T.copy()
-        unknown_ = {node.id for node in self.stores if node.initial is None}
+        for i, node in enumerate(self.stores):
+            if node.initial is None and node.history is not None:
+                initial[:, i] = remaining(node, self.episode.control_interval).sum()
+        unknown_ = {node.id for node in self.stores if node.initial is None and node.history is None}
         for arc in self.arcs:
             if arc.donor in unknown_:
                 donor, base = self.nodes[self.node_index[arc.donor]], self.held(arc.flow)

@@ -77,6 +77,14 @@ class Series(Checked, Changing):
             return f"{missing}; give what is missing, or a shorter horizon"
         return ""
 
+    def unfinished(self, said: Callable[[float], str] = "{:g}".format) -> str:
+        """Return why it does not tell what was before time 0; nothing if it does."""
+        if self.times[0] >= 0:
+            return f"series begins at {said(self.times[0])}, not before the episode does"
+        if self.end < 0:
+            return f"series ends at {said(self.end)}, before the episode begins at {said(0.0)}; give what is missing"
+        return ""
+
     def means(self, edges: Floats) -> Floats:
         """Return the mean over each interval between ``edges``, shape (len(edges) − 1,)."""
         times, values = np.array(self.times), np.array(self.values)

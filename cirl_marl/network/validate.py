@@ -16,6 +16,7 @@ from cirl_marl.network.parts import Parts
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.splits import splits, trap_problems
 from cirl_marl.network.units import factor
+from cirl_marl.network.validate_lifetimes import lifetime_problems
 from cirl_marl.network.validate_settings import (
     calendar_problems,
     is_whole,
@@ -60,11 +61,14 @@ def problems(network: Parts) -> Iterator[str]:
     nodes = {node.id: node for node in network.nodes}
     everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
     outflows: dict[str, list[Arc]] = {}
+    inflows: dict[str, list[Arc]] = {}
     for arc in network.arcs:
         outflows.setdefault(arc.donor, []).append(arc)
+        inflows.setdefault(arc.recipient, []).append(arc)
     for node in network.nodes:
         yield from _node_problems(network, node)
         yield from storage_problems(node, outflows.get(node.id, ()))
+        yield from lifetime_problems(network, node, [*inflows.get(node.id, ()), *outflows.get(node.id, ())])
     lawful = True
     for arc in network.arcs:
         found = list(_arc_problems(network, arc, nodes, everyone))
@@ -253,10 +257,14 @@ def _control_problems(where: str, compartment: Compartment, control: Control, ne
         yield f"{where}: control.low {low.min():g}{unit} would reverse the flow; use a second arc"
     elif control.kind is ControlKind.RATE and low.min() < 0:
         yield f"{where}: control.low {low.min():g} is negative; a valve cannot reverse a flow"
+    elif control.kind is ControlKind.STRETCH and low.min() <= 0:
+        yield f"{where}: control.low {low.min():g}: a stretch is above 0"
     elif control.kind is ControlKind.SHARE and (low.min() < 0 or high.max() > 1):
         yield f"{where}: control: shares lie in [0, 1], got [{low.min():g}, {high.max():g}]"
     if control.kind is ControlKind.SHARE and not isinstance(compartment, Arc):
         yield f"{where}: control.kind 'share' belongs on an arc of law 'share'"
+    if control.kind is ControlKind.STRETCH and not isinstance(compartment, Node):
+        yield f"{where}: control.kind 'stretch' belongs on a node with a lifetime"
 
 
 def _model_problems(where: str, compartment: Compartment, model: CompartmentModel) -> Iterator[str]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.declared import declarations
+from cirl_marl.network.declared import Quantity, declarations
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node, Role
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.series import Series, extremes
@@ -17,15 +17,18 @@ def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
     where, shares = f"node '{node.id}'", [arc.id for arc in outflows if arc.law is Law.SHARE]
     if node.stores:
         unscheduled = [arc.id for arc in outflows if arc.law not in (Law.CONTROLLED, Law.EXOGENOUS)]
-        if node.initial is None and unscheduled:
+        if node.initial is None and node.history is None and unscheduled:
             allowed = "only a node whose outflows are all scheduled may leave it out"
             yield f"{where}: initial: missing; {allowed}, and '{unscheduled[0]}' is not"
+        if node.lifetime is not None:
+            return
         if bool(shares) != (extremes(node.rate)[1] > 0):
-            remedy = "give the node a rate, 1/time, or stores = false"
+            remedy = "give the node a rate, 1/time, a lifetime, or stores = false"
             told = f"arc '{shares[0]}' shares what it releases; {remedy}" if shares else "it is for arcs of law 'share'"
             yield f"{where}: rate = {node.rate!r}: {told}"
         return
-    for name, given in (("initial", node.initial), ("model", node.model), ("rate", node.rate or None)):
+    given_ = {"initial": node.initial, "model": node.model, "rate": node.rate or None, "lifetime": node.lifetime}
+    for name, given in given_.items():
         if given is not None:
             yield f"{where}: {name}: it stores nothing, so that it has none"
     if node.control is not None:
@@ -52,10 +55,11 @@ def series_problems(network: Parts) -> Iterator[str]:
     named: list[tuple[str, Any]] = [(f"{type(part).__name__.lower()} '{part.id}': ", part) for part in parts]
     named += [(f"{where}control.", c.control) for where, c in named if isinstance(c, Compartment) and c.control]
     for where, part in named:
-        for name in declarations(type(part)):
+        for name, declared in declarations(type(part)).items():
             value = getattr(part, name)
             if isinstance(value, Series):
-                told = list(value.problems()) or [value.uncovered(length, said)]
+                past = isinstance(declared, Quantity) and declared.past
+                told = list(value.problems()) or [value.unfinished(said) if past else value.uncovered(length, said)]
                 origin = f" ({value.origin})" if value.origin else ""
                 yield from (f"{where}{name}: {each}{origin}" for each in told if each)
 

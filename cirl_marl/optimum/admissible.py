@@ -197,6 +197,9 @@ def _uncertified(network: Network) -> Iterator[str]:
     modelled = [c.id for c in network.compartments.values() if c.model is not None]
     if modelled:
         yield f"{modelled} have inner physics"
+    living = [node.id for node in network.stores if node.lifetime is not None]
+    if living:
+        yield f"{living} have lifetimes"
     batches = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
     if batches:
         yield f"{batches} move batches"

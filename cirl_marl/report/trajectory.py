@@ -24,7 +24,7 @@ def write_trajectory(folder: Path, name: str, env: VectorEnv, begun: Beginning, 
     folder.mkdir(parents=True, exist_ok=True)
     begun.reset(env)
     start, batches, time = env.physical, env.dynamics.batches, interval_ends(env.network)
-    stock, load = start.stock[env.rows.nodes, 0], batches.loads(start.stock)[:, 0]
+    stock, load = env.rows.stocks(start.stock)[:, 0], batches.loads(start.stock)[:, 0]
     inner = start.inner[env.dynamics.inner.visible, 0]
     lambdas, moved = (run.circularity[0], run.circularity_mean[0]), (*run.flow.T, *env.network.throughput(run.flow.T))
     columns = (*lambdas, run.service[0], *run.stock.T, *moved, *run.load.T, *run.inner.T)

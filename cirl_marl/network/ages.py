@@ -1,0 +1,101 @@
+"""How old the stock of a node with a lifetime is at the start of an episode: the stages, or slots, that it is in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.linalg import expm
+
+from cirl_marl.network.elements import Lifetime, Node
+from cirl_marl.network.lifetimes import Chain
+from cirl_marl.network.rowsum import Floats
+
+
+def slots(lifetime: Lifetime, interval: float) -> int:
+    """Return how many control intervals a fixed lifetime takes."""
+    return round(lifetime.mean / interval)
+
+
+def remaining(node: Node, interval: float) -> Floats:
+    """Return what is left of a node's history at the start of the episode, by stage or slot, mass.
+
+    What enters is spread evenly over each interval before the start. Before the history it had grown by e^(g·t), so
+    that the mean of an interval of length h before its first value is e^(−gh) of that, or it was nothing if the node
+    states no ``growth``. Stages begin with the one with most to go, slots
+    with the youngest; after them is what comes out, of which there is none between intervals.
+    """
+    lifetime, history, growth = node.lifetime, node.history, node.growth
+    assert lifetime is not None and history is not None
+    first = float(history.means(np.array([history.times[0], min(history.times[0] + interval, 0.0)]))[0])
+    if growth:
+        first *= growth * interval / np.expm1(growth * interval)
+    if (chain := lifetime.chain) is None:
+        count = slots(lifetime, interval)
+        entered = [_entered(node, first, -interval * (i + 1), -interval * i) for i in range(count)]
+        return np.array([*entered, 0.0])
+    edges = np.append(np.arange(history.times[0], -1e-9 * interval, interval), 0.0)
+    stages = np.zeros(chain.stages)
+    if growth is not None:
+        stages = chain.grown(growth * lifetime.mean) * first * lifetime.mean
+    for begin, end, inflow in zip(edges[:-1], edges[1:], history.means(edges), strict=True):
+        kept, got = held_for(chain, (end - begin) / lifetime.mean)
+        stages = kept @ stages + got * inflow * lifetime.mean
+    return stages
+
+
+def spread(node: Node, interval: float) -> Floats:
+    """Return the part of its initial stock that is in each stage, or slot; they sum to 1.
+
+    They are those of the history, or of a stock into which always more has flowed by e^(g·t); g is ``growth`` or 0.
+    """
+    lifetime, growth = node.lifetime, node.growth or 0.0
+    assert lifetime is not None
+    if node.history is not None:
+        parts = remaining(node, interval)
+    elif lifetime.chain is not None:
+        parts = lifetime.chain.grown(growth * lifetime.mean)
+    else:
+        parts = np.append(np.exp(-growth * interval * np.arange(slots(lifetime, interval))), 0.0)
+    whole: Floats = parts / parts.sum()
+    return whole
+
+
+def held_for(chain: Chain, time: float) -> tuple[Floats, Floats]:
+    """Return what e^(A·t) does to the stages, shape (K, K), and what they get of an inflow of 1 in that time, (K,).
+
+    Time is in units of the chain's ``mean``, and so is that of the inflow.
+    """
+    size = chain.stages
+    system = np.zeros((size + 1, size + 1))
+    system[:size, :size], system[:size, size] = chain.matrix, chain.entering
+    moved = expm(system * time)
+    return moved[:size, :size], moved[:size, size]
+
+
+def _entered(node: Node, first: float, begin: float, end: float) -> float:
+    """Return the mass that entered between two times before the start."""
+    assert node.history is not None
+    start, mass = node.history.times[0], 0.0
+    if end > start:
+        since = max(begin, start)
+        mass += float(node.history.means(np.array([since, end]))[0]) * (end - since)
+    if begin < start and node.growth is not None:
+        until = min(end, start)
+        past, g = (begin - start, until - start), node.growth
+        mass += first * (past[1] - past[0] if g == 0 else float(np.exp(g * past[1]) - np.exp(g * past[0])) / g)
+    return mass
+
+
+def age_problems(node: Node, interval: float) -> Iterator[str]:
+    """Yield why the ages of a node's initial stock cannot be told."""
+    lifetime, history = node.lifetime, node.history
+    assert lifetime is not None
+    chain = lifetime.chain
+    if chain is not None and node.growth is not None and node.growth * lifetime.mean <= -chain.rate:
+        yield (
+            f"growth {node.growth:g}: no stock has a lifetime of {lifetime.mean:g} and shrinks so fast; it must be "
+            f"above {-chain.rate / lifetime.mean:.4g}"
+        )
+    elif history is not None and remaining(node, interval).sum() <= 0:
+        yield "history: nothing is left of it at the start of the episode"
