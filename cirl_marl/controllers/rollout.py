@@ -105,7 +105,10 @@ def rollout(
     stock, flow = np.empty((steps, len(env.network.stores))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
-    orders, actuators = np.flatnonzero(env.dynamics.scheduled), Actuators(env.dynamics, env.agents, env.num_envs)
+    orders, actuators = (
+        np.flatnonzero(env.dynamics.scheduled[: len(total_flow)]),
+        Actuators(env.dynamics, env.agents, env.num_envs),
+    )
     unmet = np.zeros((steps, len(orders)))
     for t in range(steps):
         actions = env.stack(controller.act(observations))

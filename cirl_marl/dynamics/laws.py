@@ -21,7 +21,7 @@ import numpy as np
 from cirl_marl.dynamics.routing import Routing
 from cirl_marl.dynamics.rows import Rows
 from cirl_marl.dynamics.shares import Shares
-from cirl_marl.dynamics.stages import StagedNetwork, staged
+from cirl_marl.dynamics.stages import StagedNetwork, inside
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Arc, ControlKind, Law
@@ -93,8 +93,7 @@ class FlowLaws:
     def __init__(self, network: Network) -> None:
         """Compile ``network``."""
         self.network = network
-        living = any(node.lifetime is not None for node in network.stores)
-        self.inside = network = staged(network) if living else network
+        self.inside = network = inside(network)
         arcs = len(network.arcs)
         self.rows = rows = Rows(network)
         ends, twice = np.concatenate([network.donors, network.recipients]), np.tile(np.arange(arcs), 2)

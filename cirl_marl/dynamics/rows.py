@@ -74,7 +74,7 @@ class Rows:
         staged: Mapping[str, tuple[str, ...]] = {}
         self.stages: dict[int, Integers] = {}
         if isinstance(network, StagedNetwork):
-            staged, index = network.stages, network.node_index
+            staged, index = {n: each for n, each in network.stages.items() if len(each) > 1}, network.node_index
             self.stages = {index[node]: network.node_index_of(stages) for node, stages in staged.items()}
         self._totals = _totals(nodes, self.stages) if staged else None
         names: list[str] = []

@@ -11,14 +11,16 @@ first, in their order; the row of the node itself is that of its last stage, or 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.ages import slots
-from cirl_marl.network.elements import Arc, Law, Node
+from cirl_marl.network.elements import Arc, Law, Node, Role, Service
 from cirl_marl.network.rowsum import Integers
 from cirl_marl.network.series import Series, Value
 
@@ -28,14 +30,17 @@ class StagedNetwork(Network):
     """A network without lifetimes that moves as one with lifetimes does.
 
     Attributes:
-        stages: by node with a lifetime its stores here, first the one that what enters takes longest to leave.
+        stages: by node with a lifetime its stores here, first the one that what enters takes longest to leave; a single
+            one where the lifetime is not written out.
         valves: by store the node whose control of kind ``stretch`` acts on what leaves it.
-        lines: arcs through which fixed lifetimes come out, by the node.
+        leaving: by node with a lifetime the arc through which what has lived goes to the node that shares it out.
+        parts: by node that only is here the one that it is a part of.
     """
 
     stages: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     valves: Mapping[str, str] = field(default_factory=dict)
-    lines: Mapping[str, str] = field(default_factory=dict)
+    leaving: Mapping[str, str] = field(default_factory=dict)
+    parts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Take it as it is: the network that it stands for was checked."""
@@ -44,73 +49,151 @@ class StagedNetwork(Network):
         """Return the positions of nodes."""
         return np.array([self.node_index[node] for node in nodes], dtype=np.intp)
 
+    @cached_property
+    def sustainability(self) -> Floats:
+        """σ_k of each arc; what moves within a node does not count."""
+        return super().sustainability * ~self._within
 
-def staged(network: Network) -> StagedNetwork:
-    """Return ``network`` with its lifetimes as chains and lines."""
+    @cached_property
+    def environmental(self) -> NDArray[np.bool_]:
+        """Arcs that touch the environment and do not lie within a node of it."""
+        return super().environmental & ~self._within
+
+    def metered(self, service: Service) -> Integers:
+        """Return the arcs whose flows add up to what a service measures; an outflow is what leaves the whole node."""
+        if service.quantity != "outflow":
+            return super().metered(service)
+        leaves = [self.parts.get(arc.donor, arc.donor) == service.provider for arc in self.arcs]
+        return np.flatnonzero(np.array(leaves, dtype=bool) & ~self._within)
+
+    @property
+    def _within(self) -> NDArray[np.bool_]:
+        ends = [
+            (self.parts.get(arc.donor, arc.donor), self.parts.get(arc.recipient, arc.recipient)) for arc in self.arcs
+        ]
+        return np.array([donor == recipient for donor, recipient in ends], dtype=bool)
+
+    def _role(self, node: str) -> Role:
+        return super()._role(self.parts.get(node, node))
+
+    @property
+    def lines(self) -> Mapping[str, str]:
+        """The part of ``leaving`` that comes out of slots."""
+        arcs = {arc.id: arc for arc in self.arcs}
+        written = {node: arc for node, arc in self.leaving.items() if len(self.stages[node]) > 1}
+        return {node: arc for node, arc in written.items() if arcs[arc].law is Law.EXOGENOUS}
+
+
+def staged(network: Network, whole: Container[str] = ()) -> StagedNetwork:
+    """Return ``network`` with its lifetimes as chains and lines.
+
+    Of nodes that stay ``whole`` the arc ``leaving`` alone is written, with the rate of the stages, or 1 for a line:
+    what it carries does not follow from the stock.
+    """
     living = [node for node in network.stores if node.lifetime is not None]
-    stores, passing = list(network.stores), list(network.nodes[len(network.stores) :])
-    ends, arcs = {node.id: (f"{node.id}.entry", f"{node.id}.release") for node in living}, []
-    for arc in network.arcs:
-        donor, recipient = ends.get(arc.donor, ("", arc.donor))[1], ends.get(arc.recipient, (arc.recipient,))[0]
-        arcs.append(replace(arc, donor=donor, recipient=recipient))
-    parts = _Parts(network, arcs)
+    parts = _Parts(network)
     for node in living:
-        entry, release = ends[node.id]
-        stores[stores.index(node)] = Node(id=node.id, role=node.role, scale=node.scale, control=node.control)
-        (parts.line if node.lifetime is not None and node.lifetime.chain is None else parts.chain)(node, entry, release)
-        passing += [Node(id=each, stores=False) for each in ends[node.id]]
+        assert node.lifetime is not None
+        if node.id in whole:
+            parts.whole(node)
+        elif node.lifetime.chain is None:
+            parts.line(node)
+        else:
+            parts.chain(node)
+    arcs = [
+        replace(
+            arc, donor=parts.leaves.get(arc.donor, arc.donor), recipient=parts.enters.get(arc.recipient, arc.recipient)
+        )
+        for arc in network.arcs
+    ]
+    plain = {n.id: Node(id=n.id, role=n.role, scale=n.scale, control=n.control) for n in living}
+    stores = [plain.get(node.id, node) for node in network.stores]
+    passing = [Node(id=each, stores=False) for each in (*parts.enters.values(), *parts.leaves.values())]
     kept = {each: getattr(network, each) for each in network.__dataclass_fields__}
-    nodes = (*stores, *parts.stores, *passing)
-    changed = {"nodes": nodes, "arcs": tuple(parts.arcs), "scenarios": {}}
-    return StagedNetwork(**kept | changed, stages=parts.stages, valves=parts.valves, lines=parts.lines)
+    kept |= {"nodes": (*stores, *parts.stores, *network.nodes[len(stores) :], *passing), "scenarios": {}}
+    kept["arcs"] = (*arcs, *parts.arcs)
+    return StagedNetwork(**kept, stages=parts.stages, valves=parts.valves, leaving=parts.leaving, parts=parts.of)
+
+
+def inside(network: Network) -> Network:
+    """Return the network whose motion the simulator follows: with lifetimes as chains and lines, if it has any."""
+    return staged(network) if any(node.lifetime is not None for node in network.stores) else network
 
 
 class _Parts:
     """What lifetimes are made of."""
 
-    def __init__(self, network: Network, arcs: list[Arc]) -> None:
-        self.network, self.arcs = network, arcs
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self.arcs: list[Arc] = []
         self.stores: list[Node] = []
+        self.enters: dict[str, str] = {}
+        self.leaves: dict[str, str] = {}
         self.stages: dict[str, tuple[str, ...]] = {}
         self.valves: dict[str, str] = {}
-        self.lines: dict[str, str] = {}
+        self.leaving: dict[str, str] = {}
+        self.of: dict[str, str] = {}
 
-    def chain(self, node: Node, entry: str, release: str) -> None:
+    def chain(self, node: Node) -> None:
         """Add the stages of a lifetime that is spread."""
         assert node.lifetime is not None and node.lifetime.chain is not None
-        chain = node.lifetime.chain
+        chain, entry, release = node.lifetime.chain, self._entry(node), self._release(node)
         names = self._stores(node, chain.stages - 1)
-        rate = self._over(chain.rate / node.lifetime.mean, node.stretch)
         for name, following in zip(names, (*names[1:], release), strict=True):
             self.valves[name] = node.id
-            self.arcs.append(Arc(id=f"{name}.leaving", donor=name, recipient=following, rate=rate))
+            self.arcs.append(Arc(id=f"{name}.leaving", donor=name, recipient=following, rate=self._rate(node)))
         for end, part in zip((*names, release), (*chain.entering, chain.weights[0]), strict=True):
             if part > 0:
                 self.arcs.append(self._shared(entry, end, float(part)))
 
-    def line(self, node: Node, entry: str, release: str) -> None:
+    def line(self, node: Node) -> None:
         """Add the slots of a fixed lifetime, and the arc through which it comes out."""
         assert node.lifetime is not None
+        entry = self._entry(node)
         names = self._stores(node, slots(node.lifetime, self.network.episode.control_interval))
         self.arcs.append(self._shared(entry, names[0], 1.0))
-        self.lines[node.id] = f"{node.id}.leaving"
-        self.arcs.append(Arc(id=self.lines[node.id], donor=node.id, recipient=release, law=Law.EXOGENOUS))
+        self._out(node, Law.EXOGENOUS)
+
+    def whole(self, node: Node) -> None:
+        """Add the arc through which a lifetime comes out."""
+        assert node.lifetime is not None
+        self.stages[node.id] = (node.id,)
+        self._out(node, Law.EXOGENOUS if node.lifetime.chain is None else Law.DONOR)
+
+    def _entry(self, node: Node) -> str:
+        self.enters[node.id] = f"{node.id}.entry"
+        self.of[self.enters[node.id]] = node.id
+        return self.enters[node.id]
+
+    def _release(self, node: Node) -> str:
+        self.leaves[node.id], self.leaving[node.id] = f"{node.id}.release", f"{node.id}.leaving"
+        self.of[self.leaves[node.id]] = node.id
+        return self.leaves[node.id]
+
+    def _out(self, node: Node, law: Law) -> None:
+        release, driven = self._release(node), law is Law.DONOR
+        rate, flow = (self._rate(node), 0.0) if driven else (0.0, 1.0)
+        arc = Arc(id=self.leaving[node.id], donor=node.id, recipient=release, law=law, rate=rate, flow=flow)
+        self.arcs.append(arc)
 
     def _stores(self, node: Node, further: int) -> tuple[str, ...]:
         """Add stores before that of the node, and return all of them, first the one that is longest to live."""
         names = tuple(f"{node.id}.stage_{i + 1}" for i in range(further))
         self.stores += [Node(id=name, role=node.role, scale=node.scale) for name in names]
+        self.of |= dict.fromkeys(names, node.id)
         self.stages[node.id] = (*names, node.id)
         return self.stages[node.id]
 
     def _shared(self, entry: str, end: str, part: float) -> Arc:
         return Arc(id=f"{entry}.to.{end}", donor=entry, recipient=end, law=Law.SHARE, share=part)
 
-    def _over(self, rate: float, stretch: Value) -> Value:
-        """Return a rate, divided by the stretch of each interval."""
-        if not isinstance(stretch, Series):
-            return rate / stretch
-        interval, held = self.network.episode.control_interval, self.network.held(stretch)
+    def _rate(self, node: Node) -> Value:
+        """Return the rate of a node's stages, divided by the stretch of each interval."""
+        assert node.lifetime is not None and node.lifetime.chain is not None
+        rate = node.lifetime.chain.rate / node.lifetime.mean
+        if not isinstance(node.stretch, Series):
+            return rate / node.stretch
+        interval, held = self.network.episode.control_interval, self.network.held(node.stretch)
         return Series(times=tuple(interval * np.arange(len(held))), values=tuple(rate / held))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import ControlKind, Law
@@ -18,7 +19,8 @@ def normalised_actions(
     """Return the actions whose constant factors give the planned mean flows at the planned mean stocks.
 
     v = Z̄/X̄ where a node has several outflows, else what its outflow asks with its own control neutral; then
-    w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range. A share is such a w_k, of what is released.
+    w_k = f̄_k/(a_k·v·X̄_p) and u_k = f̄_k/v, each clipped to its range. A share is such a w_k, of what is released. A
+    stretch is 1/v, v being that of all stages together.
 
     Args:
         admissible: ranges of the factors.
@@ -42,6 +44,11 @@ def normalised_actions(
             valve[:, donor] = _ratio(flow[:, k], unit, valve[:, donor])
     for z, node in enumerate(layout.valves):
         valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
+    if isinstance(network, StagedNetwork):
+        for node in dict.fromkeys(network.valves.values()):
+            arcs = [k for k in np.flatnonzero(by_donor) if network.valves.get(network.arcs[k].donor) == node]
+            unit, place = base[:, arcs] * stock[:, network.donors[arcs]], network.node_index[node]
+            valve[:, place] = _ratio(flow[:, arcs].sum(axis=1), unit.sum(axis=1), valve[:, place])
     # what is left of f̄_k after the valve is the arc's own factor, w_k = f̄_k/(a_k·v·X̄_p)
     valve = np.clip(valve, *valve_range)
     driving = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
@@ -51,7 +58,7 @@ def normalised_actions(
 
 def _entries(admissible: Admissible, valve: Floats, own: Floats, during: slice) -> Floats:
     network, steps = admissible.network, np.arange(during.start, during.stop)
-    actuators = Actuators(FlowLaws(network), admissible.agents or None, len(steps))
+    actuators = Actuators(FlowLaws(admissible.lifetimes.network), admissible.agents or None, len(steps))
     actions = np.zeros((len(steps), len(actuators.acting)))
     for agent, entries in actuators.entries.items():
         control = network.compartments[agent].control
@@ -60,6 +67,8 @@ def _entries(admissible: Admissible, valve: Floats, own: Floats, during: slice) 
             values = own[:, network.arc_index[agent]]
         elif control.kind is ControlKind.RATE:
             values = valve[:, network.node_index[agent]]
+        elif control.kind is ControlKind.STRETCH:
+            values = 1.0 / valve[:, network.node_index[agent]]
         else:
             node = network.node_index[agent]
             sets = next(k for k in np.flatnonzero(network.donors == node) if network.arcs[k].law is Law.CONTROLLED)

@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.dynamics.laws import LAWS, FlowLaws
+from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
 from cirl_marl.network.splits import Split, splits
+from cirl_marl.optimum.vintages import Lifetimes
 
 
 class NoCertificate(CirlError):
@@ -30,7 +32,8 @@ class Admissible:
     to interval.
 
     Attributes:
-        network: whose flows they are.
+        network: whose flows they are, with lifetimes as the program sees them.
+        lifetimes: how that stands for the network that was given.
         agents: who acts.
         driver: node p that drives each arc; −1 for scheduled flows, shape (arcs,).
         base: a_k, 1/time (1 for what a node passes on), or the mean of the schedule over each interval, mass/time (1
@@ -44,6 +47,7 @@ class Admissible:
     """
 
     network: Network
+    lifetimes: Lifetimes
     agents: tuple[str, ...]
     driver: Integers
     base: Floats
@@ -66,14 +70,22 @@ class Admissible:
         if reasons:
             named = f"network '{network.name}', scenario '{network.scenario_name}'"
             raise NoCertificate(f"{named}: no bound is proved: {'; '.join(reasons)}")
+        acting = Actuators(FlowLaws(network), agents, 1).agents
+        lifetimes = Lifetimes(network, acting)
+        network = lifetimes.planned
         laws, divided = FlowLaws(network), tuple(splits(network))
-        acting = Actuators(laws, agents, 1).agents
         steps = network.episode.horizon
         # lowest, neutral and highest
         own, valve = np.ones((3, steps, len(network.arcs))), np.ones((3, steps, len(network.nodes)))
         for i, node in enumerate(network.nodes):
             if node.control is not None and node.control.kind is ControlKind.RATE:
                 valve[:, :, i] = _range(network, node, acting)
+        if isinstance(network, StagedNetwork):
+            for store, id_ in network.valves.items():
+                if network.compartments[id_].control is not None:
+                    stretch = _range(network, network.compartments[id_], acting)
+                    valve[:, :, network.node_index[store]] = 1.0 / stretch[::-1]
+        own[0][:, lifetimes.leaving] = 0.0  # what leaves at the end of a life may be nothing
         for k, arc in enumerate(network.arcs):
             setter = _setter(network, arc)
             if setter is not None:
@@ -88,6 +100,7 @@ class Admissible:
         served = [network.held(service.low) for service in network.services]
         return cls(
             network=network,
+            lifetimes=lifetimes,
             agents=acting,
             driver=np.where(laws.scheduled, -1, np.where(share, network.donors, laws.driver)),
             base=np.array(base, dtype=float).reshape(-1, steps).T,
@@ -103,6 +116,13 @@ class Admissible:
     def scheduled(self) -> NDArray[np.bool_]:
         """Arcs that flow by schedule, as far as their donor holds enough, shape (arcs,)."""
         return self.driver < 0
+
+    @cached_property
+    def lived(self) -> NDArray[np.bool_]:
+        """Arcs through which comes what has lived, whatever its stock, shape (arcs,)."""
+        found = np.zeros(len(self.network.arcs), dtype=bool)
+        found[self.lifetimes.leaving] = True
+        return found
 
     @cached_property
     def factor(self) -> Floats:
@@ -197,9 +217,6 @@ def _uncertified(network: Network) -> Iterator[str]:
     modelled = [c.id for c in network.compartments.values() if c.model is not None]
     if modelled:
         yield f"{modelled} have inner physics"
-    living = [node.id for node in network.stores if node.lifetime is not None]
-    if living:
-        yield f"{living} have lifetimes"
     batches = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
     if batches:
         yield f"{batches} move batches"

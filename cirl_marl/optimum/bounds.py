@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cirl_marl.dynamics.rows import Rows
+from cirl_marl.dynamics.stages import inside
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.ages import spread
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import Certificate, Verification, proved, verified
 from cirl_marl.optimum.program import Program, Programs
@@ -39,7 +43,7 @@ class Bound:
     Attributes:
         network: the network, under the scenario and horizon that the bound is for.
         agents: who acts; the others are neutral.
-        initial: stocks at the start, shape (stores,), mass.
+        initial: stocks at the start as the simulator has them, by stage where there is a lifetime, mass.
         objective: the bound, proved by ``verify()``: of λ̄ (mass), or of λ̄/scale + w·service with a service weight.
         value: the bound on λ̄, or with a service weight λ̄ of the plan, mass.
         service: mean service level of the plan.
@@ -100,7 +104,7 @@ class Bound:
         has to be solved. The further from the start solved for, the weaker the bound may be.
 
         Args:
-            initial: stocks at the start, shape (..., stores), mass; None is the bound's own.
+            initial: stocks at the start, shape (..., stores), or by stage, mass; None is the bound's own.
             min_service: demanded mean levels in [0, 1], of each service, shape (..., services), or one for all of them,
                 a number or shape (..., 1); None is the bound's own.
 
@@ -138,32 +142,52 @@ class Envelope:
     def at(self, initial: ArrayLike | None = None, min_service: ArrayLike | None = None) -> Floats:
         """Return the least of the bounds that the members prove; see ``Bound.at``, whose defaults are the first's."""
         first = self.members[0]
-        starts = np.asarray(first.initial if initial is None else initial, dtype=float)
+        starts = by_stage(first.network, first.initial if initial is None else initial)
         nodes = len(first.initial)
-        if starts.shape[-1:] != (nodes,):
-            raise CirlError(f"initial has shape {starts.shape}, expected (..., {nodes})")
         demanded = _demanded(first, min_service)
         shape = np.broadcast_shapes(starts.shape[:-1], () if demanded is None else demanded.shape[:-1])
+        names = Rows(inside(first.network)).start_names
         programs = Programs(Admissible.of(first.network, first.agents or None), first.degree, first.service_weight)
         starts = np.broadcast_to(starts, (*shape, nodes))
         levels = None if demanded is None else np.broadcast_to(demanded, (*shape, demanded.shape[-1]))
         found = np.empty(shape)
         for i in np.ndindex(shape):
-            check_stocks(first.network, starts[i])
+            check_stocks(names, starts[i])
             problem = programs.program(starts[i], None if levels is None else levels[i])
             found[i] = min(proved(problem, each.certificate) for each in self.members)
         return found
 
 
-def check_stocks(network: Network, stocks: Floats) -> None:
-    """Refuse stocks, shape (stores,), that no episode can start from.
+def by_stage(network: Network, stocks: ArrayLike) -> Floats:
+    """Return stocks of nodes, shape (..., stores), as the simulator has them, those with a lifetime by stage.
+
+    What is given by stage already stays as it is; the others are spread by history or growth.
+
+    Raises:
+        CirlError: for another shape.
+    """
+    given, rows = np.asarray(stocks, dtype=float), Rows(inside(network))
+    count = len(network.stores)
+    if given.shape[-1:] == (rows.nodes.stop,):
+        return given.copy()
+    if given.shape[-1:] != (count,):
+        raise CirlError(f"initial has shape {given.shape}, expected (..., {count})")
+    whole = np.zeros((*given.shape[:-1], rows.nodes.stop))
+    whole[..., :count] = given
+    for i, stages in rows.stages.items():
+        whole[..., stages] = given[..., i, None] * spread(network.stores[i], network.episode.control_interval)
+    return whole
+
+
+def check_stocks(names: Sequence[str], stocks: Floats) -> None:
+    """Refuse stocks, as many as ``names`` begin with, that no episode can start from.
 
     Raises:
         CirlError: naming a stock that is negative or not finite.
     """
-    for node, stock in zip(network.stores, stocks.tolist(), strict=True):
+    for name, stock in zip(names, stocks.tolist(), strict=False):
         if not 0 <= stock < math.inf:
-            raise CirlError(f"initial: the stock of '{node.id}' is {stock}; it must be finite and not negative")
+            raise CirlError(f"initial: the stock of '{name}' is {stock}; it must be finite and not negative")
 
 
 def check_service(min_service: ArrayLike) -> None:

@@ -56,7 +56,7 @@ def improved(
     for done in range(rounds):
         if trust < SMALLEST or enough(run):
             break
-        slopes = _jacobians(best, run) if slopes is None else slopes
+        slopes = _jacobians(best) if slopes is None else slopes
         step = _step(best, run, prices, trust, slopes)
         progress((done + 1) / rounds)
         if step is None:  # a smaller region is another program
@@ -97,15 +97,19 @@ def _demanded(bound: Bound) -> Floats:
     return np.zeros(len(bound.network.services)) if bound.min_service is None else bound.min_service
 
 
-def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
-    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, shape (steps, stores + arcs, stores | entries)."""
+def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
+    """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, and what each ends with, around the bound's actions.
+
+    Shapes are (steps, stocks + arcs, stocks), (steps, stocks + arcs, entries) and (steps, stocks); stocks are those of
+    the simulator, by stage where there is a lifetime.
+    """
     network = bound.network
     steps, entries = bound.actions.shape
-    nodes = len(network.stores)
     dynamics = Dynamics(network)
-    stock = np.concatenate([bound.initial[None], run.stock[:-1]])
-    inputs = np.concatenate([stock, bound.actions], axis=1)
-    scale = np.array([node.scale for node in network.stores])
+    rows, nodes = dynamics.rows, dynamics.rows.nodes.stop
+    stock = _path(bound, dynamics)
+    inputs = np.concatenate([stock[:-1], bound.actions], axis=1)
+    scale = np.array([node.scale for node in dynamics.inside.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
@@ -117,23 +121,37 @@ def _jacobians(bound: Bound, run: Rollout) -> tuple[Floats, Floats]:
     when = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
     done = dynamics.advance(dynamics.extend(flat[:nodes]), inner, actuators.controls(flat[nodes:], when), when)
-    outputs = np.concatenate([done.stock[dynamics.rows.nodes], done.moved / network.episode.control_interval])
+    outputs = np.concatenate([done.stock[rows.nodes], done.moved / network.episode.control_interval])
     shaped = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (shaped[:, :, :-1] - shaped[:, :, -1:]) / shift[:, None]
-    return slopes[:, :, :nodes], slopes[:, :, nodes:]
+    return slopes[:, :, :nodes], slopes[:, :, nodes:], stock[1:]
 
 
-def _step(bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tuple[Floats, Floats]) -> Floats | None:
+def _path(bound: Bound, dynamics: Dynamics) -> Floats:
+    """Return the stocks at the start and after each interval under the bound's actions, shape (steps + 1, stocks)."""
+    actuators, inner = Actuators(dynamics, bound.agents or None, 1), np.empty((0, 1))
+    masses = dynamics.extend(bound.initial[:, None])
+    found = [bound.initial]
+    for step, actions in enumerate(bound.actions):
+        when = np.array([step])
+        masses = dynamics.advance(masses, inner, actuators.controls(actions[:, None], when), when).stock
+        found.append(masses[dynamics.rows.nodes, 0])
+    return np.array(found)
+
+
+def _step(
+    bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tuple[Floats, Floats, Floats]
+) -> Floats | None:
     """Return the best change of the actions within the trust region to first order, shape (steps, entries).
 
-    None if HiGHS finds none; ``slopes`` are the Jacobians around the episode.
+    None if HiGHS finds none; ``slopes`` are the Jacobians around the episode and its stocks.
 
     Variables of an interval: δx', δf̄, δa, the levels, the imbalance; after the last, what each service lacks.
     """
     network = bound.network
     steps, entries = bound.actions.shape
-    nodes, arcs, services = len(network.stores), len(network.arcs), len(network.services)
-    by_stock, by_action = slopes
+    by_stock, by_action, stocks = slopes
+    nodes, arcs, services = stocks.shape[1], len(network.arcs), len(network.services)
     outputs = nodes + arcs
     size = outputs + entries + services + 1
     level, imbalance = outputs + entries, size - 1
@@ -145,8 +163,9 @@ def _step(bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tupl
     linear = sparse.kron(once, select_out) - sparse.csr_array(_diagonal(by_action, (outputs, entries))) @ sparse.kron(
         once, select_in
     )
-    measure, imbalances = _measures(bound)
-    realised = np.concatenate([run.stock, run.flow], axis=1)
+    dynamics = Dynamics(network)
+    measure, imbalances = _measures(bound, dynamics)
+    realised = np.concatenate([stocks, run.flow], axis=1)
     low = np.array([network.held(service.low) for service in network.services]).reshape(services, steps)
     # low·level − δq ≤ q, and ±(φ + δφ) ≤ imbalance, with q and φ those of the simulated episode
     rows = np.zeros((steps, services + 2, size))
@@ -159,7 +178,7 @@ def _step(bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tupl
     per_interval = _diagonal(rows, rows.shape[1:])
     under = sparse.block_array([[per_interval, None], [means, -sparse.eye_array(services)]], format="csr")
     bounds = np.tile(np.array([-np.inf, np.inf]), (steps, size, 1))
-    bounds[:, :nodes, 0] = -run.stock
+    bounds[:, :nodes, 0] = -stocks
     bounds[:, outputs:level] = np.stack(
         [np.maximum(-trust, -1 - bound.actions), np.minimum(trust, 1 - bound.actions)], axis=2
     )
@@ -167,7 +186,7 @@ def _step(bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tupl
     bounds[:, imbalance, 0] = 0.0
     low, high = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services, 1))]).T
     problem = LinearProgram(
-        cost=np.append(np.tile(_cost(bound, size, level), steps), prices),
+        cost=np.append(np.tile(_cost(bound, size, level, nodes), steps), prices),
         equal=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, services))], format="csr"),
         equal_to=np.zeros(steps * outputs),
         under=under,
@@ -176,7 +195,7 @@ def _step(bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tupl
         high=high,
     )
     # states and flows change by shares of their largest values, the others by shares of 1
-    parts = (*network.stores, *network.arcs)
+    parts = (*dynamics.inside.stores, *network.arcs)
     largest = np.maximum(np.abs(realised).max(axis=0), [part.scale for part in parts])
     net = max(float(np.abs(realised @ imbalances).max()), network.objective.circularity_scale)
     sizes = np.concatenate([largest, np.ones(entries + services), [net]])
@@ -188,23 +207,24 @@ def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:
     return sparse.block_diag([block.reshape(shape) for block in blocks], format="csr")
 
 
-def _measures(bound: Bound) -> tuple[Floats, Floats]:
-    """Return what each service reads off (x', f̄), shape (services, stores + arcs), and Δ·σ_env padded with zeros."""
+def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats]:
+    """Return what each service reads off (x', f̄), shape (services, stocks + arcs), and Δ·σ_env padded with zeros."""
     network = bound.network
-    nodes = len(network.stores)
+    nodes = dynamics.rows.nodes.stop
     measure = np.zeros((len(network.services), nodes + len(network.arcs)))
     for s, service in enumerate(network.services):
         if service.quantity == "stock":
-            measure[s, network.node_index[service.provider]] = 1.0
+            place = network.node_index[service.provider]
+            measure[s, dynamics.rows.stages.get(place, place)] = 1.0
         else:
             measure[s, nodes + network.metered(service)] = 1.0
     return measure, np.concatenate([np.zeros(nodes), -network.circularity_weights[1]])
 
 
-def _cost(bound: Bound, size: int, level: int) -> Floats:
+def _cost(bound: Bound, size: int, level: int, nodes: int) -> Floats:
     """Return the cost of the variables of one interval: minus the share in λ̄, or in the weighted objective."""
     network, steps = bound.network, len(bound.actions)
-    nodes, services = len(network.stores), len(network.services)
+    services = len(network.services)
     cost = np.zeros(size)
     counted = network.circularity_weights.sum(axis=0)
     if network.objective.net_zero == "abs":

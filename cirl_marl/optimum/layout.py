@@ -25,7 +25,8 @@ class Layout:
     Attributes:
         network: whose variables they are.
         pieces: equal parts of an interval.
-        merged: whether pieces are longer than the substeps of the simulator, within which scheduled flows are constant.
+        coarse: whether pieces are longer than the substeps of the simulator, within which scheduled flows are constant.
+        merged: whether they are, and stand for all that happens in them.
         degree: d.
         valves: nodes that have a Z.
         openings: nodes of these with scheduled outflows, on which the valve acts as well; v is then a variable.
@@ -33,6 +34,7 @@ class Layout:
 
     network: Network
     pieces: int
+    coarse: bool
     merged: bool
     degree: int
     valves: Integers

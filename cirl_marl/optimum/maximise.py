@@ -12,11 +12,21 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.dynamics.rows import Rows
+from cirl_marl.dynamics.stages import inside
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.actions import normalised_actions
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import Bound, Envelope, check_service, check_stocks, demanded_levels, said_levels
+from cirl_marl.optimum.bounds import (
+    Bound,
+    Envelope,
+    by_stage,
+    check_service,
+    check_stocks,
+    demanded_levels,
+    said_levels,
+)
 from cirl_marl.optimum.certificate import verified
 from cirl_marl.optimum.objective import circularity_weights
 from cirl_marl.optimum.program import Program, Programs
@@ -65,7 +75,7 @@ def bound(
     """
     check_options(service_weight, min_service, degree)
     admissible = Admissible.of(_found(network, scenario, horizon), agents)
-    start = starting_stocks(admissible.network, initial)
+    start = starting_stocks(admissible.lifetimes.network, initial)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service)
     basis = None if near is None else near.basis
     return _bounded(Programs(admissible, degree, service_weight), start, service_weight, levels, basis)
@@ -98,16 +108,18 @@ def envelope(
     if not isinstance(solves, int | np.integer) or isinstance(solves, bool) or solves < 1:
         raise CirlError(f"solves must be a whole number of at least 1, got {solves!r}")
     admissible = Admissible.of(_found(network, scenario, horizon), agents)
-    nodes = len(admissible.network.stores)
-    starts = np.asarray(initial, dtype=float)
-    if starts.ndim != 2 or starts.shape[1] != nodes or not len(starts):
-        raise CirlError(f"initial has shape {starts.shape}, expected (episodes, {nodes})")
+    network_, nodes = admissible.lifetimes.network, len(admissible.lifetimes.network.stores)
+    if np.ndim(initial) != 2 or not len(np.asarray(initial)):
+        raise CirlError(f"initial has shape {np.shape(initial)}, expected (episodes, {nodes})")
+    starts = by_stage(network_, initial)
     check_options(service_weight, min_service, degree)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service, (len(starts),))
     programs = Programs(admissible, degree, service_weight)
 
+    names = Rows(inside(network_)).start_names
+
     def solved(start: Floats, demanded: Floats | None, basis: Basis | None) -> Bound:
-        check_stocks(admissible.network, start)
+        check_stocks(names, start)
         return _bounded(programs, start, service_weight, demanded, basis)
 
     basis = None if near is None else near.basis
@@ -124,7 +136,9 @@ def envelope(
 
 
 def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike | None) -> Floats:
-    """Return the stocks that ``initial`` describes (see ``bound``), shape (stores,), mass.
+    """Return the stocks that ``initial`` describes (see ``bound``), as the simulator has them, mass.
+
+    Those of nodes with a lifetime are spread over its stages by history or growth, unless they are given by stage.
 
     Raises:
         CirlError: for an unknown node, a wrong shape, or a stock that is negative or not finite.
@@ -137,11 +151,11 @@ def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike |
                 raise CirlError(f"initial: {unknown('node', node, stores)}")
             start[stores[node]] = stock
     elif initial is not None:
-        given = np.asarray(initial, dtype=float)
-        if given.shape != start.shape:
-            raise CirlError(f"initial has shape {given.shape}, expected {start.shape}")
-        start = given.copy()
-    check_stocks(network, start)
+        start = np.asarray(initial, dtype=float)
+        if start.ndim != 1:
+            raise CirlError(f"initial has shape {start.shape}, expected {(len(stores),)}")
+    start = by_stage(network, start)
+    check_stocks(Rows(inside(network)).start_names, start)
     return start
 
 
@@ -195,8 +209,10 @@ def _bounded(
     planned = solution.plan.reshape(-1, layout.size)
     circularity = planned @ circularity_weights(layout)
     levels = planned[:, layout.level : layout.imbalance]
+    lifetimes = admissible.lifetimes
+    stocks = np.concatenate([(lifetimes.start_planned @ start)[None], planned[:, layout.last]])
     return Bound(
-        network=admissible.network,
+        network=lifetimes.network,
         agents=admissible.agents,
         initial=start,
         objective=proof.bound,
@@ -207,8 +223,8 @@ def _bounded(
         min_service=min_service,
         degree=layout.degree,
         circularity=circularity,
-        stock=np.concatenate([start[None], planned[:, layout.last]]),
-        flow=layout.means(planned)[1],
+        stock=stocks @ lifetimes.totals.T,
+        flow=layout.means(planned)[1][:, : len(lifetimes.network.arcs)],
         actions=normalised_actions(admissible, layout, planned),
         problem=problem,
         solution=solution.plan,

@@ -38,7 +38,8 @@ def falls(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) 
     valve = admissible.valve[:, step]
     through = np.intersect1d(layout.valves, nodes)
     chain.driven(through, 0 * through, layout.valve(0) + position[through], through, valve[:, through], 1.0)
-    arcs = np.setdiff1d(np.flatnonzero(np.isin(admissible.driver, nodes)), followers(admissible, step))
+    arcs = np.flatnonzero(np.isin(admissible.driver, nodes) & ~admissible.lived)
+    arcs = np.setdiff1d(arcs, followers(admissible, step))
     drivers = admissible.driver[arcs]
     via = (position[drivers] >= 0) & (network.donors[arcs] == drivers)
     factor = np.where(via, admissible.own[:, step, arcs], admissible.factor[:, step, arcs])
@@ -138,13 +139,13 @@ class _Chains:
     def _orders(self, row: Integers, nodes: Integers, weight: Floats) -> None:
         """Put a weight at every scheduled outflow of each row's node; rows are of shape (pieces, nodes).
 
-        In merged pieces what is asked in the interval stands for it; a flow that may be cut is below it at times.
+        In coarse pieces what is asked in the interval stands for it; a flow that may be cut is below it at times.
         """
         counts = self.counts[nodes]
         which = np.repeat(np.arange(len(nodes)), counts)
         offset = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
         arcs = self.orders[self.starts[nodes[which]] + offset]
-        moment = 0 * self.first if self.layout.merged else self.first
+        moment = 0 * self.first if self.layout.coarse else self.first
         self.rows.put(row[:, which], self.layout.flow(moment[:, None]) + arcs, weight[which])
-        if self.layout.merged:
+        if self.layout.coarse:
             self.rows.loosen(row[:, which], arcs, np.maximum(-weight[which], 0.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats
 from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.rows import ProgramRows
@@ -19,7 +20,9 @@ def measures(layout: Layout, low: Floats, rows: ProgramRows) -> None:
         row = rows.add(1, s)
         rows.put(row, layout.level + s, low[s])  # level ≤ q/low; level ≤ 1 is a box
         if service.quantity == "stock":
-            rows.put(row, layout.end(-1) + network.node_index[service.provider], -1.0)
+            stages = network.stages if isinstance(network, StagedNetwork) else {}
+            for store in stages.get(service.provider, (service.provider,)):
+                rows.put(row, layout.end(-1) + network.node_index[store], -1.0)
         else:
             rows.put(row, layout.flow(layout.moment_column) + network.metered(service), -1.0 / count)
     weights = -network.circularity_weights[1]

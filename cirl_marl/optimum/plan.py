@@ -96,7 +96,9 @@ class Plan(Controller):
 def achieved(bound: Bound) -> Rollout:
     """Return the episode that the plan of ``bound`` makes in the simulator."""
     network = bound.network
-    stores = [replace(n, initial=(x, x)) for n, x in zip(network.stores, bound.initial.tolist(), strict=True)]
+    stores = [replace(n, initial=(x, x)) for n, x in zip(network.stores, bound.stock[0].tolist(), strict=True)]
     pinned = replace(network, nodes=(*stores, *network.nodes[len(stores) :]))
     env = VectorEnv(pinned, num_envs=1, agents=bound.agents or None)
-    return rollout(env, Plan(replace(bound, network=pinned)))
+    stages = [row for rows in env.rows.stages.values() for row in rows.tolist()]
+    start = {env.rows.start_names[row]: float(bound.initial[row]) for row in stages}
+    return rollout(env, Plan(replace(bound, network=pinned)), start=start)

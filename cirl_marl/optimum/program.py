@@ -18,11 +18,12 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.monotone import falls
 from cirl_marl.optimum.objective import measures, objective
-from cirl_marl.optimum.reach import ComparisonSystem, Reach
+from cirl_marl.optimum.reach import ComparisonSystem, Delayed, Reach
 from cirl_marl.optimum.rows import Chained, ProgramRows
 from cirl_marl.optimum.scheduled import deliveries, openings, orders
 from cirl_marl.optimum.settled import ends, settled
 from cirl_marl.optimum.shared import followers, passing
+from cirl_marl.optimum.vintages import Lifetimes
 
 LARGE = 30_000
 """Variables beyond which the substeps of an interval are merged, into one piece or, from degree 3 on, d − 1."""
@@ -97,8 +98,11 @@ class Programs:
                 large otherwise.
         """
         self.admissible = admissible
-        self._system = ComparisonSystem(admissible)
+        lifetimes = admissible.lifetimes
+        living = lifetimes.planned is not lifetimes.reached
+        self._system = ComparisonSystem(Admissible.of(lifetimes.reached, admissible.agents) if living else admissible)
         self.layout = layout = _layout(admissible, self._system.substeps, merged, degree)
+        fading = ComparisonSystem(admissible) if living and layout.merged else self._system
         self._equal, self._under = Chained(layout), Chained(layout)
         for kind in np.unique(admissible.kinds).tolist():
             linked_equal, equal, linked_under, under = (ProgramRows(layout) for _ in range(4))
@@ -112,17 +116,17 @@ class Programs:
             falls(admissible, layout, kind, linked_under)
             if layout.merged:
                 ends(admissible, layout, kind, equal, under)
-                settled(admissible, layout, kind, self._system.of_kind(kind), linked_under)
+                settled(admissible, layout, kind, fading.of_kind(kind), linked_under)
             measures(layout, admissible.served[kind], under)
             self._equal.add(kind, linked_equal, equal)
             self._under.add(kind, linked_under, under)
         self._weights, self._constant = objective(layout, service_weight)
 
     def program(self, initial: Floats, min_service: ArrayLike | None = None, intervals: range | None = None) -> Program:
-        """Return the program from ``initial``, shape (stores,), that gives each service the mean level demanded of it.
+        """Return the program from ``initial`` that gives each service the mean level demanded of it.
 
         Args:
-            initial: stocks at the start, mass.
+            initial: stocks at the start, those with a lifetime by stage, as the simulator has them, mass.
             min_service: least mean level of every service, or of each, shape (services,), to which the last rows of G
                 hold it; None if nothing is demanded.
             intervals: of the episode, one after the other; None is all of them.
@@ -132,20 +136,22 @@ class Programs:
         """
         layout, network = self.layout, self.admissible.network
         when = range(network.episode.horizon) if intervals is None else intervals
-        steps, kinds = len(when), self.admissible.kinds[when.start : when.stop]
-        reached = self._system.reach(initial, when)
+        steps, kinds, lifetimes = len(when), self.admissible.kinds[when.start : when.stop], self.admissible.lifetimes
+        reached, leaving = _reached(lifetimes, self._system, initial, when)
         asked = self.admissible.factor[1] * self.admissible.base
         cut = np.where(self.admissible.scheduled & ~reached.uncut, asked[when.start : when.stop], 0.0)
-        equal, equal_to = self._equal.over(kinds, initial, cut)
-        under, under_to = self._under.over(kinds, initial, cut)
+        start = lifetimes.start_planned @ initial
+        equal, equal_to = self._equal.over(kinds, start, cut)
+        under, under_to = self._under.over(kinds, start, cut)
         opened, opened_to = openings(self.admissible, reached, layout, when)
-        blocks, limits = [under, opened], [under_to, opened_to]
+        lived, lived_to = lifetimes.rows(layout, initial, when)
+        blocks, limits = [under, opened, lived], [under_to, opened_to, lived_to]
         if min_service is not None:
             services = len(network.services)
             levels = sparse.eye_array(services, layout.size, k=layout.level)
             blocks.append(sparse.kron(np.full((1, steps), -1.0 / steps), levels, format="csr"))
             limits.append(-np.broadcast_to(min_service, services))
-        low, high = _box(self.admissible, reached, layout, when)
+        low, high = _box(self.admissible, reached, leaving, layout, when)
         return Program(
             layout=layout,
             cost=np.tile(-self._weights / steps, steps),
@@ -159,17 +165,38 @@ class Programs:
         )
 
 
+def _reached(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, intervals: range) -> tuple[Reach, Floats]:
+    """Return what the planned network can reach, and the most that leaves lifetimes, shape (steps, lifetimes)."""
+    delayed = [
+        Delayed(each.reached_arc, each.reached_node, each.slots(initial), lifetimes.network.episode.control_interval)
+        for each in lifetimes.lived
+        if not len(each.rate)
+    ]
+    slots = {each.arc: each for each in delayed}
+    found = system.reach(lifetimes.start_reached @ initial, intervals, delayed)
+    most = [
+        each.rate[intervals.start : intervals.stop] * found.upper[:, each.reached_node]
+        if len(each.rate)
+        else np.array([slots[each.reached_arc].most(t, found.entered) for t in range(len(intervals))])
+        for each in lifetimes.lived
+    ]
+    upper = found.upper @ lifetimes.nodes_reached.T
+    leaving = np.array(most).reshape(len(most), len(intervals)).T
+    return Reach(upper, found.uncut[:, lifetimes.arcs_reached], found.entered), leaving
+
+
 def _layout(admissible: Admissible, substeps: int, merged: bool | None, degree: int) -> Layout:
     network = admissible.network
     nodes = len(network.nodes)
+    pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.lived else substeps
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
     orders = np.bincount(network.donors[admissible.scheduled], minlength=nodes)
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
-    fine = Layout(network, substeps, False, degree, valves, openings)
-    if substeps > max(1, degree - 1) and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
-        return replace(fine, pieces=max(1, degree - 1), merged=True)
+    fine = Layout(network, pieces, pieces < substeps, False, degree, valves, openings)
+    if pieces > max(1, degree - 1) and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
+        return replace(fine, pieces=max(1, degree - 1), coarse=True, merged=True)
     return fine
 
 
@@ -215,7 +242,8 @@ def _laws(admissible: Admissible, layout: Layout, step: int, equal: ProgramRows,
             under.put(row, column[:, ~given], sign)
             under.put(row, driver[:, ~given], -sign * bound[~given])
 
-    valves, arcs = layout.valves, np.setdiff1d(np.flatnonzero(~admissible.scheduled), followers(admissible, step))
+    valves, driven = layout.valves, ~admissible.scheduled & ~admissible.lived
+    arcs = np.setdiff1d(np.flatnonzero(driven), followers(admissible, step))
     place = np.arange(len(valves))
     hold(1, place, layout.valve(moment) + place, layout.stock(moment) + valves, admissible.valve[:, step, valves])
     # behind a valve that several outflows share F_i = w·a·Z_i with Z_i = v·X_i; else F_i = v·w·a·X_i
@@ -233,7 +261,7 @@ def _held(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) 
     For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.
     """
     moment = layout.moment_column[1:]
-    free = ~admissible.scheduled & (admissible.factor[0, step] < admissible.factor[1, step])
+    free = ~admissible.scheduled & ~admissible.lived & (admissible.factor[0, step] < admissible.factor[1, step])
     arcs, valves = np.flatnonzero(free), np.arange(len(layout.valves))
     opened = admissible.neutral_valve[step, layout.valves]
     parts = (
@@ -247,7 +275,9 @@ def _held(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) 
             rows.put(row, layout.stock(at) + driver, -sign * rate)
 
 
-def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: range) -> tuple[Floats, Floats]:
+def _box(
+    admissible: Admissible, reached: Reach, leaving: Floats, layout: Layout, intervals: range
+) -> tuple[Floats, Floats]:
     """Return the lowest and highest value of every variable; all are finite, which makes every multiplier a bound."""
     network = admissible.network
     low, high = np.zeros((2, len(intervals), layout.size))
@@ -257,6 +287,7 @@ def _box(admissible: Admissible, reached: Reach, layout: Layout, intervals: rang
     # no weighted mean exceeds the supremum: F ≤ r̄·x̄_p, and U ≤ ū; U ≥ u̲ only where nothing is ever cut
     most = rates[1] * np.where(scheduled, 1.0, reached.upper[:, admissible.driver])
     least = np.where(scheduled & reached.uncut, rates[0], 0.0)
+    most[:, admissible.lifetimes.leaving] = leaving
     for i in layout.moments:
         high[:, layout.stock(i) : layout.flow(i)] = reached.upper
         high[:, layout.flow(i) : layout.valve(i)] = most

@@ -8,6 +8,7 @@ flow realised.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,10 +35,34 @@ class Reach:
         upper: bound of each stock within each interval, mass, and of what passes through each node that stores
             nothing, mass/time, shape (steps, nodes).
         uncut: whether the donor of each arc delivers all that is asked, whatever the actions, shape (steps, arcs).
+        entered: most that enters each stock in each interval, shape (steps, stores), mass.
     """
 
     upper: Floats
     uncut: NDArray[np.bool_]
+    entered: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Delayed:
+    """What comes out of a fixed lifetime.
+
+    Attributes:
+        arc: through which it comes out.
+        node: from which.
+        slots: what is in it at the start, first what comes out first, mass.
+        interval: length of an interval.
+    """
+
+    arc: int
+    node: int
+    slots: Floats
+    interval: float
+
+    def most(self, step: int, entered: Floats) -> float:
+        """Return the most that comes out in an interval, given what ``entered`` in those before, mass/time."""
+        delay = len(self.slots)
+        return float(self.slots[step] if step < delay else entered[step - delay, self.node]) / self.interval
 
 
 class ComparisonSystem:
@@ -56,8 +81,10 @@ class ComparisonSystem:
         self._routes: dict[bytes, RouteBounds] = {}
         self._linear: dict[int, Linear] = {}
 
-    def reach(self, initial: Floats, intervals: range) -> Reach:
+    def reach(self, initial: Floats, intervals: range, delayed: Sequence[Delayed] = ()) -> Reach:
         """Bound the stocks from ``initial``, shape (stores,), on, over the given intervals of the episode.
+
+        What comes out of fixed lifetimes, ``delayed``, is at most what entered so many intervals before.
 
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds: the solver then departs from the laws.
@@ -66,16 +93,19 @@ class ComparisonSystem:
         nodes, stores, steps = len(network.nodes), len(network.stores), len(intervals)
         mass = float(initial.sum()) * (1 + ROUNDING)
         lower, upper = initial.copy(), initial.copy()
-        highest = np.zeros((steps, nodes))
+        highest, entered = np.zeros((steps, nodes)), np.zeros((steps, stores))
         uncut = np.ones((steps, len(network.arcs)), dtype=bool)
         for step, interval in enumerate(intervals):
             least, most = np.where(scheduled, self.admissible.rate(interval), 0.0)
+            for each in delayed:
+                least[each.arc], most[each.arc] = 0.0, each.most(step, entered)
             linear = self.of_kind(int(self.admissible.kinds[interval]))
             entering, outgoing = self._by_node(most)
             incoming = linear.routes.most(entering)
             for _ in range(self.substeps):
                 # without any outflow no stock ends a substep lower than it began, so this bounds it throughout
                 peak, missed = linear.growth(upper, incoming)
+                entered[step] += np.maximum(peak + missed - upper, 0.0)
                 peak = np.minimum(peak + missed, mass) * (1 + ROUNDING)
                 highest[step, :stores] = np.maximum(highest[step, :stores], peak)
                 # what may be asked in this piece, against what is left at the least: nothing is cut where it suffices
@@ -95,7 +125,8 @@ class ComparisonSystem:
                 lower = np.maximum(bounds[:stores] - missed, 0.0)
                 upper = np.minimum(bounds[stores:] + missed, mass)
             highest[step, stores:] = linear.routes.through(entering[stores:] + linear.sent @ highest[step, :stores])
-        return Reach(highest, uncut)
+        uncut[:, [each.arc for each in delayed]] = True  # a slot holds what comes out of it
+        return Reach(highest, uncut, entered)
 
     def _by_node(self, flow: Floats) -> tuple[Floats, Floats]:
         """Return the sums of flows into each node, shape (nodes,), and out of each stock, shape (stores,)."""

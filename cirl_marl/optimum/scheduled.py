@@ -17,9 +17,9 @@ def deliveries(admissible: Admissible, layout: Layout, step: int, rows: ProgramR
     """Add U·δ − x_start·z/(e^z − 1), at most 0, for the scheduled outflow U of each node; keys (0, piece, node).
 
     This is how the simulator cuts scheduled flows, with z = a·δ for the proportional exits of rate a; the least a gives
-    the most. What flows in during the piece is not available to them. Of merged pieces nothing is said.
+    the most. What flows in during the piece is not available to them. Of coarse pieces nothing is said.
     """
-    if layout.merged:
+    if layout.coarse:
         return
     network = admissible.network
     turned_over = admissible.exits(step)[0] * layout.length
@@ -36,16 +36,16 @@ def deliveries(admissible: Admissible, layout: Layout, step: int, rows: ProgramR
 def orders(admissible: Admissible, layout: Layout, equal: ProgramRows, under: ProgramRows) -> None:
     """Add that a scheduled flow is constant in its piece, F_i = F_0; keys (0, moment, 0, arc, side).
 
-    If pieces are merged, a flow that nothing can cut is constant in the interval.
+    If pieces are coarse, a flow that nothing can cut is constant in the interval.
     """
     moment, arcs = layout.moment_column, np.flatnonzero(admissible.scheduled)
-    first = 0 * moment if layout.merged else moment - moment % (layout.degree + 1)
+    first = 0 * moment if layout.coarse else moment - moment % (layout.degree + 1)
     later = (moment > first).ravel()
-    for rows, side, sign in ((under, 0, 1.0), (under, 1, -1.0)) if layout.merged else ((equal, 0, 1.0),):
+    for rows, side, sign in ((under, 0, 1.0), (under, 1, -1.0)) if layout.coarse else ((equal, 0, 1.0),):
         row = rows.add(0, moment[later], 0, arcs, side)
         rows.put(row, layout.flow(moment[later]) + arcs, sign)
         rows.put(row, layout.flow(first[later]) + arcs, -sign)
-        if layout.merged:
+        if layout.coarse:
             rows.loosen(row, arcs, 1.0)
 
 

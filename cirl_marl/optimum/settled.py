@@ -14,12 +14,11 @@ and g, and for (w − w̲) and (w̄ − w) times what a factor w acts on. Of x_j
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import special
 
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
@@ -27,6 +26,7 @@ from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.reach import Linear
 from cirl_marl.optimum.rows import ProgramRows
 from cirl_marl.optimum.shared import followers, leader
+from cirl_marl.optimum.vintages import weighted
 
 FAST = (0.5, 2.0, 8.0)
 """Turnovers in a piece from which on a stock counts as fast; there are rows for each choice."""
@@ -45,7 +45,7 @@ def ends(admissible: Admissible, layout: Layout, step: int, equal: ProgramRows, 
         under.put(row, layout.end_flow(piece) + orders, sign)
         under.put(row, layout.flow(0) + orders, -sign)
         under.loosen(row, orders, 1.0)
-    driven = np.setdiff1d(np.flatnonzero(~admissible.scheduled), followers(admissible, step))
+    driven = np.setdiff1d(np.flatnonzero(~admissible.scheduled & ~admissible.lived), followers(admissible, step))
     given = rate[0, driven] == rate[1, driven]
     for rows, which, side, sign in (
         (equal, driven[given], 0, 1.0),
@@ -100,7 +100,8 @@ def _held_factors(
     (low, high), piece = admissible.rate(step), np.arange(layout.pieces)[:, None]
     fastest = admissible.exits(step)[1]
     known = np.append(usable & (fastest[: len(usable)] * layout.length < FAST[-1]), False)
-    arcs = np.flatnonzero((low < high) & known[np.minimum(admissible.driver, len(usable))] & ~admissible.scheduled)
+    free = (low < high) & ~admissible.scheduled & ~admissible.lived
+    arcs = np.flatnonzero(free & known[np.minimum(admissible.driver, len(usable))])
     arcs = np.setdiff1d(arcs, followers(admissible, step))
     driver = admissible.driver[arcs]
     for i in range(layout.degree + 1):
@@ -216,20 +217,7 @@ def _growth(rate: float | Floats, layout: Layout, i: int) -> Any:
 
 
 def _transients(matrix: Floats, length: float, degree: int) -> Floats:
-    """Return the means of e^{Ms} under B_0 … B_d, and e^{Mδ}, each at least as large, shape (d + 2, n, n).
-
-    The first row of exp of the blocks [[M, I, 0, …], [0, 0, I, …], …]·δ has e^{Mδ}, then, for m = 0 … d, the integrals
-    of e^{Ms}(δ − s)^m/m! (Van Loan 1978); B_i is a sum of powers of 1 − s/δ.
-    """
-    n = len(matrix)
-    blocks = np.kron(np.eye(degree + 2, k=1), np.eye(n))
-    blocks[:n, :n] = matrix
-    first = linalg.expm(blocks * length)[:n].reshape(n, degree + 2, n).transpose(1, 0, 2)
-    powers = [first[m + 1] * math.factorial(m) / length**m for m in range(degree + 1)]
-    means = [
-        sum(math.comb(i, j) * (-1) ** j * powers[degree - i + j] for j in range(i + 1))
-        * (math.comb(degree, i) * (degree + 1) / length)
-        for i in range(degree + 1)
-    ]
-    found: Floats = np.maximum(np.array([*means, first[0]]), 0.0) * WIDER + ROUND_OFF
+    """Return the means of e^{Ms} under B_0 … B_d, and e^{Mδ}, each at least as large, shape (d + 2, n, n)."""
+    means, last = weighted(matrix, degree, length)
+    found: Floats = np.maximum(np.concatenate([means, last[None]]), 0.0) * WIDER + ROUND_OFF
     return found

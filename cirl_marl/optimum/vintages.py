@@ -1,0 +1,390 @@
+"""What leaves at the end of uncontrolled lifetimes, from what entered and when: rows without stages.
+
+What leaves a chain of stages is linear in what has entered it, u, and in what it held at the start. Weighted with B_i
+over a piece p it is ::
+
+    L_i = known_i + w_0 U_i + (d + 1)/δ · Σ_q ∫_q k_pi(τ) u(τ) dτ,    k_pi(τ) = ∫_p B_i(t) μ e_Kᵀ Φ(t, τ) E dt,
+
+over the pieces q up to p, with Φ the motion of the stages and E how an inflow enters them. Each k is smooth on a piece
+and not negative. Polynomials of degree d enclose it there, c̲_j and c̄_j being their Bernstein coefficients, and as u is
+not negative, neither are any of the means in
+
+    known_i + w_0 U_i + Σ_q Σ_j c̲_j U_qj ≤ L_i ≤ known_i + w_0 U_i + Σ_q Σ_j c̄_j U_qj
+
+(theorem 4 of docs/bound.md). What leaves a fixed lifetime is the mean inflow of one interval, or known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import expm
+
+from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.dynamics.rows import Rows
+from cirl_marl.dynamics.stages import StagedNetwork, inside, staged
+from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.elements import Node
+from cirl_marl.network.lifetimes import Chain
+from cirl_marl.optimum.layout import Layout
+
+TERMS = 26
+"""Degree to which kernels are expanded; what is left out is below 1e-13 of them."""
+LOOSE = 2e-4
+"""Distance of the bounds of what leaves, relative to it, above which intervals have more pieces."""
+MARGIN = 1e-12
+"""Widening of every enclosure, relative to the largest value of its kernel, for rounding errors, which are smaller."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lived:
+    """A lifetime that nobody controls.
+
+    Attributes:
+        node: whose it is.
+        rows: of its stages, or slots, among the stocks of the simulator.
+        leaving: the arc of the planned network through which what has lived goes.
+        entering: its arcs through which something enters.
+        rate: μ in each interval, shape (steps,), 1/time; empty for a fixed one.
+        reached_node: the node, or its last stage, among the nodes of ``reached``.
+        reached_arc: ``leaving`` among its arcs.
+    """
+
+    node: Node
+    rows: Integers
+    leaving: int
+    entering: Integers
+    rate: Floats
+    reached_node: int
+    reached_arc: int
+
+    def slots(self, initial: Floats) -> Floats:
+        """Return what is in the slots of a fixed lifetime, first what comes out first, of all stocks, mass."""
+        held = initial[self.rows]
+        # what rounding left of what came out before comes with the oldest
+        return np.concatenate([[held[-2] + held[-1]], held[-3::-1]])
+
+
+class Lifetimes:
+    """A network as its program sees it: controlled lifetimes as chains, the others whole.
+
+    Attributes:
+        network: as it is given.
+        planned: as the program has it.
+        reached: as stocks are bounded, all lifetimes but fixed ones being chains.
+        lived: the lifetimes that nobody controls.
+    """
+
+    def __init__(self, network: Network, acting: Sequence[str]) -> None:
+        """Compile the lifetimes of ``network`` while ``acting`` act."""
+        self.network = network
+        living = [node for node in network.stores if node.lifetime is not None]
+        whole = [node for node in living if not (node.id in acting and node.control is not None)]
+        fixed = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
+        self.planned: Network = staged(network, {node.id for node in whole}) if living else network
+        self.reached: Network = staged(network, fixed) if living else network
+        self._written = inside(network)
+        rows = Rows(self._written)
+        self.stocks = rows.nodes.stop
+        neutral = network.control_bounds[1]
+        self.lived: list[Lived] = []
+        for node in whole:
+            assert node.lifetime is not None and isinstance(self.planned, StagedNetwork)
+            place, chain, planned = network.node_index[node.id], node.lifetime.chain, self.planned
+            rate = np.zeros(0)
+            if chain is not None:
+                rate = chain.rate / node.lifetime.mean / network.held(node.stretch)
+                if node.control is not None:
+                    rate = rate / neutral[network.control_rows[node.id].start]
+            self.lived.append(
+                Lived(
+                    node=node,
+                    rows=rows.stages.get(place, np.array([place])),
+                    leaving=planned.arc_index[planned.leaving[node.id]],
+                    entering=np.flatnonzero(planned.recipients == planned.node_index[node.id]),
+                    rate=rate,
+                    reached_node=self.reached.node_index[node.id],
+                    reached_arc=self.reached.arc_index[planned.leaving[node.id]],
+                )
+            )
+        self._known: dict[tuple[str, bytes, int], Kernel] = {}
+
+    @cached_property
+    def leaving(self) -> Integers:
+        """Arcs of the planned network that come out of lifetimes that nobody controls."""
+        return np.array([each.leaving for each in self.lived], dtype=np.intp)
+
+    def pieces(self, degree: int, most: int) -> int:
+        """Return the pieces of an interval, at most ``most``, in which stocks turn over once and kernels are smooth."""
+        laws, interval = FlowLaws(self.planned), self.network.episode.control_interval
+        turnover = laws.turnover.copy()
+        driven = [each for each in self.lived if len(each.rate)]
+        for each in driven:
+            turnover[self.planned.donors[each.leaving]] = 0.0
+        pieces = max(1, math.ceil(interval * float(turnover.max(initial=0.0)) - 1e-9))
+        for each in driven:
+            while pieces < most and self._looseness(each, pieces, degree) > LOOSE:
+                pieces += 1
+        return min(pieces, most)
+
+    def _looseness(self, each: Lived, pieces: int, degree: int) -> float:
+        """Return how far bounds of what leaves are apart, relative to it, where as much enters all the time."""
+        assert each.node.lifetime is not None and each.node.lifetime.chain is not None
+        count = pieces * self.network.episode.horizon
+        rate = np.full(count, each.rate.max())
+        kernel = Kernel(each.node.lifetime.chain, rate, self.network.episode.control_interval / pieces, degree)
+        low, high = (bound[-1].sum(axis=(1, 2)) for bound in (kernel.low, kernel.high))
+        return float(((high - low) / high).max())
+
+    @cached_property
+    def start_planned(self) -> Any:
+        """What the stores of the planned network hold of the stocks of the simulator, shape (stores, stocks)."""
+        return _sums(self._written, self.planned)[: len(self.planned.stores), : self.stocks]
+
+    @cached_property
+    def start_reached(self) -> Any:
+        """What the stores of ``reached`` hold of them, shape (stores, stocks)."""
+        return _sums(self._written, self.reached)[: len(self.reached.stores), : self.stocks]
+
+    @cached_property
+    def nodes_reached(self) -> Any:
+        """What the nodes of the planned network are of those of ``reached``, shape (nodes, nodes)."""
+        return _sums(self.reached, self.planned)
+
+    @cached_property
+    def arcs_reached(self) -> Integers:
+        """Arcs of ``reached`` that are those of the planned network, shape (arcs,)."""
+        return np.array([self.reached.arc_index[arc.id] for arc in self.planned.arcs], dtype=np.intp)
+
+    @cached_property
+    def totals(self) -> Any:
+        """What the stocks of the network are of those of the planned one, shape (stores, stores)."""
+        stores = self.planned.stages if isinstance(self.planned, StagedNetwork) else {}
+        found = sparse.lil_array((len(self.network.stores), len(self.planned.stores)))
+        for i, node in enumerate(self.network.stores):
+            for store in stores.get(node.id, (node.id,)):
+                found[i, self.planned.node_index[store]] = 1.0
+        return sparse.csr_array(found)
+
+    def rows(self, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
+        """Return the rows G v ≤ g of all lifetimes that nobody controls, and g.
+
+        Args:
+            layout: of the variables of the planned network.
+            initial: stocks of the simulator at the start, shape (stocks,), mass.
+            intervals: of the episode, one after the other.
+        """
+        blocks: list[Any] = [sparse.csr_array((0, layout.size * len(intervals)))]
+        limits = [np.zeros(0)]
+        for each in self.lived:
+            write = self._of_line if each.node.lifetime is None or not len(each.rate) else self._of_chain
+            matrix, to = write(each, layout, initial, intervals)
+            blocks.append(matrix)
+            limits.append(to)
+        return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
+
+    def _of_chain(self, each: Lived, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
+        assert each.node.lifetime is not None and each.node.lifetime.chain is not None
+        during = each.rate[intervals.start : intervals.stop]
+        key = (each.node.id, during.tobytes(), layout.pieces)
+        if key not in self._known:
+            chain = each.node.lifetime.chain
+            self._known[key] = Kernel(chain, np.repeat(during, layout.pieces), layout.length, layout.degree)
+        kernel = self._known[key]
+        known = (kernel.known @ initial[each.rows]).ravel()
+        leaving, entering = _columns(each, layout, len(intervals))
+        out = _picked(leaving[:, None], layout.size * len(intervals))
+        into = _picked(entering, layout.size * len(intervals))
+        count = len(leaving)
+        low, high = (sparse.csr_array(bound.reshape(count, count)) for bound in (kernel.low, kernel.high))
+        return sparse.vstack([out - high @ into, low @ into - out], format="csr"), np.concatenate([known, -known])
+
+    def _of_line(self, each: Lived, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
+        slots = each.slots(initial)
+        steps, moments, delay = len(intervals), len(layout.moments), len(slots)
+        leaving, entering = _columns(each, layout, steps)
+        known = np.zeros((steps, moments))
+        known[:delay] = slots[:steps, None] / self.network.episode.control_interval
+        out = _picked(leaving[:, None], layout.size * steps)
+        into = _picked(entering, layout.size * steps)
+        shifted = sparse.eye_array(steps, k=-delay) if delay < steps else sparse.csr_array((steps, steps))
+        earlier = sparse.kron(shifted, np.full((moments, moments), 1.0 / moments))
+        matrix = out - sparse.csr_array(earlier) @ into
+        return sparse.vstack([matrix, -matrix], format="csr"), np.concatenate([known.ravel(), -known.ravel()])
+
+
+def _columns(each: Lived, layout: Layout, steps: int) -> tuple[Integers, Integers]:
+    """Return the columns of what leaves, shape (moments of all,), and of what enters, shape (moments of all, arcs)."""
+    moments = np.array([layout.flow(moment) for moment in layout.moments])
+    first = (layout.size * np.arange(steps)[:, None] + moments).ravel()
+    return first + each.leaving, first[:, None] + each.entering
+
+
+def _picked(columns: Integers, width: int) -> Any:
+    """Return the matrix that adds up columns, of shape (rows, some)."""
+    rows = np.repeat(np.arange(len(columns)), columns.shape[1])
+    return sparse.csr_array((np.ones(columns.size), (rows, columns.ravel())), shape=(len(columns), width))
+
+
+def _sums(given: Network, wanted: Network) -> Any:
+    """Return what the nodes of one writing of a network are of those of another that is written out further."""
+    stages = given.stages if isinstance(given, StagedNetwork) else {}
+    whole = wanted.stages if isinstance(wanted, StagedNetwork) else {}
+    found = sparse.lil_array((len(wanted.nodes), len(given.nodes)))
+    for i, node in enumerate(wanted.nodes):
+        for part in stages[node.id] if len(whole.get(node.id, ())) == 1 else (node.id,):
+            found[i, given.node_index[part]] = 1.0
+    return sparse.csr_array(found)
+
+
+class Kernel:
+    """What leaves a chain in pieces of equal length, of what is there and of what enters.
+
+    Attributes:
+        known: of what is there in each stage, shape (pieces, d + 1, stages), 1/time.
+        low: c̲ of each piece and moment, by those of what enters, shape (pieces, d + 1, pieces, d + 1).
+        high: c̄, likewise; both with w_0.
+    """
+
+    def __init__(self, chain: Chain, rate: Floats, length: float, degree: int) -> None:
+        """Compute it for a rate μ in each piece, shape (pieces,), 1/time."""
+        pieces, stages, moments = len(rate), chain.stages, degree + 1
+        shape = (pieces, moments, pieces, moments)
+        self.known, self.low, self.high = np.zeros((pieces, moments, stages)), np.zeros(shape), np.zeros(shape)
+        unit = chain.matrix / chain.rate
+        motions = {each: _Motion(unit, each * length, chain.entering, degree) for each in np.unique(rate).tolist()}
+        parts = [motions[each] for each in rate.tolist()]
+        gathered, passed = np.empty((0, moments, stages)), np.eye(stages)
+        for p, motion in enumerate(parts):
+            self.known[p] = motion.left @ passed / length
+            passed = motion.whole @ passed
+        for q in reversed(range(pieces)):
+            # of what is there at the end of piece q, what leaves in each later one
+            if q + 1 < pieces:
+                gathered = np.concatenate([parts[q + 1].left[None], gathered @ parts[q + 1].whole])
+            for target, (low, high) in (
+                (slice(q, q + 1), parts[q].own),
+                (slice(q + 1, pieces), parts[q].later.enclosed(gathered.reshape(-1, stages) / moments)),
+            ):
+                self.low[target, :, q], self.high[target, :, q] = (
+                    each.reshape(-1, moments, moments) for each in (low, high)
+                )
+        at_once = chain.weights[0] * np.eye(pieces * moments).reshape(shape)
+        self.low += at_once
+        self.high += at_once
+
+
+class _Motion:
+    """The motion of stages in a piece in which they have passed on μδ times what they hold.
+
+    Attributes:
+        whole: e^(Aδ), shape (stages, stages).
+        left: what leaves, weighted with B_i and times (d + 1), of what is there at its start, shape (d + 1, stages).
+        later: of what enters in the piece, where it is at its end.
+        own: enclosure of what leaves in the piece of what enters in it, shape (d + 1, d + 1) each.
+    """
+
+    def __init__(self, unit: Floats, turnover: float, entering: Floats, degree: int) -> None:
+        stages, matrix = len(unit), unit * turnover
+        means, self.whole = weighted(matrix, degree)
+        self.left = turnover * means[:, -1]
+        self.later = _Smooth(matrix, entering[:, None], degree)
+        # y' = A y + E ψ_0, ψ_l' = ψ_(l+1): with ψ_0 the polynomial, read from the end of the piece
+        chained = np.zeros((stages + degree + 1,) * 2)
+        chained[:stages, :stages], chained[:stages, stages] = matrix, entering
+        chained[stages:, stages:] = np.eye(degree + 1, k=1)
+        start = np.zeros((stages + degree + 1, degree + 1))
+        start[stages:] = np.stack([_derivatives(degree, degree - i) for i in range(degree + 1)], axis=1)
+        last = np.zeros((1, stages + degree + 1))
+        last[0, stages - 1] = turnover
+        low, high = _Smooth(chained, start, degree).enclosed(last)
+        self.own = low, high
+
+
+class _Smooth:
+    """f(τ) = v e^(M(1 − τ)) z on [0, 1], for many v and z."""
+
+    def __init__(self, matrix: Floats, start: Floats, degree: int) -> None:
+        """Expand e^(Mσ) z for the columns z of ``start``."""
+        self._degree, self._columns = degree, start.shape[1]
+        count = max(1, math.ceil(float(np.abs(matrix).sum(axis=0).max(initial=0.0)) / 2))
+        nodes = (1 - np.cos(np.pi * (2 * np.arange(degree + 1) + 1) / (2 * degree + 2))) / 2
+        bernstein = np.stack([_polynomial(degree, j, nodes) for j in range(degree + 1)], axis=1)
+        values = np.stack([expm(matrix * node) @ start for node in nodes], axis=2)
+        self._near = values @ np.linalg.inv(bernstein).T  # coefficients of B_j(σ) that interpolate, shape (n, z, d + 1)
+        step, at = expm(matrix / count), start
+        found = []
+        for part in range(count):
+            term, powers = at, []
+            for m in range(TERMS + 1):
+                powers.append(term)
+                term = matrix @ term / (count * (m + 1))
+            found.append(np.stack(powers, axis=2) @ _to_bernstein(TERMS) - self._near @ _within(degree, part, count))
+            at = step @ at
+        self._rest = np.concatenate(found, axis=2)
+
+    def enclosed(self, rows: Floats) -> tuple[Floats, Floats]:
+        """Return the coefficients of B_j(τ) below and above f, shape (v, z, d + 1) each."""
+        near = np.einsum("vn,nzj->vzj", rows, self._near, optimize=True)
+        rest = np.einsum("vn,nzj->vzj", rows, self._rest, optimize=True)
+        margin = MARGIN * np.abs(near).max(axis=2, initial=0.0, keepdims=True)
+        low = near + rest.min(axis=2, initial=0.0, keepdims=True) - margin
+        high = near + rest.max(axis=2, initial=0.0, keepdims=True) + margin
+        return low[:, :, ::-1], high[:, :, ::-1]
+
+
+def weighted(matrix: Floats, degree: int, length: float = 1.0) -> tuple[Floats, Floats]:
+    """Return the means of e^{Ms} under B_0 … B_d, and e^{Mδ}, shape (d + 1, n, n) and (n, n).
+
+    The first row of exp of the blocks [[M, I, 0, …], [0, 0, I, …], …]·δ has e^{Mδ}, then, for m = 0 … d, the integrals
+    of e^{Ms}(δ − s)^m/m! (Van Loan 1978); B_i is a sum of powers of 1 − s/δ.
+    """
+    n = len(matrix)
+    blocks = np.kron(np.eye(degree + 2, k=1), np.eye(n))
+    blocks[:n, :n] = matrix
+    first = expm(blocks * length)[:n].reshape(n, degree + 2, n).transpose(1, 0, 2)
+    powers = [first[m + 1] * math.factorial(m) / length**m for m in range(degree + 1)]
+    means = [
+        sum(math.comb(i, j) * (-1) ** j * powers[degree - i + j] for j in range(i + 1))
+        * (math.comb(degree, i) * (degree + 1) / length)
+        for i in range(degree + 1)
+    ]
+    return np.array(means), first[0]
+
+
+def _polynomial(degree: int, j: int, at: Floats) -> Floats:
+    return math.comb(degree, j) * at**j * (1 - at) ** (degree - j)
+
+
+def _derivatives(degree: int, j: int) -> Floats:
+    """Return the derivatives of B_j at 0, of order 0 … d."""
+    power = np.polynomial.polynomial.polypow([1.0, -1.0], degree - j)
+    coefficients = np.concatenate([np.zeros(j), math.comb(degree, j) * power])
+    found: Floats = coefficients * np.array([math.factorial(order) for order in range(degree + 1)])
+    return found
+
+
+def _to_bernstein(degree: int) -> Floats:
+    """Return what turns coefficients of powers into those of B_j, shape (d + 1, d + 1)."""
+    return np.array(
+        [
+            [math.comb(j, m) / math.comb(degree, m) if m <= j else 0.0 for j in range(degree + 1)]
+            for m in range(degree + 1)
+        ]
+    )
+
+
+def _within(degree: int, part: int, count: int) -> Floats:
+    """Return what turns coefficients of B_j on [0, 1] into those of degree ``TERMS`` on one of equal parts of it."""
+    found = np.zeros((degree + 1, TERMS + 1))
+    inside = np.polynomial.Polynomial([part / count, 1 / count])
+    for j in range(degree + 1):
+        powers = np.polynomial.Polynomial(_derivatives(degree, j) / [math.factorial(m) for m in range(degree + 1)])
+        found[j, : degree + 1] = np.resize(np.append(powers(inside).coef, np.zeros(degree + 1)), degree + 1)
+    return found @ _to_bernstein(TERMS)

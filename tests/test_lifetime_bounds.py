@@ -1,0 +1,134 @@
+"""Bounds of networks with lifetimes: kernels against fine simulation, rows and boxes of episodes, plans that hold."""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from test_lifetimes import INFLOW, LIVES, town
+
+from benchmarks.products import product_cycle
+from cirl_marl import Series, VectorEnv
+from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.network.elements import Lifetime
+from cirl_marl.network.lifetimes import chain_of
+from cirl_marl.optimum import achieved, bound, envelope, improved
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.bounds import by_stage
+from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.vintages import Kernel
+
+Floats = NDArray[np.floating]
+FINE = 300
+
+
+def weighted(values: Floats, degree: int) -> Floats:
+    """Return the means of values, shape (pieces, FINE), in the middle of fine steps, under B_0 … B_d."""
+    time = (np.arange(FINE) + 0.5) / FINE
+    weights = np.array([comb(degree, i) * time**i * (1 - time) ** (degree - i) for i in range(degree + 1)])
+    means: Floats = (degree + 1) * values @ weights.T / FINE
+    return means
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("distribution", "deviation", "mean"),
+    [("normal", 0.3, 25.0), ("weibull", 0.4, 4.0), ("lognormal", 0.5, 1.5), ("exponential", 1.0, 0.4)],
+)
+def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: float, degree: int) -> None:
+    """Of an inflow that jumps within pieces, from any stages, at rates that change; close where pieces are short."""
+    chain, pieces, rng = chain_of(distribution, deviation), 6, np.random.default_rng(degree)
+    rate = chain.rate / mean * np.repeat(rng.uniform(0.8, 1.2, 3), 2)
+    kernel = Kernel(chain, rate, 1.0, degree)
+    inflow = rng.uniform(0, 1, (pieces, 20)).repeat(FINE // 20, axis=1)
+    stages = start = rng.random(chain.stages)
+    leaving = np.empty((pieces, FINE))
+    for p in range(pieces):
+        size = chain.stages
+        system = np.zeros((size + 1, size + 1))
+        system[:size, :size], system[:size, size] = chain.matrix * rate[p] / chain.rate, chain.entering
+        half, whole = expm(system / FINE / 2), expm(system / FINE)
+        for k in range(FINE):
+            middle = half[:size, :size] @ stages + half[:size, size] * inflow[p, k]
+            leaving[p, k] = rate[p] * middle[-1] + chain.weights[0] * inflow[p, k]
+            stages = whole[:size, :size] @ stages + whole[:size, size] * inflow[p, k]
+    entered, left = weighted(inflow, degree), weighted(leaving, degree)
+    known = kernel.known @ start
+    low, high = (known + np.einsum("piqj,qj->pi", each, entered) for each in (kernel.low, kernel.high))
+    rounding = 1e-4 * left.max()  # of the fine steps
+    assert (low <= left + rounding).all() and (left <= high + rounding).all()
+    if mean > 20:
+        assert (high - low).max() < (2e-3 if degree == 1 else 2e-4) * left.max()
+
+
+@pytest.mark.parametrize("stretch", [1.0, Series(times=(0.0, 3.0), values=(0.8, 1.4))])
+@pytest.mark.parametrize("lifetime", [LIVES[0], LIVES[2], Lifetime(mean=0.6, deviation=0.3, distribution="weibull")])
+def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | Series) -> None:
+    """Those of what leaves, with the moments of an episode that is simulated in short steps."""
+    years = 6
+    network = town(lifetime, INFLOW[:years], initial=30.0, growth=0.02, stretch=stretch)
+    programs = Programs(Admissible.of(network), 2, None)
+    lifetimes, layout = programs.admissible.lifetimes, programs.layout
+    start = by_stage(network, network.initial[1])
+    problem = programs.program(start)
+    matrix, to = lifetimes.rows(layout, start, range(years))
+    steps = layout.pieces * FINE
+    short = network.with_options(episode={"control_interval": 1.0 / steps, "horizon": years * steps})
+    run = rollout(VectorEnv(short, num_envs=1), Neutral())
+    left = weighted(run.flow[:, network.arc_index["discard"]].reshape(-1, FINE), 2).reshape(years, -1)
+    (each,) = lifetimes.lived
+    values = np.zeros((years, layout.size))
+    for i, moment in enumerate(layout.moments):
+        values[:, layout.flow(moment) + each.leaving] = left[:, i]
+        values[:, layout.flow(moment) + each.entering[0]] = INFLOW[:years]
+        columns = layout.size * np.arange(years) + layout.flow(moment) + each.leaving
+        assert (left[:, i] <= problem.high[columns] * (1 + 1e-6)).all()
+    assert (matrix @ values.ravel() <= to + 1e-5 * left.max()).all()
+    # and they leave little room
+    room = (to - matrix @ values.ravel()).max()
+    assert room < 1e-2 * left.max()
+
+
+def test_a_delay_is_exact() -> None:
+    """What comes out of a fixed lifetime is known, or entered before: nothing is left open."""
+    network = town(LIVES[1], INFLOW[:20], initial=60.0, growth=0.03)
+    found = bound(network)
+    run = achieved(found)
+    assert found.objective == pytest.approx(run.episode_circularity[0], rel=1e-9)
+    np.testing.assert_allclose(found.stock[1:], run.stock, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.medium
+def test_a_cycle_of_four_products_is_planned() -> None:
+    """Within one per cent of the bound at the demanded service; from other starts too, and by MPC as well."""
+    network = product_cycle(10)
+    found = bound(network, min_service=0.95)
+    assert found.verify().bound == found.objective
+    run = achieved(improved(found))
+    assert run.episode_levels[0].min() >= 0.95 - 1e-4
+    assert 0.0 <= found.gap(run.episode_circularity)[0] < 0.01
+    starts = network.initial[1] * np.array([[0.97], [1.0]])
+    together = envelope(network, starts, min_service=0.95, solves=2)
+    solved = [bound(network, start, min_service=0.95).objective for start in starts]
+    assert (together.at(starts) >= np.array(solved) - 1e-6).all()
+    controlled = rollout(VectorEnv(network, num_envs=1), MPC(min_service=0.95))
+    assert controlled.episode_levels[0].min() >= 0.94
+    assert 0.0 <= found.gap(controlled.episode_circularity)[0] < 0.05
+
+
+@pytest.mark.slow
+def test_prolonged_lifetimes_are_planned_below_the_bound() -> None:
+    """By stages; agents who prolong lives do better than those who cannot."""
+    network = product_cycle(6, controlled=True)
+    found, without = bound(network, min_service=0.9), bound(product_cycle(6), min_service=0.9)
+    run = achieved(improved(found))
+    assert run.episode_levels[0].min() >= 0.9 - 1e-4
+    assert without.objective < float(run.episode_circularity[0]) <= found.objective
+    assert found.gap(run.episode_circularity)[0] < 0.1
+    place = list(network.agents).index("cars")
+    assert found.actions[:, place].max() > -0.2  # above the neutral stretch, which is no stretch
