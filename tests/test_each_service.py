@@ -24,7 +24,7 @@ from cirl_marl import (
     VectorEnv,
     load_network,
 )
-from cirl_marl.cli.networks import simulate
+from cirl_marl.cli.episodes import simulate
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import write_network
