@@ -250,7 +250,7 @@ def test_a_simulation_says_the_level_of_each(
     """Beside the mean, which hides the one that starves."""
     monkeypatch.chdir(tmp_path)
     write_network(town(cars=0.0), Path("town.toml"))
-    simulate("town.toml", set_=[], control="neutral")
+    simulate("town.toml", set_=[], control=["neutral"])
     printed = " ".join(capsys.readouterr().out.split())
     run = rollout(VectorEnv("town.toml", num_envs=1), Neutral())
     mobility, housing = run.episode_levels[0]

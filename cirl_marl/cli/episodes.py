@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cirl_marl.cli.common import MinService, NetworkName, Scenario, StartSeed, app, bar, console, say, stem
+from cirl_marl.cli.common import MinService, NetworkName, Scenario, StartSeed, app, bar, console, folder_for, say, stem
 from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Watched
-from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, rollout
+from cirl_marl.controllers.rollout import Beginning, Rollout
 from cirl_marl.controllers.shortages import shortages
 from cirl_marl.definitions.catalogue import file_and_region, networks
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
+from cirl_marl.evaluation.alternatives import Alternative, alternatives, compared_quantities
 from cirl_marl.evaluation.figures import time_window
 from cirl_marl.network import Network
 from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
@@ -23,7 +25,10 @@ from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
 @app.command()
 def simulate(
     network: NetworkName,
-    control: Annotated[str, typer.Option(help=f"Who acts: {', '.join(CONTROLLERS)}.")] = "neutral",
+    control: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Who acts: {', '.join(CONTROLLERS)}; repeat it to compare several; default: neutral."),
+    ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -32,25 +37,65 @@ def simulate(
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Control intervals; default: the horizon.")] = None,
     seed: StartSeed = None,
-    scenario: Scenario = None,
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(help="Scenario of the definition; repeat it to compare several; default: the physical one."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
 ) -> None:
     """Simulate a network under a controller without learning; write a CSV and a picture.
 
     Flows, and λ beside them in the picture, are means over each interval; the CSV has λ at its end as well.
+
+    Several scenarios or controllers, or every pair of both, start from the same seed and are compared.
+    There is a CSV of each, one picture of all, and a table of the differences to the first.
     """
+    controls = control or ["neutral"]
+    held, folder = _held(controls, set_ or []), folder_for(out or Path(), "--out")
+    with bar("simulating") as progress:
+        found = alternatives(
+            network,
+            scenarios=scenario or [None],
+            controls=controls,
+            held=held,
+            steps=steps,
+            seed=seed,
+            progress=progress,
+        )
+    files = {stem(each.network, each.control): each for each in found}
+    if len(found) == 1:
+        _write_one(folder, files)
+    else:
+        _write_several(folder, files)
+
+
+def _write_one(folder: Path, files: Mapping[str, Alternative]) -> None:
     from cirl_marl.report.trajectory import write_trajectory
 
-    controller = named_controller(control, held=_held(control, set_ or []))
-    env = VectorEnv(network, num_envs=1, scenario=scenario, horizon=steps)
-    found, begun = env.network, beginning(env, seed)
-    with bar("simulating") as progress:
-        watched = Watched(controller, progress)
-        run = rollout(env, watched, seed=begun.seed, start=begun.given, progress=watched.acted)
-    title = f"{found.title or found.name}, {control} control"
-    written = write_trajectory(out or Path(), stem(found, control), env, begun, run, title)
-    _say_figures(run, found, begun)
+    ((name, only),) = files.items()
+    title = f"{only.network.title or only.network.name}, {only.control} control"
+    written = write_trajectory(folder, name, only.env, only.begun, only.rollout, title)
+    _say_figures(only.rollout, only.network, only.begun)
     say(f"wrote {' and '.join(map(str, written))}")
+
+
+def _write_several(folder: Path, files: Mapping[str, Alternative]) -> None:
+    """Write and say what became of alternatives, and what differs between them."""
+    from cirl_marl.report.alternatives import ROWS, differences_table, write_alternatives
+
+    found = list(files.values())
+    network, quantities = found[0].network, compared_quantities(found)
+    controls = list(dict.fromkeys(each.control for each in found))
+    title = f"{network.name}, {controls[0]} control" if len(controls) == 1 else network.name
+    written = write_alternatives(folder, f"{network.name}_differences", files, quantities, title=title)
+    for each in found:
+        _say_figures(each.rollout, each.network, each.begun, f"{each.name}: ")
+    if differing := [each for each in quantities if each.rank > 0]:
+        console.print(differences_table(found, differing))
+    more = f", of which {ROWS} are shown" if len(differing) > ROWS else ""
+    say(f"{len(differing)} of {len(quantities)} quantities differ{more}; all are in {written[-2]}")
+    for path in written:
+        say(f"wrote {path}")
 
 
 @app.command()
@@ -111,27 +156,27 @@ def _actor(
     return run.make_env(1), Trained(run)
 
 
-def _say_figures(run: Rollout, network: Network, begun: Beginning) -> None:
-    """Say where an episode began, what came of it, and which flows were less than was asked for."""
-    say(f"start: {begun.said}")
+def _say_figures(run: Rollout, network: Network, begun: Beginning, who: str = "") -> None:
+    """Say where an episode began, what came of it, and which flows were less than was asked for; ``who`` goes first."""
+    say(f"{who}start: {begun.said}")
     figures = [
         f"λ̄ = {float(run.episode_circularity[0]):.5g} {network.mass_unit}",
         f"service level {float(run.episode_service[0]):.4f}",
     ]
     if network.objective.criticality is not None:
         figures.append(f"time-window circularity {float(time_window(network, run)[0]):.5g} {network.mass_unit}")
-    console.print(", ".join(figures))
+    console.print(who + ", ".join(figures))
     if len(network.services) > 1:
         each = zip(network.services, run.episode_levels[0].tolist(), strict=True)
-        say(f"service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in each)}")
+        say(f"{who}service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in each)}")
     for short in shortages(run, network):
-        say(short.said)
+        say(f"{who}{short.said}")
 
 
-def _held(control: str, settings: list[str]) -> dict[str, float]:
+def _held(controls: Sequence[str], settings: list[str]) -> dict[str, float]:
     """Return the values of --set by agent."""
-    if settings and control not in SETTABLE:
-        raise CirlError(f"--set goes with --control constant or scripted, not with {control}")
+    if settings and not set(controls) & set(SETTABLE):
+        raise CirlError(f"--set goes with --control constant or scripted, not with {', '.join(controls)}")
     held = {}
     for setting in settings:
         agent, _, value = setting.partition("=")
