@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from series_definition import column, definition, written
 
 from cirl_marl import Episode, Network, NetworkError, Node, load_network, parallel_env, vector_env
-from cirl_marl.cli.networks import plan, simulate
+from cirl_marl.cli.episodes import plan, simulate
 from cirl_marl.network.calendar import When, elapsed, labels, year, years
 from cirl_marl.report import curves
 

@@ -24,7 +24,7 @@ from cirl_marl import (
     VectorEnv,
     load_network,
 )
-from cirl_marl.cli.networks import simulate
+from cirl_marl.cli.episodes import simulate
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import write_network
@@ -250,7 +250,7 @@ def test_a_simulation_says_the_level_of_each(
     """Beside the mean, which hides the one that starves."""
     monkeypatch.chdir(tmp_path)
     write_network(town(cars=0.0), Path("town.toml"))
-    simulate("town.toml", set_=[], control="neutral")
+    simulate("town.toml", set_=[], control=["neutral"])
     printed = " ".join(capsys.readouterr().out.split())
     run = rollout(VectorEnv("town.toml", num_envs=1), Neutral())
     mobility, housing = run.episode_levels[0]

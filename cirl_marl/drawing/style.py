@@ -10,7 +10,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from cirl_marl.errors import CirlError
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import write_atomically
 
@@ -80,6 +81,19 @@ def dressed(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9.0)
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color(NEUTRAL)
+
+
+def dated(time: Floats, network: Network) -> Floats:
+    """Return times as axes show them: as calendar years, if the network has a start."""
+    return time if network.episode.start is None else years(network, time)
+
+
+def time_axis(axes: Axes, time: Floats, network: Network) -> None:
+    """Let the horizontal axis span ``time``, given as ``dated`` returns it, and name it."""
+    axes.set_xlabel("year" if network.episode.start is not None else f"time / {network.time_unit}", fontsize=9)
+    axes.ticklabel_format(axis="x", useOffset=False)  # 2000, not 0 with +2e3 in a corner
+    if len(time) > 1:
+        axes.set_xlim(float(np.min(time)), float(np.max(time)))
 
 
 def save(figure: Figure, path: str | Path) -> Path:

@@ -12,10 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
-from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dressed, save, shaped, spoken
+from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dated, dressed, save, shaped, spoken, time_axis
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import Law
 
 if TYPE_CHECKING:
@@ -50,7 +49,7 @@ def save_circularity(
     ``runs`` are means of λ over the intervals, mass, and ``services`` service levels by control, of shape
     (episodes, steps), ``time`` the ends of the intervals, (steps,); other shapes raise a ``CirlError``.
     """
-    time = _shown(time - network.episode.control_interval / 2, network)
+    time = dated(time - network.episode.control_interval / 2, network)
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
     names = list(dict.fromkeys([*runs, *services]))
@@ -61,7 +60,7 @@ def save_circularity(
     dressed(above, title=title, ylabel=f"λ / {network.mass_unit}")
     dressed(below, title="Service level", ylabel="service level")
     below.set_ylim(-0.03, 1.06)
-    _set_time(below, time, network)
+    time_axis(below, time, network)
     if names:
         lines, labels = (above if runs else below).get_legend_handles_labels()
         figure.legend(lines, labels, loc="outside upper right", ncols=4, frameon=False, fontsize=9)
@@ -137,10 +136,10 @@ def save_trajectory(
         held += [f"on {arc}" for arc in on_the_way]
         stock = np.concatenate([stock, shaped("load", load, (len(on_the_way), *steps))])
     # what is a mean over an interval stands in its middle, a stock at its end
-    middle, held_at = (_shown(each, network) for each in (time - network.episode.control_interval / 2, time))
+    middle, held_at = (dated(each, network) for each in (time - network.episode.control_interval / 2, time))
     if start is not None:
         stock = np.column_stack([shaped("start", start, (len(stock),)), stock])
-        held_at = np.concatenate([_shown(np.zeros(1), network), held_at])
+        held_at = np.concatenate([dated(np.zeros(1), network), held_at])
     heights = (1.25, 1.25, 0.8) if service is None else (1.25, 1.25, 0.8, 0.5)
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
     figure.suptitle(title, fontsize=11, fontweight="bold")
@@ -155,7 +154,7 @@ def save_trajectory(
         _draw_mean(panels[3], middle, shaped("service", service, steps), "", 0)
         dressed(panels[3], title="Service level", ylabel="service level")
         panels[3].set_ylim(-0.03, 1.06)
-    _set_time(panels[-1], held_at, network)
+    time_axis(panels[-1], held_at, network)
     return save(figure, path)
 
 
@@ -202,18 +201,6 @@ def _matching(name: str, values: Floats, time: Floats) -> Floats:
 def _dots(time: Floats) -> str:
     """A single point makes no line: mark it."""
     return "o" if len(time) == 1 else ""
-
-
-def _shown(time: Floats, network: Network) -> Floats:
-    """Return times as axes show them: as calendar years, if the network has a start."""
-    return time if network.episode.start is None else years(network, time)
-
-
-def _set_time(axes: Axes, time: Floats, network: Network) -> None:
-    axes.set_xlabel("year" if network.episode.start is not None else f"time / {network.time_unit}", fontsize=9)
-    axes.ticklabel_format(axis="x", useOffset=False)  # 2000, not 0 with +2e3 in a corner
-    if len(time) > 1:
-        axes.set_xlim(float(np.min(time)), float(np.max(time)))
 
 
 def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, top: float = math.inf) -> None:

@@ -16,38 +16,48 @@ from cirl_marl.report.curves import save_trajectory
 def write_trajectory(folder: Path, name: str, env: VectorEnv, begun: Beginning, run: Rollout, title: str) -> list[Path]:
     """Write ``name.csv`` and ``name.png`` of what ``run`` did in ``env`` from where it began; return their paths.
 
-    The table has a row for the start and one for the end of each interval: year or date at the end, if the network has
-    a start on the calendar, λ at the end and the mean of λ, the service level, stocks at the end, mean flows, what
-    passes through nodes without stock, masses on the way and inner states that an agent may see. The picture shows λ as
-    a mean, as it does the flows. ``env`` is left at the start of the episode.
+    The first holds what ``trajectory_table`` returns. The picture shows λ as a mean, as it does the flows. ``env`` is
+    left at the start of the episode.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    begun.reset(env)
-    start, batches, time = env.physical, env.dynamics.batches, interval_ends(env.network)
-    stock, load = env.rows.stocks(start.stock)[:, 0], batches.loads(start.stock)[:, 0]
-    inner = start.inner[env.dynamics.inner.visible, 0]
-    lambdas, moved = (run.circularity[0], run.circularity_mean[0]), (*run.flow.T, *env.network.throughput(run.flow.T))
-    columns = (*lambdas, run.service[0], *run.stock.T, *moved, *run.load.T, *run.inner.T)
-    first = [*[None] * 3, *stock.tolist(), *[None] * len(moved), *load.tolist(), *inner.tolist()]
-    times = np.concatenate([[0.0], time])
-    clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
-    measured = [first, *zip(*(column.tolist() for column in columns), strict=True)]
-    rows = [[*at, *values] for at, values in zip(clock, measured, strict=True)]
     table, picture = folder / f"{name}.csv", folder / f"{name}.png"
-    write_atomically(table, lambda partial: write_table(partial, _header(env), rows))
+    header, rows = trajectory_table(env, begun, run)
+    write_atomically(table, lambda partial: write_table(partial, header, rows))
+    start = env.physical.stock
     save_trajectory(
         picture,
         env.network,
-        time,
+        interval_ends(env.network),
         run.stock.T,
         run.flow.T,
         run.circularity_mean[0],
-        start=np.concatenate([stock, load]),
+        start=np.concatenate([env.rows.stocks(start)[:, 0], env.dynamics.batches.loads(start)[:, 0]]),
         load=run.load.T,
         service=run.service[0] if env.network.services else None,
         title=title,
     )
     return [table, picture]
+
+
+def trajectory_table(env: VectorEnv, begun: Beginning, run: Rollout) -> tuple[list[str], list[list[object]]]:
+    """Return header and rows of what ``run`` did in ``env`` from where it began.
+
+    There is a row for the start and one for the end of each interval: year or date at the end, if the network has a
+    start on the calendar, λ at the end and the mean of λ, the service level, stocks at the end, mean flows, what passes
+    through nodes without stock, masses on the way and inner states that an agent may see. ``env`` is left at the start
+    of the episode.
+    """
+    begun.reset(env)
+    start = env.physical
+    stock, load = env.rows.stocks(start.stock)[:, 0], env.dynamics.batches.loads(start.stock)[:, 0]
+    inner = start.inner[env.dynamics.inner.visible, 0]
+    lambdas, moved = (run.circularity[0], run.circularity_mean[0]), (*run.flow.T, *env.network.throughput(run.flow.T))
+    columns = (*lambdas, run.service[0], *run.stock.T, *moved, *run.load.T, *run.inner.T)
+    first = [*[None] * 3, *stock.tolist(), *[None] * len(moved), *load.tolist(), *inner.tolist()]
+    times = np.concatenate([[0.0], interval_ends(env.network)])
+    clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
+    measured = [first, *zip(*(column.tolist() for column in columns), strict=True)]
+    return _header(env), [[*at, *values] for at, values in zip(clock, measured, strict=True)]
 
 
 def _header(env: VectorEnv) -> list[str]:

@@ -1,0 +1,187 @@
+"""``cirl simulate | plan``: what a controller or policy does in one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cirl_marl.cli.common import MinService, NetworkName, Scenario, StartSeed, app, bar, console, folder_for, say, stem
+from cirl_marl.controllers import Controller
+from cirl_marl.controllers.basic import Watched
+from cirl_marl.controllers.rollout import Beginning, Rollout
+from cirl_marl.controllers.shortages import shortages
+from cirl_marl.definitions.catalogue import file_and_region, networks
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError
+from cirl_marl.evaluation.alternatives import Alternative, alternatives, compared_quantities
+from cirl_marl.evaluation.figures import time_window
+from cirl_marl.network import Network
+from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
+
+
+@app.command()
+def simulate(
+    network: NetworkName,
+    control: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Who acts: {', '.join(CONTROLLERS)}; repeat it to compare several; default: neutral."),
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="AGENT=VALUE in [-1, 1], held constant under --control constant or scripted; repeatable."
+        ),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Control intervals; default: the horizon.")] = None,
+    seed: StartSeed = None,
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(help="Scenario of the definition; repeat it to compare several; default: the physical one."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
+) -> None:
+    """Simulate a network under a controller without learning; write a CSV and a picture.
+
+    Flows, and λ beside them in the picture, are means over each interval; the CSV has λ at its end as well.
+
+    Several scenarios or controllers, or every pair of both, start from the same seed and are compared.
+    There is a CSV of each, one picture of all, and a table of the differences to the first.
+    """
+    controls = control or ["neutral"]
+    held, folder = _held(controls, set_ or []), folder_for(out or Path(), "--out")
+    with bar("simulating") as progress:
+        found = alternatives(
+            network,
+            scenarios=scenario or [None],
+            controls=controls,
+            held=held,
+            steps=steps,
+            seed=seed,
+            progress=progress,
+        )
+    files = {stem(each.network, each.control): each for each in found}
+    if len(found) == 1:
+        _write_one(folder, files)
+    else:
+        _write_several(folder, files)
+
+
+def _write_one(folder: Path, files: Mapping[str, Alternative]) -> None:
+    from cirl_marl.report.trajectory import write_trajectory
+
+    ((name, only),) = files.items()
+    title = f"{only.network.title or only.network.name}, {only.control} control"
+    written = write_trajectory(folder, name, only.env, only.begun, only.rollout, title)
+    _say_figures(only.rollout, only.network, only.begun)
+    say(f"wrote {' and '.join(map(str, written))}")
+
+
+def _write_several(folder: Path, files: Mapping[str, Alternative]) -> None:
+    """Write and say what became of alternatives, and what differs between them."""
+    from cirl_marl.report.alternatives import ROWS, differences_table, write_alternatives
+
+    found = list(files.values())
+    network, quantities = found[0].network, compared_quantities(found)
+    controls = list(dict.fromkeys(each.control for each in found))
+    title = f"{network.name}, {controls[0]} control" if len(controls) == 1 else network.name
+    written = write_alternatives(folder, f"{network.name}_differences", files, quantities, title=title)
+    for each in found:
+        _say_figures(each.rollout, each.network, each.begun, f"{each.name}: ")
+    if differing := [each for each in quantities if each.rank > 0]:
+        console.print(differences_table(found, differing))
+    more = f", of which {ROWS} are shown" if len(differing) > ROWS else ""
+    say(f"{len(differing)} of {len(quantities)} quantities differ{more}; all are in {written[-2]}")
+    for path in written:
+        say(f"wrote {path}")
+
+
+@app.command()
+def plan(
+    source: Annotated[
+        str, typer.Argument(metavar="RUN | NETWORK", help="Training run; or with --control a network, as elsewhere.")
+    ],
+    control: Annotated[
+        str | None, typer.Option(help=f"Who acts in a network: {', '.join(CONTROLLERS)}; a run acts by its policies.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="CSV file to write; default: plan_NETWORK[_SCENARIO]_CONTROL or plan_RUN."),
+    ] = None,
+    scenario: Scenario = None,
+    seed: StartSeed = None,
+    min_service: MinService = None,
+) -> None:
+    """Write what a policy or controller does in one episode: its actions in physical units over time, as CSV.
+
+    A row is a control interval: when it begins and ends (if the network has a start on the calendar with the year or
+    date on which it begins), the value of every control (a flow ordered, a factor on what a valve lets through, or an
+    input of a model) with its unit, the resulting flows, circularity and service level.
+    """
+    from cirl_marl.controllers.schedule import schedule
+
+    if out is not None and out.suffix != ".csv":
+        raise CirlError(f"--out {out}: needs the name of a .csv file")
+    env, controller = _actor(source, control, scenario, min_service)
+    who = Path(source).resolve().name if control is None else stem(env.network, control)
+    path = Path(f"plan_{who}.csv") if out is None else out
+    with bar("planning") as progress:
+        watched = Watched(controller, progress)
+        found = schedule(env, watched, seed=seed, progress=watched.acted)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    found.write(path)
+    _say_figures(found.rollout, env.network, found.begun)
+    if controller.note:
+        say(controller.note)
+    say(f"wrote {path}")
+
+
+def _actor(
+    source: str, control: str | None, scenario: str | None, min_service: float | None
+) -> tuple[VectorEnv, Controller]:
+    if control is not None and (Path(source) / "config.json").is_file():
+        raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
+    if control is not None:
+        return VectorEnv(source, num_envs=1, scenario=scenario), named_controller(control, min_service=min_service)
+    if source in networks() or file_and_region(source):
+        raise CirlError(f"plan {source}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
+    if scenario is not None or min_service is not None:
+        raise CirlError("--scenario and --min-service go with --control; a run has its own scenario and policies")
+    from cirl_marl.learners.run import RunDirectory
+    from cirl_marl.learners.trained import Trained
+
+    run = RunDirectory(source)
+    return run.make_env(1), Trained(run)
+
+
+def _say_figures(run: Rollout, network: Network, begun: Beginning, who: str = "") -> None:
+    """Say where an episode began, what came of it, and which flows were less than was asked for; ``who`` goes first."""
+    say(f"{who}start: {begun.said}")
+    figures = [
+        f"λ̄ = {float(run.episode_circularity[0]):.5g} {network.mass_unit}",
+        f"service level {float(run.episode_service[0]):.4f}",
+    ]
+    if network.objective.criticality is not None:
+        figures.append(f"time-window circularity {float(time_window(network, run)[0]):.5g} {network.mass_unit}")
+    console.print(who + ", ".join(figures))
+    if len(network.services) > 1:
+        each = zip(network.services, run.episode_levels[0].tolist(), strict=True)
+        say(f"{who}service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in each)}")
+    for short in shortages(run, network):
+        say(f"{who}{short.said}")
+
+
+def _held(controls: Sequence[str], settings: list[str]) -> dict[str, float]:
+    """Return the values of --set by agent."""
+    if settings and not set(controls) & set(SETTABLE):
+        raise CirlError(f"--set goes with --control constant or scripted, not with {', '.join(controls)}")
+    held = {}
+    for setting in settings:
+        agent, _, value = setting.partition("=")
+        try:
+            held[agent] = float(value)
+        except ValueError:
+            raise CirlError(f"--set {setting}: needs AGENT=VALUE with a number in [-1, 1]") from None
+    return held
