@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -26,11 +27,16 @@ from cirl_marl import (
     VectorEnv,
     load_network,
 )
+from cirl_marl.controllers import Constant, Neutral
+from cirl_marl.controllers.pyramids import pyramids
+from cirl_marl.controllers.remarks import remarks
+from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.network import Network
 from cirl_marl.network.ages import remaining
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.lifetimes import chain_of
+from cirl_marl.report.trajectory import write_trajectory
 
 Floats = NDArray[np.floating]
 YEARS, MEAN = 100, 25.0
@@ -262,6 +268,75 @@ def test_the_error_of_a_chain_is_what_it_says(distribution: str, deviation: floa
 
 
 BUY, DISCARD = town(LIVES[0]).arcs
+
+
+@pytest.mark.parametrize("stretch", [1.0, Series(times=(0.0, 5.0), values=(1.0, 1.5))])
+@pytest.mark.parametrize("lifetime", LIVES)
+def test_ages_are_those_of_cohorts(lifetime: Lifetime, stretch: float | Series) -> None:
+    """Together they are the stock; what enters is young, what is not replaced grows a year older each year."""
+    changing: dict[str, Any] = {} if lifetime.distribution == "fixed" else {"stretch": stretch}
+    history = Series(times=tuple(range(-40, 0)), values=tuple(INFLOW[:40]))
+    network = town(lifetime, np.append(INFLOW[40:60], np.zeros(4)), initial=None, history=history, **changing)
+    env = VectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    start = env.rows.stocks(env.physical.stock)[:, 0].copy()
+    run = rollout(env, Neutral())
+    (found,) = pyramids(network, run, start)
+    place = network.node_index["use"]
+    whole = np.append(start[place], run.stock[:, place])
+    np.testing.assert_allclose(found.mass.sum(axis=1), whole, rtol=2e-4)
+    np.testing.assert_allclose(found.mass[1:21, 0], INFLOW[40:60], rtol=0.1)  # few live for less than a year
+    assert (found.mass[22:, :2] < 1e-9).all()
+    aged = found.mass[21, :-1] - found.mass[22, 1:]
+    assert (aged[:-1] >= -1e-12).all()
+    assert found.mean_age[23] > found.mean_age[20]
+    if lifetime.distribution == "fixed":
+        np.testing.assert_allclose(found.mass[20], INFLOW[59:52:-1])
+
+
+def test_a_stretch_that_agents_set_makes_stocks_older() -> None:
+    """The pyramid follows what they did."""
+    control = Control(kind=ControlKind.STRETCH, low=0.5, neutral=1.0, high=2.0)
+    network = town(LIVES[0], np.full(30, 5.0), initial=45.0, control=control)
+    env, means = VectorEnv(network, num_envs=1), []
+    for action in (-1.0, -1 / 3, 1.0):
+        env.reset(seed=0)
+        start = env.rows.stocks(env.physical.stock)[:, 0].copy()
+        run = rollout(env, Constant({"use": action}))
+        (found,) = pyramids(network, run, start)
+        np.testing.assert_allclose(found.mass.sum(axis=1)[1:], run.stock[:, 1], rtol=1e-3)
+        means.append(found.mean_age[-1])
+    np.testing.assert_allclose(np.array(means) / means[1], [0.5, 1.0, 2.0], rtol=0.1)
+
+
+def test_an_episode_is_written_with_its_ages(tmp_path: Path) -> None:
+    """Mean ages in the table, masses by age in a second one, and a picture."""
+    env = VectorEnv(town(LIVES[0], INFLOW[:5], initial=30.0), num_envs=1)
+    begun = beginning(env)
+    run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    files = write_trajectory(tmp_path, "town", env, begun, run, "a town")
+    assert [path.name for path in files] == ["town.csv", "town.png", "town_ages.csv", "town_ages.png"]
+    with files[0].open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    with files[2].open(newline="") as file:
+        masses = list(csv.DictReader(file))
+    for row in rows:
+        now = [each for each in masses if each["time (year)"] == row["time (year)"]]
+        total = sum(float(each["stock (kt)"]) for each in now)
+        assert total == pytest.approx(float(row["stock of use (kt)"]), rel=1e-3)
+        middles = [(float(each["from the age of (year)"]) + float(each["to the age of (year)"])) / 2 for each in now]
+        weighted = sum(age * float(each["stock (kt)"]) for age, each in zip(middles, now, strict=True))
+        assert weighted / total == pytest.approx(float(row["mean age of use (year)"]), rel=1e-9)
+
+
+def test_narrow_lifetimes_are_remarked_on() -> None:
+    """With the error of their chain; others are not."""
+    narrow = Lifetime(mean=20.0, deviation=1.0, distribution="normal")
+    (said,) = [each for each in remarks(town(narrow, initial=1.0)) if "lifetime" in each]
+    assert narrow.chain is not None and f"within {narrow.chain.error:.1%}" in said and "20 ± 1 year" in said
+    assert not [each for each in remarks(town(LIVES[0], initial=1.0)) if "lifetime" in each]
+
+
 ENDED, LATE = Series(times=(-5.0,), values=(1.0,), until=-2.0), Series(times=(1.0,), values=(1.0,))
 OTHER = Arc(id="other", donor="use", recipient="dump", rate=0.1)
 

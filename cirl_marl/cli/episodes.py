@@ -76,7 +76,7 @@ def _write_one(folder: Path, files: Mapping[str, Alternative]) -> None:
     title = f"{only.network.title or only.network.name}, {only.control} control"
     written = write_trajectory(folder, name, only.env, only.begun, only.rollout, title)
     _say_figures(only.rollout, only.network, only.begun)
-    say(f"wrote {' and '.join(map(str, written))}")
+    say(f"wrote {', '.join(map(str, written))}")
 
 
 def _write_several(folder: Path, files: Mapping[str, Alternative]) -> None:

@@ -15,6 +15,7 @@ from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import ControlKind, Law, Role
+from cirl_marl.network.lifetimes import CLOSE
 from cirl_marl.network.model import Releasing
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.units import factor
@@ -32,7 +33,7 @@ SHORT = 20
 
 def remarks(network: Network) -> Iterator[str]:
     """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse."""
-    for look in (_apart, _without_effect, _shares, _departures, _free, _starved, _aimless, _unpaid, _coarse):
+    for look in (_apart, _without_effect, _shares, _departures, _free, _starved, _aimless, _unpaid, _coarse, _lives):
         yield from look(network)
 
 
@@ -121,6 +122,18 @@ def _coarse(network: Network) -> Iterator[str]:
         name = VectorEnv(network, num_envs=1).state_names[worst]
         other = f"neutral control gives another {name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
         yield f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, {other}"
+
+
+def _lives(network: Network) -> Iterator[str]:
+    """Yield lifetimes that stages follow less closely than others."""
+    for node in network.stores:
+        chain = None if node.lifetime is None else node.lifetime.chain
+        if node.lifetime is not None and chain is not None and chain.error > CLOSE:
+            yield (
+                f"node '{node.id}': lifetime: {chain.stages} stages follow the survival function of this "
+                f"{node.lifetime.distribution} lifetime of {node.lifetime.mean:g} ± {node.lifetime.deviation:g} "
+                f"{network.time_unit} within {chain.error:.1%}; wider ones are followed within {CLOSE:.1%}"
+            )
 
 
 def _states(network: Network, action: float | None, intervals: int) -> Floats:

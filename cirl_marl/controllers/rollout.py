@@ -54,6 +54,7 @@ class Rollout:
     flow: Annotated[Floats, "mean flows of each interval in the first copy, shape (steps, arcs), mass/time"]
     load: Annotated[Floats, "masses that batch arcs hold, likewise, shape (steps, batch arcs), mass"]
     inner: Annotated[Floats, "inner states that an agent may see, likewise, shape (steps, states)"]
+    controls: Annotated[Floats, "values of all controls, in the rows of ``network.control_rows``, (steps, controls)"]
     unmet: Annotated[Floats, "what scheduled flows lacked, mean over copies, shape (steps, scheduled arcs), mass"]
     final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (stores,), mass"]
     mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
@@ -105,17 +106,16 @@ def rollout(
     stock, flow = np.empty((steps, len(env.network.stores))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
-    orders, actuators = (
-        np.flatnonzero(env.dynamics.scheduled[: len(total_flow)]),
-        Actuators(env.dynamics, env.agents, env.num_envs),
-    )
+    orders = np.flatnonzero(env.dynamics.scheduled[: len(total_flow)])
+    actuators = Actuators(env.dynamics, env.agents, env.num_envs)
+    controls = np.empty((steps, len(env.dynamics.neutral)))
     unmet = np.zeros((steps, len(orders)))
     for t in range(steps):
-        actions = env.stack(controller.act(observations))
-        outcome = env.advance(actions)
+        actions, when = env.stack(controller.act(observations)), np.full(env.num_envs, t)
+        outcome, held = env.advance(actions), actuators.controls(actions, when)
+        controls[t] = held[:, 0]
         if len(orders):
-            when = np.full(env.num_envs, t)
-            asked = env.dynamics.rate(actuators.controls(actions, when), when)[orders]
+            asked = env.dynamics.rate(held, when)[orders]
             short = asked - outcome.flow[orders]
             unmet[t] = np.where(short > ROUNDING * np.abs(asked), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
@@ -131,7 +131,8 @@ def rollout(
     unmet *= env.network.episode.control_interval
     final = rows.stocks(env.physical.stock).mean(axis=1)
     flows = total_flow / steps
-    return Rollout(circularity, mean, service, levels, local, returns, stock, flow, load, inner, unmet, final, flows)
+    seen = (stock, flow, load, inner, controls)
+    return Rollout(circularity, mean, service, levels, local, returns, *seen, unmet, final, flows)
 
 
 def beginning(env: VectorEnv, seed: int | None = None) -> Beginning:

@@ -27,17 +27,12 @@ def remaining(node: Node, interval: float) -> Floats:
     """
     lifetime, history, growth = node.lifetime, node.history, node.growth
     assert lifetime is not None and history is not None
-    first = float(history.means(np.array([history.times[0], min(history.times[0] + interval, 0.0)]))[0])
-    if growth:
-        first *= growth * interval / np.expm1(growth * interval)
     if (chain := lifetime.chain) is None:
-        count = slots(lifetime, interval)
-        entered = [_entered(node, first, -interval * (i + 1), -interval * i) for i in range(count)]
-        return np.array([*entered, 0.0])
+        return np.append(entered(node, interval, slots(lifetime, interval)), 0.0)
     edges = np.append(np.arange(history.times[0], -1e-9 * interval, interval), 0.0)
     stages = np.zeros(chain.stages)
     if growth is not None:
-        stages = chain.grown(growth * lifetime.mean) * first * lifetime.mean
+        stages = chain.grown(growth * lifetime.mean) * _first(node, interval) * lifetime.mean
     for begin, end, inflow in zip(edges[:-1], edges[1:], history.means(edges), strict=True):
         kept, got = held_for(chain, (end - begin) / lifetime.mean)
         stages = kept @ stages + got * inflow * lifetime.mean
@@ -73,7 +68,26 @@ def held_for(chain: Chain, time: float) -> tuple[Floats, Floats]:
     return moved[:size, :size], moved[:size, size]
 
 
-def _entered(node: Node, first: float, begin: float, end: float) -> float:
+def entered(node: Node, interval: float, count: int) -> Floats:
+    """Return the mass that entered in each of some intervals before the start, last first, shape (count,).
+
+    Without a history it is relative to that of the last one.
+    """
+    if node.history is None:
+        return np.asarray(np.exp(-(node.growth or 0.0) * interval * np.arange(count)))
+    first = _first(node, interval)
+    return np.array([_between(node, first, -interval * (i + 1), -interval * i) for i in range(count)])
+
+
+def _first(node: Node, interval: float) -> float:
+    """Return what flowed in when the history begins, as if what grew before had come to it."""
+    assert node.history is not None
+    begin, growth = node.history.times[0], node.growth or 0.0
+    first = float(node.history.means(np.array([begin, min(begin + interval, 0.0)]))[0])
+    return first * growth * interval / float(np.expm1(growth * interval)) if growth else first
+
+
+def _between(node: Node, first: float, begin: float, end: float) -> float:
     """Return the mass that entered between two times before the start."""
     assert node.history is not None
     start, mass = node.history.times[0], 0.0
