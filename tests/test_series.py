@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -166,3 +167,24 @@ def test_means_keep_to_the_values_that_they_are_of(data: st.DataObject) -> None:
         held = np.array(values)[place]
         same = np.ones(40, dtype=bool) if shift == 0.0 else ~np.isin(np.arange(40), knots)
         assert (means[same] == held[same]).all()
+
+
+@pytest.mark.parametrize("kinds", [("step", "step"), ("step", "linear"), ("linear", "linear")])
+def test_a_product_has_the_mean_of_the_product(kinds: tuple[str, str]) -> None:
+    """Not the product of the means; against a fine sum, with times that fall together and others that do not."""
+    rng = np.random.default_rng(5)
+    times = [(0.0, 1.5, 4.0, 6.5), (-1.0, 1.5, 2.25, 7.0)]
+    per_head, heads = (
+        Series(times=each, values=tuple(rng.uniform(1, 9, 4).tolist()), interpolation=kind)
+        for each, kind in zip(times, kinds, strict=True)
+    )
+    product = replace(per_head, factor=heads)
+    edges = np.array([0.0, 0.7, 2.0, 2.25, 5.0, 6.5])
+    fine = np.linspace(0.0, 6.5, 130_001)
+    middles = (fine[:-1] + fine[1:]) / 2
+    both = per_head.begins(middles) * heads.begins(middles)
+    expected = [both[(middles > a) & (middles < b)].mean() for a, b in pairwise(edges.tolist())]
+    np.testing.assert_allclose(product.means(edges), expected, rtol=1e-4)
+    low, high = product.extremes
+    assert low <= both.min() and both.max() <= high
+    assert abs(product.means(edges) - per_head.means(edges) * heads.means(edges)).max() > 1e-3

@@ -12,7 +12,7 @@ from cirl_marl.cli.common import MinService, NetworkName, Scenario, StartSeed, a
 from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Beginning, Rollout
-from cirl_marl.controllers.shortages import shortages
+from cirl_marl.controllers.shortages import shortages, unsupplied
 from cirl_marl.definitions.catalogue import file_and_region, networks
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
@@ -169,8 +169,8 @@ def _say_figures(run: Rollout, network: Network, begun: Beginning, who: str = ""
     if len(network.services) > 1:
         each = zip(network.services, run.episode_levels[0].tolist(), strict=True)
         say(f"{who}service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in each)}")
-    for short in shortages(run, network):
-        say(f"{who}{short.said}")
+    for said in (*(short.said for short in shortages(run, network)), *unsupplied(run, network)):
+        say(f"{who}{said}")
 
 
 def _held(controls: Sequence[str], settings: list[str]) -> dict[str, float]:

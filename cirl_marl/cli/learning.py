@@ -10,7 +10,7 @@ import typer
 
 from cirl_marl.cli.common import EpisodeCount, RunPath, Scenario, Seed, app, console, listed, say, shares, training_bar
 from cirl_marl.controllers.rollout import Rollout
-from cirl_marl.controllers.shortages import shortages
+from cirl_marl.controllers.shortages import shortages, unsupplied
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
@@ -211,10 +211,10 @@ def _kept(directory: Path) -> str:
 
 
 def _say_shortages(rollouts: Mapping[str, Rollout], network: Network) -> None:
-    """Say under which control scheduled flows were less than was asked for, as means over the episodes."""
+    """Say under which control flows and services were less than was asked for, as means over the episodes."""
     for name, run in rollouts.items():
-        for short in shortages(run, network):
-            say(f"{name}: {short.said}")
+        for said in (*(short.said for short in shortages(run, network)), *unsupplied(run, network)):
+            say(f"{name}: {said}")
 
 
 def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:

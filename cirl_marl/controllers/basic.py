@@ -68,7 +68,7 @@ class Constant(Controller):
 
     def act(self, observations: Arrays) -> Arrays:
         """Return the fixed actions, whose arrays are read-only, and neutral ones of the coming interval."""
-        return {**self._env.neutral_action, **self._actions}
+        return self._env.neutral_beside(self._actions)
 
 
 class Neutral(Constant):

@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl.controllers.basic import Constant, Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
-from cirl_marl.controllers.shortages import shortages
+from cirl_marl.controllers.shortages import shortages, unsupplied
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
@@ -33,7 +33,19 @@ SHORT = 20
 
 def remarks(network: Network) -> Iterator[str]:
     """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse."""
-    for look in (_apart, _without_effect, _shares, _departures, _free, _starved, _aimless, _unpaid, _coarse, _lives):
+    for look in (
+        _apart,
+        _without_effect,
+        _shares,
+        _departures,
+        _free,
+        _starved,
+        _unsupplied,
+        _aimless,
+        _unpaid,
+        _coarse,
+        _lives,
+    ):
         yield from look(network)
 
 
@@ -189,6 +201,16 @@ def _starved(network: Network) -> Iterator[str]:
                 said.add(arc.id)
                 little = f"under {control} control '{arc.donor}' holds too little for its flow {since}"
                 yield f"arc '{arc.id}': {little}; give it a larger initial stock if it stands for the world outside"
+
+
+def _unsupplied(network: Network) -> Iterator[str]:
+    """Yield services that fall short of what is demanded though arcs make up for them."""
+    if not any(arc.makes_up_for for arc in network.arcs):
+        return
+    env = VectorEnv(network, num_envs=1)
+    begun = beginning(env)
+    for said in unsupplied(rollout(env, Neutral(), seed=begun.seed, start=begun.given), network):
+        yield f"under neutral control {said}; widen the bounds of its control, or ask for less"
 
 
 def _scales(network: Network, id_: str) -> bool:

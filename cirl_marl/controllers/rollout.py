@@ -9,7 +9,6 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
@@ -107,15 +106,13 @@ def rollout(
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
     orders = np.flatnonzero(env.dynamics.scheduled[: len(total_flow)])
-    actuators = Actuators(env.dynamics, env.agents, env.num_envs)
     controls = np.empty((steps, len(env.dynamics.neutral)))
     unmet = np.zeros((steps, len(orders)))
     for t in range(steps):
-        actions, when = env.stack(controller.act(observations)), np.full(env.num_envs, t)
-        outcome, held = env.advance(actions), actuators.controls(actions, when)
-        controls[t] = held[:, 0]
+        outcome = env.advance(env.stack(controller.act(observations)))
+        controls[t] = env.held[:, 0]
         if len(orders):
-            asked = env.dynamics.rate(held, when)[orders]
+            asked = env.dynamics.rate(env.held, np.full(env.num_envs, t))[orders]
             short = asked - outcome.flow[orders]
             unmet[t] = np.where(short > ROUNDING * np.abs(asked), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean

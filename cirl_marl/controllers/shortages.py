@@ -1,4 +1,4 @@
-"""What scheduled flows lacked because their donors held too little, which no service need show."""
+"""What lacked: scheduled flows whose donors held too little, and services that nobody could make up for."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.network import Network
+from cirl_marl.network.calendar import labels
 from cirl_marl.network.elements import Arc
 
 NOTABLE = 1e-3
@@ -38,3 +39,21 @@ def shortages(run: Rollout, network: Network) -> Iterator[Shortage]:
             less = f"{mass:.4g} {network.mass_unit} ({mass / asked:.1%}) less than asked for"
             first = f"first at {begins:g} {network.time_unit}"
             yield Shortage(arc, begins, mass, f"arc '{arc.id}' moved {less}, {first}: '{arc.donor}' held too little")
+
+
+def unsupplied(run: Rollout, network: Network) -> Iterator[str]:
+    """Yield the services that fell short in a rollout of ``network`` though arcs make up for them."""
+    interval = network.episode.control_interval
+    for s, service in enumerate(network.services):
+        arcs = [arc for arc in network.arcs if arc.makes_up_for == service.id]
+        levels = run.levels[:, s].mean(axis=0)
+        if arcs and levels.min() < 1 - NOTABLE:
+            first = int(np.argmax(levels < 1 - NOTABLE))
+            when = " ".join(f"({column[0]})" for column in labels(network, first * interval)[1])
+            at = f"{first * interval:g} {network.time_unit} {when}".strip()
+            flows = [f"'{arc.id}' {run.controls[first, network.control_rows[arc.id].start]:.4g}" for arc in arcs]
+            unit = f"{network.mass_unit}/{network.time_unit}"
+            told = (
+                f"falls to {levels.min():.4f}, short first at {at}, when {' and '.join(flows)} {unit} makes up for it"
+            )
+            yield f"service '{service.id}' {told}"

@@ -9,7 +9,7 @@ from cirl_marl.definitions.columns import DataFiles
 from cirl_marl.definitions.mistakes import parameter_mistakes
 from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, QuantityTable, Range
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
-from cirl_marl.definitions.series import Clock, column_value, inline_series
+from cirl_marl.definitions.series import Clock, column_value, inline_series, product
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network import Network, elements
 from cirl_marl.network.declared import Declared, Nested, Numbers, Quantity, declarations
@@ -200,8 +200,19 @@ class Converter:
         return Control(kind=control.kind, **sides)
 
     def _value(self, quantity: Any, kind: str, where: str) -> Value:
-        unit = self._factor(quantity.unit, kind, where)
-        return self._in_time(quantity.value if isinstance(quantity, QuantityTable) else quantity, unit, where)
+        other, name = quantity.multiplied_by, quantity.unit
+        if other is not None:
+            name = f"({name})*({other.unit})"
+            if other.multiplied_by is not None:
+                self.mistakes.append(
+                    f"{where}.multiplied_by.multiplied_by: a quantity has one factor; multiply the others"
+                )
+        unit = self._factor(name, kind, where)
+        value = self._in_time(quantity.value if isinstance(quantity, QuantityTable) else quantity, unit, where)
+        if other is None:
+            return value
+        where = f"{where}.multiplied_by"
+        return product(value, self._in_time(other.value if isinstance(other, QuantityTable) else other, 1.0, where))
 
     def _in_time(self, given: float | AmountSeries | AmountColumn, unit: float, where: str) -> Value:
         """Return a number, or one that changes in time, in the network's units, of which its own is ``unit``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import date, datetime
-from typing import Annotated, Any, Literal, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, Union, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema
 from pydantic_core import PydanticCustomError
@@ -18,7 +18,19 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class QuantityTable(Table):
+if TYPE_CHECKING:
+    Factor: TypeAlias = Any  # its tables are those that it stands in
+
+
+class FactoredTable(Table):
+    """A quantity that may be given as a product."""
+
+    multiplied_by: Factor = Field(
+        None, description="another quantity by which it is multiplied, such as a population; the units, too"
+    )
+
+
+class QuantityTable(FactoredTable):
     """A number with its unit and source."""
 
     value: Number
@@ -71,7 +83,7 @@ class AmountSeries(Table):
     )
 
 
-class SeriesTable(AmountSeries):
+class SeriesTable(AmountSeries, FactoredTable):
     """A quantity that changes in time."""
 
     unit: str
@@ -93,7 +105,7 @@ class AmountColumn(Table):
     time_unit: TimeUnit = None
 
 
-class ColumnTable(AmountColumn):
+class ColumnTable(AmountColumn, FactoredTable):
     """A quantity that stands in a CSV file; the last step holds as long as the one before it."""
 
     unit: str
@@ -120,6 +132,12 @@ def varying(value: Any, series: Any, column: Any, word: str = "") -> Any:
         return Annotated[Union[*forms], Discriminator(_form)]
     either = Discriminator(lambda given: WORD if isinstance(given, str) else _form(given))
     return Annotated[Union[*forms, Annotated[Literal[word], Tag(WORD)]], either]
+
+
+if not TYPE_CHECKING:
+    Factor = varying(QuantityTable, SeriesTable, ColumnTable) | None
+for _made in (FactoredTable, QuantityTable, SeriesTable, ColumnTable):
+    _made.model_rebuild()
 
 
 def forms(kind: Any) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 
 from cirl_marl.definitions.columns import DataFiles
@@ -63,3 +63,14 @@ def column_value(table: AmountColumn, where: Mapping[str, str], files: DataFiles
         until=times[-1] + last if table.interpolation == "step" else None,
         origin=column.origin,
     )
+
+
+def product(value: Value, factor_: Value) -> Value:
+    """Return a number or series times another."""
+    if isinstance(value, Series):
+        if isinstance(factor_, Series):
+            return replace(value, factor=factor_)
+        return replace(value, values=tuple(each * factor_ for each in value.values))
+    if isinstance(factor_, Series):
+        return replace(factor_, values=tuple(value * each for each in factor_.values))
+    return value * factor_

@@ -171,6 +171,8 @@ class _Writer:
             told["interpolation"] = series.interpolation
         if series.until is not None:
             told["until"] = float(series.until)
+        if series.factor is not None:
+            told["multiplied_by"] = {**self._series(series.factor), "unit": "1", "source": SOURCE}
         return {**told, "time_unit": self._units["time"]}
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from cirl_marl.dynamics.motion import Dynamics, Transition
+from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.scoring import Scoring
 from cirl_marl.environments.state import State
 from cirl_marl.errors import CirlError
@@ -36,9 +37,17 @@ class Credit:
     λ is that at the ``end`` of the interval or its ``mean`` over it.
     """
 
-    def __init__(self, dynamics: Dynamics, scoring: Scoring, agents: Sequence[str], mode: str, measure: str) -> None:
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        supply: Supply,
+        scoring: Scoring,
+        agents: Sequence[str],
+        mode: str,
+        measure: str,
+    ) -> None:
         """Pay ``agents`` by ``mode``; ``measure`` is ``end`` or ``mean``."""
-        self.mode, self._measure = mode, measure
+        self.mode, self._measure, self._supply = mode, measure, supply
         self._dynamics, self._scoring, self._agents = dynamics, scoring, tuple(agents)
         self.weigh(dynamics.network.objective.circularity_weight)
 
@@ -107,12 +116,17 @@ class Credit:
     def _imagined(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
         dynamics, count, batch = self._dynamics, len(agents), controls.shape[1]
         imagined, neutral = np.tile(controls, (1, count)), dynamics.neutral_in(state.step)
+        idle = np.repeat(self._supply.idle(self._agents), count * batch, axis=1)
         for i, agent in enumerate(agents):
-            rows = dynamics.network.control_rows[agent]
-            imagined[rows, i * batch : (i + 1) * batch] = neutral[rows]
-        transition = dynamics.advance(
-            np.tile(state.stock, (1, count)), np.tile(state.inner, (1, count)), imagined, np.tile(state.step, count)
+            rows, columns = dynamics.network.control_rows[agent], slice(i * batch, (i + 1) * batch)
+            imagined[rows, columns] = neutral[rows]
+            idle[[arc == agent for arc in self._supply.arcs], columns] = True
+        stock, inner, step = (
+            np.tile(state.stock, (1, count)),
+            np.tile(state.inner, (1, count)),
+            np.tile(state.step, count),
         )
+        transition = dynamics.advance(stock, inner, self._supply(stock, inner, imagined, step, idle), step)
         imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
         flow = transition.moved / dynamics.network.episode.control_interval
         end, mean, _ = self.circularity(imagined_state, transition, flow)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.dynamics.motion import Dynamics, Transition
+from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.environments.rewards import Credit
@@ -45,6 +46,9 @@ class VectorEnv:
         observation_names: by agent, what each entry of its observation is.
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
         rows: which row of the physical state is what.
+        supply: the arcs that make up for services.
+        held: controls that were held in the last interval, in the rows of ``network.control_rows``, shape
+            (controls, num_envs).
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
             order of ``state()``.
         episodes: episodes begun in each copy, those gone back to included, shape (num_envs,).
@@ -95,18 +99,21 @@ class VectorEnv:
         self.reward_mode = _choice("reward", found.objective.reward if reward is None else reward, REWARDS)
         measure = _choice("circularity", circularity, MOMENTS)
         self.dynamics = Dynamics(found)
+        self.supply = Supply(self.dynamics)
         self._actuators = Actuators(self.dynamics, agents, num_envs)
         self.agents = self._actuators.agents
         self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
         self.scoring = Scoring(found, self.layout, self.agents, num_envs)
-        self._credit = Credit(self.dynamics, self.scoring, self.agents, self.reward_mode, measure)
+        self._idle = self.supply.idle(self.agents)
+        self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, measure)
         self.observation_spaces = self.layout.spaces
         self.observation_names = self.layout.names
         self._starts = Starts(found, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
         self.state_names = (*self.rows.start_names, *self.rows.batch_names)
         self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
+        self.held: Floats = np.empty((len(self.dynamics.neutral), num_envs))
         self._state: State | None = None
         _keep_freed_memory()
 
@@ -121,8 +128,29 @@ class VectorEnv:
 
     @property
     def neutral_action(self) -> dict[str, Floats]:
-        """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each."""
-        return self._actuators.neutral_action(self._coming())
+        """Action of each agent that leaves it neutral in the coming interval, shape (num_envs, entries) each.
+
+        An agent that makes up for a service supplies what lacks while all are neutral.
+        """
+        return self.neutral_beside({})
+
+    def neutral_beside(self, actions: Mapping[str, ArrayLike]) -> dict[str, Floats]:
+        """Return the actions of all agents, of which those that are not given stay neutral.
+
+        What an agent supplies to make up for a service depends on what others do in the interval, so that it can be
+        told only beside their actions.
+        """
+        step, given = self._coming(), {agent: np.asarray(action) for agent, action in actions.items()}
+        every: dict[str, Floats] = self._actuators.neutral_action(step) | given
+        waiting = [arc for arc in self.supply.arcs if arc in self.agents and arc not in given]
+        if waiting and self._state is not None and (self._state.step < self.network.episode.horizon).all():
+            controls = self._actuators.controls(self.stack(every), step)
+            idle = self.supply.idle([agent for agent in self.agents if agent not in waiting])
+            state = self._state
+            found = self.supply(state.stock, state.inner, controls, step, idle)
+            for arc in waiting:
+                every[arc] = self.normalised(arc, found[self.network.control_rows[arc]])
+        return every
 
     def normalised(self, agent: str, values: Floats) -> Floats:
         """Return the action that comes closest to physical values of an agent's control in the coming interval.
@@ -209,6 +237,7 @@ class VectorEnv:
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         controls = self._actuators.controls(actions, state.step)
+        controls = self.held = self.supply(state.stock, state.inner, controls, state.step, self._idle)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step)
         quantities, flow = self._measured(transition, controls)
         levels = self.scoring.levels(quantities, state.step)
@@ -293,7 +322,8 @@ class VectorEnv:
         dynamics, batch = self.dynamics, drawn.shape[1]
         stocks, inner = self.rows.split(drawn)
         stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
-        neutral = dynamics.neutral_in(step)
+        every = np.ones((len(self.supply.arcs), 1), dtype=bool)
+        neutral = self.supply(stock, inner, dynamics.neutral_in(step), step, every)
         flow, measures = dynamics.start_flow(stock, inner, neutral), dynamics.inner.measures(inner, neutral)
         sums = (np.zeros(shape) for shape in ((2, batch), (batch,), (len(self.network.services), batch)))
         return State(stock, inner, flow, measures, step, *sums)

@@ -52,10 +52,14 @@ def _annotated(made: Any) -> dict[str, Any]:
 
 
 class Changing:
-    """What may stand for a number that is declared to vary: one that changes in time, made of ``values``."""
+    """What may stand for a number that is declared to vary: one that changes in time, between two ``extremes``."""
 
     __slots__ = ()
-    values: tuple[float, ...]
+
+    @property
+    def extremes(self) -> tuple[float, float]:
+        """Lowest and highest value."""
+        raise NotImplementedError
 
 
 @itemised
@@ -233,7 +237,7 @@ def bound_problems(part_: Any, where: str = "") -> Iterator[str]:
         if isinstance(declared, Word) and value not in declared.of:
             yield f"{where}{unknown(declared.called or name, value, declared.of)}"
         elif isinstance(declared, Quantity) and value is not None:
-            for each in value.values if isinstance(value, Changing) else (value,):
+            for each in value.extremes if isinstance(value, Changing) else (value,):
                 if told := declared.bound_problem(each):
                     yield f"{where}{name} {each} {told}"
                     break

@@ -305,6 +305,17 @@ class Arc(Compartment):
         ),
     ] = 0.0
     flow: Annotated[Value, NotNegative("e, mass/time (exogenous law)", of="flow", varies=True)] = 0.0
+    makes_up_for: Annotated[
+        str,
+        Declared(
+            "service of which, while nobody acts on it, a controlled flow supplies what would lack in the interval, "
+            "within the bounds of its control"
+        ),
+    ] = ""
+    weight: Annotated[
+        float | None,
+        Share("part of that supply, of arcs that make up for the same service; they sum to 1; None: all of it"),
+    ] = None
     pollutant: Annotated[bool, Declared("whether material that enters an environment here is a pollutant")] = True
     set_point: Annotated[float | None, Quantity("mean flow aimed at, mass/time; None if there is none", of="flow")] = (
         None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import field
+from dataclasses import field, replace
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -35,11 +35,21 @@ class Series(Checked, Changing):
             "time up to which the last value is known to hold; None: for good (``step``), or no longer", of="time"
         ),
     ] = None
+    factor: Annotated[Any, Declared("another series, not negative, by which it is multiplied at all times")] = None
     origin: Annotated[str, Declared("where it was read from, for messages")] = field(default="", compare=False)
+
+    @property
+    def extremes(self) -> tuple[float, float]:
+        """Bounds of its values, which it reaches if it has no factor."""
+        low, high = min(self.values), max(self.values)
+        if self.factor is None:
+            return low, high
+        corners = [each * other for each in (low, high) for other in self.factor.extremes]
+        return min(corners), max(corners)
 
     def __format__(self, spec: str) -> str:
         """Say its lowest and its highest value."""
-        low, high = extremes(self)
+        low, high = self.extremes
         return f"{low:{spec}} … {high:{spec}}"
 
     @property
@@ -62,6 +72,11 @@ class Series(Checked, Changing):
             yield "series: times and values must be finite"
         elif self.until is not None and not self.until >= self.times[-1]:
             yield f"series: until {self.until:g} lies before its last time, {self.times[-1]:g}"
+        if self.factor is not None:
+            mistakes = list(self.factor.problems())
+            if not mistakes and min(self.factor.values) < 0:
+                mistakes = [f"series: {min(self.factor.values):g} is negative"]
+            yield from (f"multiplied_by: {each}" for each in mistakes)
 
     def uncovered(self, length: float, said: Callable[[float], str] = "{:g}".format) -> str:
         """Return what is missing of an episode of some length; nothing if the series covers it.
@@ -75,7 +90,8 @@ class Series(Checked, Changing):
         if self.end < length - slack:
             missing = f"series ends at {said(self.end)}, but the episode at {said(length)}"
             return f"{missing}; give what is missing, or a shorter horizon"
-        return ""
+        other = "" if self.factor is None else self.factor.uncovered(length, said)
+        return other and f"multiplied_by: {other}"
 
     def unfinished(self, said: Callable[[float], str] = "{:g}".format) -> str:
         """Return why it does not tell what was before time 0; nothing if it does."""
@@ -83,29 +99,64 @@ class Series(Checked, Changing):
             return f"series begins at {said(self.times[0])}, not before the episode does"
         if self.end < 0:
             return f"series ends at {said(self.end)}, before the episode begins at {said(0.0)}; give what is missing"
-        return ""
+        other = "" if self.factor is None else self.factor.unfinished(said)
+        return other and f"multiplied_by: {other}"
 
     def means(self, edges: Floats) -> Floats:
         """Return the mean over each interval between ``edges``, shape (len(edges) − 1,)."""
-        times, values = np.array(self.times), np.array(self.values)
-        slopes = np.zeros(len(times))
-        if self.interpolation == "linear":
-            slopes[:-1] = np.diff(values) / np.diff(times)
+        if self.factor is not None:
+            return self._means_of_product(edges)
+        times, values, slopes = self._lines()
         lengths = np.diff(times)
         total = np.concatenate([[0.0], np.cumsum(values[:-1] * lengths + slopes[:-1] * lengths**2 / 2)])
         index = np.maximum(np.searchsorted(times, edges, side="right") - 1, 0)
         within = edges - times[index]
         integral = total[index] + values[index] * within + slopes[index] * within**2 / 2
         # differences of a sum round: what holds throughout is its own mean, and no mean leaves the values it is of
-        begins = values[index] + slopes[index] * within
-        index = np.maximum(np.searchsorted(times, edges, side="left") - 1, 0)
-        ends = values[index] + slopes[index] * (edges - times[index])
-        lowest, highest = np.minimum(begins[:-1], ends[1:]), np.maximum(begins[:-1], ends[1:])
+        begins, ends = self.begins(edges[:-1]), self.ends(edges[1:])
+        lowest, highest = np.minimum(begins, ends), np.maximum(begins, ends)
         of = np.searchsorted(edges, times, side="right") - 1
         inside = (of >= 0) & (of < len(lowest))
         np.minimum.at(lowest, of[inside], values[inside])
         np.maximum.at(highest, of[inside], values[inside])
         means: Floats = np.clip(np.diff(integral) / np.diff(edges), lowest, highest)
+        return means
+
+    def begins(self, times: Floats) -> Floats:
+        """Return the values from some times on, shape (times,)."""
+        known, values, slopes = self._lines()
+        index = np.maximum(np.searchsorted(known, times, side="right") - 1, 0)
+        found: Floats = values[index] + slopes[index] * (times - known[index])
+        return found
+
+    def ends(self, times: Floats) -> Floats:
+        """Return the values until some times, shape (times,)."""
+        known, values, slopes = self._lines()
+        index = np.maximum(np.searchsorted(known, times, side="left") - 1, 0)
+        found: Floats = values[index] + slopes[index] * (times - known[index])
+        return found
+
+    def _lines(self) -> tuple[Floats, Floats, Floats]:
+        """Return times, values and slopes from each time on."""
+        times, values = np.array(self.times), np.array(self.values)
+        slopes = np.zeros(len(times))
+        if self.interpolation == "linear":
+            slopes[:-1] = np.diff(values) / np.diff(times)
+        return times, values, slopes
+
+    def _means_of_product(self, edges: Floats) -> Floats:
+        """Return the means of the product, by Simpson's rule between all times, where both are straight lines."""
+        both = [replace(self, factor=None), self.factor]
+        known = np.array([*self.times, *self.factor.times])
+        points = np.union1d(edges, known[(known > edges[0]) & (known < edges[-1])])
+        begins, ends = (
+            np.array([getattr(each, side)(at) for each in both])
+            for side, at in (("begins", points[:-1]), ("ends", points[1:]))
+        )
+        middle = (begins + ends) / 2
+        part = (begins.prod(axis=0) + 4 * middle.prod(axis=0) + ends.prod(axis=0)) / 6 * np.diff(points)
+        first = np.searchsorted(points, edges[:-1])
+        means: Floats = np.add.reduceat(part, first) / np.diff(edges)
         return means
 
 
@@ -115,4 +166,4 @@ Value = float | Series
 
 def extremes(value: Value) -> tuple[float, float]:
     """Return the lowest and the highest value."""
-    return (min(value.values), max(value.values)) if isinstance(value, Series) else (value, value)
+    return value.extremes if isinstance(value, Series) else (value, value)

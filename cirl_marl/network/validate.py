@@ -25,6 +25,7 @@ from cirl_marl.network.validate_settings import (
     setting_problems,
 )
 from cirl_marl.network.validate_storage import series_problems, share_problems, storage_problems
+from cirl_marl.network.validate_supply import supply_problems
 
 IDENTIFIER = r"^[a-z][a-z0-9_]*$"
 """How compartments and services may be called; their names are keys of definition files and names of files."""
@@ -89,6 +90,7 @@ def problems(network: Parts) -> Iterator[str]:
         yield from crooked or trap_problems(network, divided)
     yield from _port_problems(network)
     yield from service_problems(network)
+    yield from supply_problems(network)
     yield from setting_problems(network)
     acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.acting:

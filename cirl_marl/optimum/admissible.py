@@ -199,7 +199,9 @@ def shares(split: Split, asked: Floats) -> Floats:
 def _range(network: Network, compartment: Compartment, acting: Sequence[str]) -> Floats:
     """Return the lowest, neutral and highest value of a control, shape (3, steps)."""
     bounds = network.control_bounds[:, network.control_rows[compartment.id].start]
-    return bounds if compartment.id in acting else bounds[[1, 1, 1]]
+    # what is supplied while nobody acts depends on the state: all that may be is allowed
+    supplies = isinstance(compartment, Arc) and bool(compartment.makes_up_for)
+    return bounds if compartment.id in acting or supplies else bounds[[1, 1, 1]]
 
 
 def _setter(network: Network, arc: Arc) -> Arc | Node | None:

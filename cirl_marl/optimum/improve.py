@@ -16,6 +16,7 @@ from scipy import sparse
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats
 from cirl_marl.optimum.bounds import Bound
@@ -120,7 +121,9 @@ def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
     actuators = Actuators(dynamics, bound.agents or None, flat.shape[1])
     when = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
-    done = dynamics.advance(dynamics.extend(flat[:nodes]), inner, actuators.controls(flat[nodes:], when), when)
+    stocks, supply = dynamics.extend(flat[:nodes]), Supply(dynamics)
+    controls = supply(stocks, inner, actuators.controls(flat[nodes:], when), when, supply.idle(actuators.agents))
+    done = dynamics.advance(stocks, inner, controls, when)
     outputs = np.concatenate([done.stock[rows.nodes], done.moved / network.episode.control_interval])
     shaped = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (shaped[:, :, :-1] - shaped[:, :, -1:]) / shift[:, None]
@@ -130,11 +133,12 @@ def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
 def _path(bound: Bound, dynamics: Dynamics) -> Floats:
     """Return the stocks at the start and after each interval under the bound's actions, shape (steps + 1, stocks)."""
     actuators, inner = Actuators(dynamics, bound.agents or None, 1), np.empty((0, 1))
-    masses = dynamics.extend(bound.initial[:, None])
-    found = [bound.initial]
+    masses, supply = dynamics.extend(bound.initial[:, None]), Supply(dynamics)
+    idle, found = supply.idle(actuators.agents), [bound.initial]
     for step, actions in enumerate(bound.actions):
         when = np.array([step])
-        masses = dynamics.advance(masses, inner, actuators.controls(actions[:, None], when), when).stock
+        controls = supply(masses, inner, actuators.controls(actions[:, None], when), when, idle)
+        masses = dynamics.advance(masses, inner, controls, when).stock
         found.append(masses[dynamics.rows.nodes, 0])
     return np.array(found)
 

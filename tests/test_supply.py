@@ -1,0 +1,263 @@
+"""Business as usual: arcs that make up for what a service lacks while nobody acts on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    NetworkError,
+    Node,
+    Role,
+    Series,
+    Service,
+    VectorEnv,
+    load_network,
+    parallel_env,
+)
+from cirl_marl.controllers import Constant, Neutral
+from cirl_marl.controllers.remarks import remarks
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.controllers.shortages import unsupplied
+from cirl_marl.definitions.reading import write_network
+from cirl_marl.network import Network
+from cirl_marl.network.elements import Lifetime
+from cirl_marl.optimum import achieved, bound, improved
+
+Floats = NDArray[np.floating]
+EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
+
+
+def cycle(scenario: str | None = None, *, high: float = 400.0, **arc: Any) -> Network:
+    """Return the example, in which mining makes up for what recycling does not deliver."""
+    network = load_network(EXAMPLE).scenario(scenario)
+    assert network.arcs[0].control is not None
+    mining = replace(network.arcs[0], makes_up_for="supply", **arc)
+    mining = replace(mining, control=Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=high))
+    return replace(network, arcs=(mining, *network.arcs[1:]), scenarios={})
+
+
+def demanded(network: Network) -> Floats:
+    """Return the demand of each year."""
+    return np.array(network.held(network.services[0].low))
+
+
+@pytest.mark.parametrize("scenario", ["default", "lifetimes"])
+def test_supply_is_what_lacks(scenario: str) -> None:
+    """Whatever the others do: the stock is the demand, unless nothing or all that can be had is supplied."""
+    network = cycle(scenario)
+    env, rng = VectorEnv(network, num_envs=3, agents=["old_scrap"]), np.random.default_rng(1)
+    env.reset(seed=0, options={"initial_state": {"use": np.array([1050.0, 1100.0, 1150.0])}})
+    met = np.zeros(3, dtype=int)
+    for year, demand in enumerate(demanded(network)):
+        env.advance(rng.uniform(-1, 1, (1, 3)))
+        mined, use = env.held[0], env.rows.stocks(env.physical.stock)[network.node_index["use"]]
+        exact = (mined > 0) & (mined < 400.0)
+        np.testing.assert_allclose(use[exact], demand, rtol=1e-9, err_msg=str(year))
+        assert (use[mined == 0.0] >= demand * (1 - 1e-9)).all() and (mined < 400.0).all()
+        met += exact
+    assert (met > 15).all()
+
+
+def test_a_chain_falls_short_as_far_as_its_bounds_say() -> None:
+    """Then all that can be had is supplied, and the level of the service tells what lacks."""
+    network = cycle(high=60.0)
+    run = rollout(VectorEnv(network, num_envs=1, agents=["old_scrap"]), Neutral())
+    mined = run.controls[:, 0]
+    short = run.levels[0, 0] < 1.0 - 1e-3
+    assert short.any() and (mined[short] == 60.0).all()
+    stock = run.stock[:, network.node_index["use"]]
+    np.testing.assert_allclose(run.levels[0, 0], np.minimum(1.0, stock / demanded(network)), rtol=1e-9)
+
+    (said,) = unsupplied(run, network)
+    first = int(np.argmax(short))
+    assert f"'supply' falls to {run.levels.min():.4f}, short first at {first} year ({2020 + first})" in said
+    assert "'smelting' 60 Mt/year" in said
+    assert any(said in remark for remark in remarks(network)) and not list(remarks(cycle()))
+    assert not list(unsupplied(rollout(VectorEnv(cycle(), num_envs=1), Neutral()), cycle()))
+
+
+def test_an_agent_that_acts_overrides_it() -> None:
+    """Its action is what it carries; neutral, it supplies what lacks beside what the others do."""
+    network = cycle()
+    env = VectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    outcome = env.advance(np.array([[0.5], [0.0]]))
+    assert outcome.flow[0, 0] == pytest.approx(300.0)
+    for action in (-1.0, 0.3, 1.0):
+        alone = rollout(VectorEnv(network, num_envs=1, agents=["old_scrap"]), Constant({"old_scrap": action}))
+        beside = rollout(env, Constant({"old_scrap": action}))
+        np.testing.assert_allclose(beside.flow, alone.flow, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("acting", [["old_scrap"], ["smelting", "old_scrap"]])
+def test_counterfactuals_supply_anew(acting: list[str]) -> None:
+    """The difference to a second network, in which the agent is neutral and mining makes up for what then lacks."""
+    network = cycle()
+    env = VectorEnv(network, num_envs=2, agents=acting, reward="difference")
+    other = VectorEnv(network, num_envs=2, agents=acting, reward="circularity")
+    env.reset(3)
+    other.reset(3)
+    rng = np.random.default_rng(0)
+    for _ in range(8):
+        actions, here = rng.uniform(-1, 1, (len(acting), 2)), env.snapshot()
+        reward = env.advance(actions).reward
+        for row, agent in enumerate(acting):
+            other.restore(here)
+            actual = other.advance(actions).reward[0]
+            other.restore(here)
+            given = {each: action for each, action in other.unstack(actions).items() if each != agent}
+            imagined = other.advance(other.stack(other.neutral_beside(given))).reward[0]
+            np.testing.assert_allclose(reward[row], actual - imagined, atol=1e-7)
+
+
+DEMAND = Series(times=(0.0, 9.0), values=(52.0, 60.0), interpolation="linear")
+
+
+def town(weights: tuple[float | None, float | None], high: tuple[float, float] = (99.0, 99.0)) -> Network:
+    """Return two products from one market, whose makers are fed by two sources each."""
+    control = [Control(kind=ControlKind.FLOW, low=1.0, neutral=1.0, high=most) for most in (*high, 50.0)]
+    ore, ores = Role.NONRENEWABLE_RESERVOIR, ("ore_a", "ore_b", "ore_c")
+    return Network(
+        name="town",
+        nodes=(
+            *(Node(id=each, role=ore) for each in ores),
+            Node(id="market", stores=False),
+            Node(id="cars", lifetime=Lifetime(mean=8.0, deviation=3.0, distribution="weibull"), initial=(40.0, 60.0)),
+            Node(id="homes", rate=0.05, initial=(80.0, 90.0)),
+            Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            *(
+                Arc(id=f"mine_{c}", donor=f"ore_{c}", recipient="market", law=Law.CONTROLLED, control=control[i],
+                    makes_up_for="driving", weight=weights[i])
+                for i, c in enumerate("ab")
+            ),
+            Arc(id="import", donor="ore_c", recipient="homes", law=Law.CONTROLLED, control=control[2],
+                makes_up_for="living"),
+            Arc(id="to_cars", donor="market", recipient="cars", law=Law.SHARE, share=0.7),
+            Arc(id="to_homes", donor="market", recipient="homes", law=Law.SHARE),
+            Arc(id="old_cars", donor="cars", recipient="dump", law=Law.SHARE),
+            Arc(id="old_homes", donor="homes", recipient="dump", law=Law.SHARE),
+        ),
+        services=(
+            Service(id="driving", provider="cars", quantity="stock", low=DEMAND),
+            Service(id="living", provider="homes", quantity="stock", low=88.0),
+        ),
+        episode=Episode(horizon=8),
+        time_unit="year",
+        mass_unit="Mt",
+    )  # fmt: skip
+
+
+def test_several_services_are_solved_together() -> None:
+    """What is mined for cars builds homes, too, of which so much less is imported; sources keep their weights."""
+    network = town((0.25, 0.75))
+    run = rollout(VectorEnv(network, num_envs=2), Neutral())
+    a, b, imported = run.controls.T
+    np.testing.assert_allclose((a - 1.0) * 3, b - 1.0, rtol=1e-9)
+    exact = (imported > 1.0) & (a > 1.0)
+    assert exact.sum() >= 4
+    homes, cars = (run.stock[:, network.node_index[each]] for each in ("homes", "cars"))
+    np.testing.assert_allclose(homes[exact], 88.0, rtol=1e-9)
+    np.testing.assert_allclose(cars[exact], np.array(network.held(network.services[0].low))[exact], rtol=1e-9)
+
+
+@pytest.mark.parametrize("network", [cycle("lifetimes"), town((0.25, 0.75))])
+def test_copies_are_lone_environments(network: Network) -> None:
+    """To the bit."""
+    acting = [network.agents[-1]]
+    batch = VectorEnv(network, num_envs=3, agents=acting)
+    batch.reset(7)
+    alone = [parallel_env(network, agents=acting) for _ in range(3)]
+    for i, env in enumerate(alone):
+        env.reset(7 + i)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        actions = rng.uniform(-1, 1, (1, 3)).astype(np.float32)
+        flows = batch.advance(actions.astype(float)).flow
+        for i, env in enumerate(alone):
+            infos = env.step({acting[0]: actions[:, i]})[-1]
+            np.testing.assert_array_equal(infos[acting[0]]["flows"], flows[:, i])
+
+
+def test_bounds_allow_all_that_may_be_supplied() -> None:
+    """An idle supply may be anything in the program; its plan is carried out with what is supplied then."""
+    network = replace(cycle("lifetimes"), acting=("old_scrap",))
+    found = bound(network, min_service=0.999)
+    run = achieved(improved(found))
+    assert float(run.episode_circularity[0]) <= found.objective
+    neutral = rollout(VectorEnv(network, num_envs=1), Neutral())
+    assert float(run.episode_circularity[0]) > float(neutral.episode_circularity[0])
+    assert run.episode_levels[0].min() > 0.999 - 1e-6
+
+
+def test_demand_is_what_each_needs_times_how_many_there_are(tmp_path: Path) -> None:
+    """A stock per head, or anything else, may be multiplied by a series, inline or in a file; so are the units."""
+    text = EXAMPLE.read_text().replace("metal_cycle.csv", "people.csv")
+    people = EXAMPLE.with_suffix(".csv").read_text().splitlines()
+    heads_of = ("people", "7.8e9", "8.5e9", "9.2e9", "9.8e9")
+    rows = [f"{line},{heads}" for line, heads in zip(people, heads_of, strict=True)]
+    (tmp_path / "people.csv").write_text("\n".join(rows) + "\n")
+    old = text[text.index("low = { times = [2020, 2050], values = [1000, 1800]") :].partition("\n")[0]
+    by = '{ file = "people.csv", column = "people", interpolation = "linear", unit = "1", source = "a census" }'
+    each = 'times = [2020, 2050], values = [128, 184], interpolation = "linear", unit = "kg", source = "made up"'
+    path = tmp_path / "metal_cycle.toml"
+    path.write_text(text.replace(old, f"low = {{ {each}, multiplied_by = {by} }}"))
+    network = load_network(str(path))
+    time = np.linspace(0, 30, 300_001)
+    middle = (time[:-1] + time[1:]) / 2
+    heads = np.interp(middle, [0, 10, 20, 31], [7.8, 8.5, 9.2, 9.8])
+    wanted = (heads * np.interp(middle, [0, 30], [128.0, 184.0])).reshape(30, -1).mean(axis=1)
+    np.testing.assert_allclose(demanded(network), wanted, rtol=1e-6)
+    write_network(network, tmp_path / "again.toml")
+    assert load_network(str(tmp_path / "again.toml")).services == network.services
+    for wrong, said in (
+        (by.replace('"1"', '"kg"'), r"services.supply.low: unit '\(kg\)\*\(kg\)' is inconsistent"),
+        ("{ times = [2020], values = [-1], unit = '1', source = 'x' }", r"multiplied_by: series: -1 is negative"),
+        ("{ times = [2030], values = [1], unit = '1', source = 'x' }", r"multiplied_by: series begins at 10 \(2030\)"),
+    ):
+        path.write_text(text.replace(old, f"low = {{ {each}, multiplied_by = {wrong} }}"))
+        with pytest.raises(NetworkError, match=said):
+            load_network(str(path))
+
+
+def test_files_hold_it(tmp_path: Path) -> None:
+    """And read back the same."""
+    network = town((0.25, 0.75))
+    write_network(network, tmp_path / "town.toml")
+    assert load_network(str(tmp_path / "town.toml")).arcs == network.arcs
+
+
+BASE = town((0.25, 0.75))
+
+
+@pytest.mark.parametrize(
+    ("weights", "changed", "said"),
+    [
+        ((None, 0.5), {}, r"service 'driving': mine_a, mine_b make up for it; each needs a weight"),
+        ((0.5, 0.7), {}, r"the weights of mine_a, mine_b, which make up for it, sum to 1.2, not to 1"),
+        ((0.25, 0.75), {"import": {"makes_up_for": "livin"}}, r"unknown service 'livin'. Did you mean 'living'"),
+        ((0.25, 0.75), {"import": {"makes_up_for": "", "weight": 0.5}}, r"weight: it makes up for no service"),
+        ((0.25, 0.75), {"import": {"recipient": "dump"}}, r"'import': makes_up_for 'living': .*'homes' at once"),
+        ((0.25, 0.75), {"to_homes": {"makes_up_for": "living"}}, r"'to_homes': makes_up_for needs law 'controlled'"),
+    ],
+)  # fmt: skip
+def test_what_cannot_make_up_is_refused(
+    weights: tuple[float | None, float | None], changed: dict[str, dict[str, Any]], said: str
+) -> None:
+    """With the arc or service, the value, and what to do."""
+    with pytest.raises(NetworkError, match=said):
+        network = town(weights)
+        arcs = tuple(replace(arc, **changed.get(arc.id, {})) for arc in network.arcs)
+        replace(network, arcs=arcs)
