@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from cirl_marl.cli.common import MinService, NetworkName, Scenario, StartSeed, app, bar, console, folder_for, say, stem
@@ -13,7 +14,7 @@ from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Beginning, Rollout
 from cirl_marl.controllers.shortages import shortages, unsupplied
-from cirl_marl.definitions.catalogue import file_and_region, networks
+from cirl_marl.definitions.catalogue import file_and_region, load_network, networks
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.alternatives import Alternative, alternatives, compared_quantities
@@ -41,6 +42,9 @@ def simulate(
         list[str] | None,
         typer.Option(help="Scenario of the definition; repeat it to compare several; default: the physical one."),
     ] = None,
+    samples: Annotated[
+        int | None, typer.Option(min=2, help="Draws of the uncertain numbers, for bands and what causes them.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
 ) -> None:
     """Simulate a network under a controller without learning; write a CSV and a picture.
@@ -49,8 +53,14 @@ def simulate(
 
     Several scenarios or controllers, or every pair of both, start from the same seed and are compared.
     There is a CSV of each, one picture of all, and a table of the differences to the first.
+
+    With --samples the uncertain numbers of the network are drawn so many times: bands in a CSV and a picture.
+    From 70 samples on a table says which number causes most of the spread.
     """
     controls = control or ["neutral"]
+    if samples is not None:
+        _sample(network, scenario or [None], controls, steps, 0 if seed is None else seed, samples, out)
+        return
     held, folder = _held(controls, set_ or []), folder_for(out or Path(), "--out")
     with bar("simulating") as progress:
         found = alternatives(
@@ -67,6 +77,42 @@ def simulate(
         _write_one(folder, files)
     else:
         _write_several(folder, files)
+
+
+def _sample(
+    name: str,
+    scenarios: Sequence[str | None],
+    controls: Sequence[str],
+    steps: int | None,
+    seed: int,
+    samples: int,
+    out: Path | None,
+) -> None:
+    """Simulate draws of the uncertain numbers, and write and say what came of them."""
+    from cirl_marl.evaluation.sampling import FEWEST, sampled, sensitivities
+    from cirl_marl.report.samples import sensitivity_table, write_samples
+
+    if len(scenarios) > 1 or len(controls) > 1:
+        raise CirlError("--samples goes with one scenario and one control; compare their files")
+    folder, network = folder_for(out or Path(), "--out"), load_network(name, scenario=scenarios[0])
+    if steps is not None:
+        network = network.with_options(episode={"horizon": steps})
+    with bar("sampling") as progress:
+        found = sampled(network, samples=samples, control=controls[0], seed=seed, progress=progress)
+    causes = sensitivities(found) if samples >= FEWEST else []
+    title = f"{network.title or network.name}, {controls[0]} control, {samples} samples"
+    written = write_samples(folder, stem(network, controls[0]), found, causes, title=title)
+    mean = found.circularity.mean(axis=1)
+    low, high = np.quantile(mean, (0.025, 0.975)).tolist()
+    say(f"λ̄ = {mean.mean():.5g} {network.mass_unit}, 95 % of samples in [{low:.5g}, {high:.5g}]")
+    for service, levels in zip(network.services, found.levels.mean(axis=2).T, strict=True):
+        low, high = np.quantile(levels, (0.025, 0.975)).tolist()
+        say(f"level of {service.id}: {levels.mean():.4f}, 95 % of samples in [{low:.4f}, {high:.4f}]")
+    if causes:
+        console.print(sensitivity_table(found, causes))
+    else:
+        say(f"which number causes the spread is told from {FEWEST} samples on")
+    say(f"wrote {', '.join(map(str, written))}")
 
 
 def _write_one(folder: Path, files: Mapping[str, Alternative]) -> None:

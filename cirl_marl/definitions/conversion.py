@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
+
+import numpy as np
 
 from cirl_marl.compartments import CompartmentModel, model_class
 from cirl_marl.definitions.columns import DataFiles
@@ -14,7 +17,8 @@ from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network import Network, elements
 from cirl_marl.network.declared import Declared, Nested, Numbers, Quantity, declarations
 from cirl_marl.network.elements import TAKEN, Arc, Control, ControlKind, Law, Node
-from cirl_marl.network.series import Value
+from cirl_marl.network.series import Series, Value
+from cirl_marl.network.uncertainty import Spread
 from cirl_marl.network.units import factor
 
 GIVEN = ("rate", "flow", "batches")
@@ -38,6 +42,7 @@ class Converter:
         self.table, self.files, self.region = table, files, region
         self.mistakes: list[str] = []
         self.used: set[str] = set()
+        self.uncertain: dict[str, Spread] = {}
         self._told: set[str] = set()
         mass, time = table.units.mass, table.units.time
         self.targets = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})", "steps": "1"}
@@ -84,6 +89,7 @@ class Converter:
             region=self.region,
             data_sha256={name: self.files.sha256(name) for name in sorted(self.used)},
             acting=tuple(table.agents),
+            uncertain=self.uncertain,
             **parts,
             **known,
         )
@@ -209,10 +215,32 @@ class Converter:
                 )
         unit = self._factor(name, kind, where)
         value = self._in_time(quantity.value if isinstance(quantity, QuantityTable) else quantity, unit, where)
+        self._spread(quantity, value, unit, where)
         if other is None:
             return value
         where = f"{where}.multiplied_by"
         return product(value, self._in_time(other.value if isinstance(other, QuantityTable) else other, 1.0, where))
+
+    def _spread(self, quantity: Any, value: Value, unit: float, where: str) -> None:
+        """Note how a quantity spreads, if it does."""
+        deviation, span = quantity.deviation, quantity.range
+        if deviation is None and span is None:
+            if quantity.distribution is not None:
+                self.mistakes.append(f"{where}.distribution: '{quantity.distribution}' needs a deviation or a range")
+            return
+        middle = float(np.mean(value.values)) if isinstance(value, Series) else float(value)
+        if middle <= 0 or (deviation is not None and deviation <= 0):
+            told = f"deviation {deviation:g}" if middle > 0 else f"the number is {middle / unit:g}"
+            self.mistakes.append(f"{where}: {told}: what spreads, and its deviation, must be positive")
+            return
+        low, high = (0.0, math.inf) if span is None else (float(end * unit / middle) for end in span)
+        if low >= high or not low <= 1 <= high:
+            wanted = "contain the number" if low < high else "have its lower end first"
+            self.mistakes.append(f"{where}.range: {list(span or ())} must {wanted}, {middle / unit:g}")
+            return
+        kind = quantity.distribution or ("uniform" if deviation is None else "normal")
+        relative = None if deviation is None else deviation * unit / middle
+        self.uncertain[where] = Spread(deviation=relative, low=low, high=high, distribution=kind)
 
     def _in_time(self, given: float | AmountSeries | AmountColumn, unit: float, where: str) -> Value:
         """Return a number, or one that changes in time, in the network's units, of which its own is ``unit``."""

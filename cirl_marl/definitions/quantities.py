@@ -22,15 +22,22 @@ if TYPE_CHECKING:
     Factor: TypeAlias = Any  # its tables are those that it stands in
 
 
-class FactoredTable(Table):
-    """A quantity that may be given as a product."""
+class StatedTable(Table):
+    """A quantity that may be a product, and may be known only so far."""
 
     multiplied_by: Factor = Field(
         None, description="another quantity by which it is multiplied, such as a population; the units, too"
     )
+    deviation: Number | None = Field(
+        None, description="standard deviation of what is not known exactly, in the same unit; of a series of its mean"
+    )
+    range: tuple[Number, Number] | None = Field(None, description="lowest and highest value that it may have, likewise")
+    distribution: Literal["normal", "lognormal", "uniform"] | None = Field(
+        None, description="of what it may be; default: ``normal`` with a deviation, else ``uniform``"
+    )
 
 
-class QuantityTable(FactoredTable):
+class QuantityTable(StatedTable):
     """A number with its unit and source."""
 
     value: Number
@@ -83,7 +90,7 @@ class AmountSeries(Table):
     )
 
 
-class SeriesTable(AmountSeries, FactoredTable):
+class SeriesTable(AmountSeries, StatedTable):
     """A quantity that changes in time."""
 
     unit: str
@@ -105,7 +112,7 @@ class AmountColumn(Table):
     time_unit: TimeUnit = None
 
 
-class ColumnTable(AmountColumn, FactoredTable):
+class ColumnTable(AmountColumn, StatedTable):
     """A quantity that stands in a CSV file; the last step holds as long as the one before it."""
 
     unit: str
@@ -136,7 +143,7 @@ def varying(value: Any, series: Any, column: Any, word: str = "") -> Any:
 
 if not TYPE_CHECKING:
     Factor = varying(QuantityTable, SeriesTable, ColumnTable) | None
-for _made in (FactoredTable, QuantityTable, SeriesTable, ColumnTable):
+for _made in (StatedTable, QuantityTable, SeriesTable, ColumnTable):
     _made.model_rebuild()
 
 

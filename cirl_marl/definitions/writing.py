@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from datetime import date
 from typing import Any
 
+import numpy as np
 import tomlkit
 
 from cirl_marl.compartments import kind_of
@@ -16,6 +18,7 @@ from cirl_marl.network import Network
 from cirl_marl.network.declared import CalendarTime, Nested, Numbers, Quantity, declarations, default_of, is_required
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 from cirl_marl.network.series import Series, Value
+from cirl_marl.network.uncertainty import Spread
 
 SOURCE = "network built in Python"
 
@@ -85,17 +88,19 @@ class _Writer:
             "episode": self._part(network.episode),
             "objective": self._part(network.objective),
             "observation": self._part(network.observation),
-            "nodes": {node.id: self._part(node) for node in network.nodes},
-            "arcs": {arc.id: self._part(arc) for arc in network.arcs},
-            "services": {service.id: self._part(service) for service in network.services},
+            **{
+                key: {each.id: self._part(each, f"{key}.{each.id}") for each in getattr(network, key)}
+                for key in ("nodes", "arcs", "services")
+            },
         }
 
-    def _part(self, part: Any) -> dict[str, Any]:
-        """Return the table of a part, without what is as it is by default."""
+    def _part(self, part: Any, where: str = "") -> dict[str, Any]:
+        """Return the table of a part, without what is as it is by default; ``where`` is its path."""
         table: dict[str, Any] = {}
         for name, declared in declarations(type(part)).items():
             value, key = getattr(part, name), declared.key or name
             needed = is_required(type(part), name) or name == _needed(part)
+            needed = needed or f"{where}.{name}" in self._network.uncertain
             if not needed and value == default_of(type(part), name):
                 continue
             if isinstance(declared, CalendarTime):
@@ -103,7 +108,8 @@ class _Writer:
             elif isinstance(declared, Quantity) and declared.shared:
                 table |= {key: float(value), "unit": self._units[declared.kind(part)], "source": SOURCE}
             elif isinstance(declared, Quantity):
-                table[key] = self._quantity(value, declared.kind(part))
+                spread = self._network.uncertain.get(f"{where}.{name}")
+                table[key] = self._quantity(value, declared.kind(part)) | _told(spread, value)
             elif isinstance(declared, Numbers):
                 table |= self._numbers(part, value, declared, key)
             elif isinstance(declared, Nested):
@@ -174,6 +180,19 @@ class _Writer:
         if series.factor is not None:
             told["multiplied_by"] = {**self._series(series.factor), "unit": "1", "source": SOURCE}
         return {**told, "time_unit": self._units["time"]}
+
+
+def _told(spread: Spread | None, value: Value) -> dict[str, Any]:
+    """Return the keys that say how a number spreads."""
+    if spread is None:
+        return {}
+    middle = float(np.mean(value.values)) if isinstance(value, Series) else value
+    told: dict[str, Any] = {"distribution": spread.distribution}
+    if spread.deviation is not None:
+        told["deviation"] = spread.deviation * middle
+    if math.isfinite(spread.high):
+        told["range"] = [spread.low * middle, spread.high * middle]
+    return told
 
 
 def _needed(part: Any) -> str:

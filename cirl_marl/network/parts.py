@@ -27,6 +27,7 @@ class Parts:
         episode: time and solver.
         objective: circularity and rewards.
         observation: default observation.
+        uncertain: how numbers spread that are not known exactly, by their path, such as ``arcs.mining.rate``.
         acting: compartments that act by default; empty means every compartment with a control.
         mass_unit: unit of stocks.
         time_unit: unit of time.
@@ -48,6 +49,7 @@ class Parts:
     episode: Episode = field(default_factory=Episode)
     objective: Objective = field(default_factory=Objective)
     observation: Observation = field(default_factory=Observation)
+    uncertain: Mapping[str, Any] = field(default_factory=dict)
     acting: tuple[str, ...] = ()
     mass_unit: str = "kg"
     time_unit: str = "day"

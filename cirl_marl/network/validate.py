@@ -15,6 +15,7 @@ from cirl_marl.network.model import CompartmentModel, Outflowing, Releasing, Veh
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.splits import splits, trap_problems
+from cirl_marl.network.uncertainty import uncertainty_problems
 from cirl_marl.network.units import factor
 from cirl_marl.network.validate_lifetimes import lifetime_problems
 from cirl_marl.network.validate_settings import (
@@ -92,6 +93,7 @@ def problems(network: Parts) -> Iterator[str]:
     yield from service_problems(network)
     yield from supply_problems(network)
     yield from setting_problems(network)
+    yield from uncertainty_problems(network)
     acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.acting:
         if agent in everyone and agent not in acting:
