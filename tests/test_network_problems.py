@@ -148,7 +148,7 @@ def test_networks_that_cannot_be_simulated(changes: dict[str, Any], said: str) -
         (
             LINK,
             {"delay": steps(0.0)},
-            "interpolation='step', until=None, origin='')",
+            "interpolation='step', until=None, factor=None, origin='')",
         ),
         (LINK, {"rate": None}, "arc 'k': rate must be a number, got None"),
         (VALVE, {"low": (0.0, 2.0)}, "control: low must be a number, got (0.0, 2.0)"),

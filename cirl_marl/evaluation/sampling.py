@@ -17,14 +17,14 @@ from cirl_marl.network.uncertainty import drawn
 from cirl_marl.optimum.named import named_controller
 
 FEWEST = 70
-"""Samples from which on shares of the spread are told."""
+"""SampledEpisodes from which on shares of the spread are told."""
 RESAMPLES = 200
 """Bootstrap resamples of their intervals."""
 
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class Samples:
+class SampledEpisodes:
     """Episodes of networks whose uncertain numbers were drawn; everything else is the same."""
 
     network: Annotated[Network, "the network, its numbers as they are stated"]
@@ -54,7 +54,7 @@ def sampled(
     control: str = "neutral",
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
-) -> Samples:
+) -> SampledEpisodes:
     """Simulate draws of the uncertain numbers, each in an episode from the middle of all initial ranges.
 
     Sample i draws from ``[seed, i]``, so that more samples add to those before, and the numbers of a network without
@@ -87,7 +87,7 @@ def sampled(
         begun = beginning(env)
         runs.append(rollout(env, named_controller(control), seed=begun.seed, start=begun.given))
         progress((i + 1) / samples)
-    return Samples(
+    return SampledEpisodes(
         network,
         names,
         factors,
@@ -99,7 +99,7 @@ def sampled(
     )
 
 
-def sensitivities(found: Samples) -> list[Sensitivity]:
+def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
     """Return what causes the spread of λ̄, and of the mean level of each service.
 
     The indices are estimated from the samples themselves, by RBD-FAST (Tarantola, Gatelli and Mara 2006) with the

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import SERIES, dated, dressed, save, spoken, time_axis
-from cirl_marl.evaluation.sampling import Samples, Sensitivity
+from cirl_marl.evaluation.sampling import SampledEpisodes, Sensitivity
 from cirl_marl.evaluation.statistics import defined
 from cirl_marl.network import Floats
 from cirl_marl.network.calendar import labels
@@ -25,7 +25,7 @@ ROWS = 8
 """Largest number of causes in a table on screen."""
 
 
-def sensitivity_table(found: Samples, causes: Sequence[Sensitivity]) -> Table:
+def sensitivity_table(found: SampledEpisodes, causes: Sequence[Sensitivity]) -> Table:
     """Return the numbers that cause most of the spread, with the share of each figure that they cause."""
     table = Table(title="share of the spread that a number causes by itself")
     table.add_column("number")
@@ -48,7 +48,9 @@ def _said(each: Sensitivity, i: int) -> str:
     return f"{max(0.0, each.shares[i]):.0%} ± {each.margins[i]:.0%}"
 
 
-def write_samples(folder: Path, name: str, found: Samples, causes: Sequence[Sensitivity], *, title: str) -> list[Path]:
+def write_samples(
+    folder: Path, name: str, found: SampledEpisodes, causes: Sequence[Sensitivity], *, title: str
+) -> list[Path]:
     """Write ``name_bands.csv``, ``name_draws.csv``, ``name_causes.csv`` and ``name_bands.png``, all or none.
 
     Bands are quantiles of each quantity over the samples, by time. Draws are what was drawn in each sample and what
@@ -73,7 +75,7 @@ def write_samples(folder: Path, name: str, found: Samples, causes: Sequence[Sens
     return [folder / file for file in files]
 
 
-def _draws(found: Samples) -> tuple[list[str], list[list[object]]]:
+def _draws(found: SampledEpisodes) -> tuple[list[str], list[list[object]]]:
     network = found.network
     header = ["sample", *(f"factor on {name}" for name in found.names), f"mean circularity ({network.mass_unit})"]
     header += [f"mean level of {service.id}" for service in network.services]
@@ -81,7 +83,7 @@ def _draws(found: Samples) -> tuple[list[str], list[list[object]]]:
     return header, [[i, *row] for i, row in enumerate(np.concatenate(columns, axis=1).tolist())]
 
 
-def _causes(found: Samples, causes: Sequence[Sensitivity]) -> tuple[list[str], list[list[object]]]:
+def _causes(found: SampledEpisodes, causes: Sequence[Sensitivity]) -> tuple[list[str], list[list[object]]]:
     header = ["number", *(part for each in causes for part in (f"share of {each.figure}", "half-width"))]
     return header, [
         [found.names[i], *(defined(float(part)) for each in causes for part in (each.shares[i], each.margins[i]))]
@@ -89,7 +91,7 @@ def _causes(found: Samples, causes: Sequence[Sensitivity]) -> tuple[list[str], l
     ]
 
 
-def _quantities(found: Samples) -> Iterator[tuple[str, str, Floats]]:
+def _quantities(found: SampledEpisodes) -> Iterator[tuple[str, str, Floats]]:
     """Yield name, unit and values, shape (samples, steps), of everything that has a band."""
     network = found.network
     mass, flow = network.mass_unit, f"{network.mass_unit}/{network.time_unit}"
@@ -99,7 +101,7 @@ def _quantities(found: Samples) -> Iterator[tuple[str, str, Floats]]:
     yield from ((f"flow of {each.id}", flow, found.flow[:, :, k]) for k, each in enumerate(network.arcs))
 
 
-def save_bands(path: str | Path, found: Samples, *, title: str) -> Path:
+def save_bands(path: str | Path, found: SampledEpisodes, *, title: str) -> Path:
     """Save bands of λ, of services and of what spreads most, as a PNG and return its path."""
     network, every = found.network, list(_quantities(found))
     first = 1 + min(3, len(network.services))
