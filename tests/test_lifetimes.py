@@ -17,6 +17,7 @@ from scipy import optimize, special
 from cirl_marl import (
     Arc,
     Control,
+    ControlError,
     ControlKind,
     Episode,
     Law,
@@ -109,6 +110,7 @@ def cohorts(distribution: str, deviation: float) -> tuple[Floats, Floats]:
     return found.outflow.values, found.stock.values
 
 
+@pytest.mark.sample(6)
 @pytest.mark.parametrize("ratio", [0.1, 0.2, 0.3, 0.45, 0.7])
 @pytest.mark.parametrize("distribution", ["normal", "folded_normal", "lognormal", "weibull"])
 def test_discards_are_those_of_cohorts(distribution: str, ratio: float) -> None:
@@ -239,8 +241,16 @@ def test_stages_belong_to_their_node() -> None:
     first = [env.advance(np.zeros((1, 2))).flow for _ in range(3)]
     env.restore(kept)
     np.testing.assert_array_equal([env.advance(np.zeros((1, 2))).flow for _ in range(3)], first)
-    with pytest.raises(Exception, match=r"covers"):
-        env.reset(options={"initial_state": {"use": 1e9}})
+    env.reset(seed=0, options={"initial_state": {stages[1]: 7.0}})  # the other stages are empty then
+    assert env.rows.stocks(env.physical.stock)[1, 0] == pytest.approx(7.0)
+    for given, said in (
+        ({"use": 1e9}, "covers"),
+        ({stages[0]: 1e9}, "covers"),
+        ({"use": 1.0, stages[2]: 1.0}, "give the stock, or its stages, not both"),
+        ({"use.stage_99": 1.0}, "unknown node or inner state 'use.stage_99'"),
+    ):
+        with pytest.raises(ControlError, match=said):
+            env.reset(options={"initial_state": given})
 
 
 def test_files_hold_lifetimes(tmp_path: Path) -> None:
@@ -254,6 +264,7 @@ def test_files_hold_lifetimes(tmp_path: Path) -> None:
         np.testing.assert_array_equal(lived(again), lived(network))
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("distribution", ["normal", "weibull", "lognormal"])
 @pytest.mark.parametrize("deviation", [0.03, 0.1, 0.4])
 def test_the_error_of_a_chain_is_what_it_says(distribution: str, deviation: float) -> None:
@@ -359,6 +370,8 @@ OTHER = Arc(id="other", donor="use", recipient="dump", rate=0.1)
         ({"node": {"history": ENDED}}, (), r"series ends at -2, bef"),
         ({"node": {"history": LATE}}, (), r"series begins at 1, not"),
         ({"node": {"history": Series(times=(-5.0,), values=(0.0,))}}, (), r"history: nothing is left of it"),
+        ({"node": {"growth": -30.0}}, (), r"growth -30: in a lifetime of 9 .*; is it in percent"),
+        ({"node": {"growth": -2.0}, "distribution": "fixed", "deviation": None, "mean": 60.0}, (), r"is it in percent"),
         ({"node": {"growth": -3.0}}, (), r"growth -3: no stock has a lifetime of 9 and shrinks so fast"),
         ({"node": {"lifetime": None, "rate": 0.1, "stretch": 2.0}}, (), r"stretch: it has no lifetime"),
         ({"node": {"initial": None}}, (), r"initial: missing"),

@@ -188,3 +188,12 @@ def test_a_product_has_the_mean_of_the_product(kinds: tuple[str, str]) -> None:
     low, high = product.extremes
     assert low <= both.min() and both.max() <= high
     assert abs(product.means(edges) - per_head.means(edges) * heads.means(edges)).max() > 1e-3
+
+
+def test_a_factor_covers_what_it_multiplies() -> None:
+    """Nothing is told of the time before it begins."""
+    late = Series(times=(-2.0, 0.0), values=(1.0, 8.0), interpolation="linear")
+    history = Series(times=(-30.0, 0.0), values=(1.0, 1.0), interpolation="linear", factor=late)
+    assert "series begins at -2, after what it multiplies at -30" in history.unfinished()
+    assert history.uncovered(3.0)
+    assert replace(history, factor=replace(late, times=(-31.0, 0.0))).unfinished() == ""

@@ -173,6 +173,71 @@ def test_several_services_are_solved_together() -> None:
     np.testing.assert_allclose(cars[exact], np.array(network.held(network.services[0].low))[exact], rtol=1e-9)
 
 
+def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0) -> Network:
+    """Return a product made from a reserve that may not last."""
+    control = Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=most)
+    return Network(
+        name="reserve",
+        nodes=(
+            Node(id="ore", role=Role.NONRENEWABLE_RESERVOIR, initial=(stock, stock)),
+            Node(id="use", rate=0.1, initial=(50.0, 50.0)),
+            Node(id="dump", role=Role.LANDFILL, initial=(0.0, 0.0)),
+        ),
+        arcs=(
+            Arc(id="mine", donor="ore", recipient="use", law=Law.CONTROLLED, control=control, makes_up_for="need"),
+            Arc(id="export", donor="ore", recipient="dump", law=Law.EXOGENOUS, flow=export),
+            Arc(id="old", donor="use", recipient="dump", law=Law.SHARE),
+        ),
+        services=(Service(id="need", provider="use", quantity="stock", low=demand),),
+        episode=Episode(horizon=6),
+    )
+
+
+@pytest.mark.parametrize(("stock", "export"), [(12.0, 0.0), (1000.0, 0.0), (120.0, 10.0)])
+def test_a_small_reserve_gives_no_more_than_is_needed(stock: float, export: float) -> None:
+    """However wide the bounds of the control; when it is used up the service falls short."""
+    run = rollout(VectorEnv(reserve(stock, 1e4, export=export), num_envs=1), Neutral())
+    use, left = run.stock[:, 1], run.stock[:, 0]
+    enough = left > 1e-6
+    np.testing.assert_allclose(use[enough], 47.0, rtol=1e-9)
+    assert enough[0] and (use <= 47.0 * (1 + 1e-9)).all()
+    assert enough.all() == (stock >= 1000.0 or export > 0)
+
+
+@pytest.mark.parametrize("high", [(3.0, 99.0), (0.5, 99.0)])
+def test_where_one_is_at_its_bound_others_supply_more(high: tuple[float, float]) -> None:
+    """Of arcs that share a service; and of services, one that cannot be met leaves the others as they should be."""
+    network = town((0.5, 0.5), high=(1.0 + high[0], high[1]))
+    run = rollout(VectorEnv(network, num_envs=1), Neutral())
+    cars = run.stock[:, network.node_index["cars"]]
+    wanted = np.array(network.held(network.services[0].low))
+    np.testing.assert_allclose(cars, np.maximum(cars, wanted), rtol=1e-9)
+    assert (run.controls[:, 0] == 1.0 + high[0]).any()
+    arcs = tuple(
+        replace(arc, control=Control(kind=ControlKind.FLOW, low=0.0, neutral=0.0, high=0.5))
+        if arc.id == "import"
+        else arc
+        for arc in network.arcs
+    )
+    short = replace(network, arcs=arcs, services=(network.services[0], replace(network.services[1], low=120.0)))
+    run = rollout(VectorEnv(short, num_envs=1), Neutral())
+    assert run.levels[0, 1].max() < 1.0 and (run.controls[:, 2] == 0.5).all()
+    np.testing.assert_allclose(run.stock[:, network.node_index["cars"]], wanted, rtol=1e-9)
+
+
+def test_services_that_hang_together_are_all_met() -> None:
+    """Two sources of one market, one for each product: as much as the product needs that lacks more."""
+    network = town((0.25, 0.75))
+    changed: dict[str, dict[str, Any]] = {"mine_a": {"weight": None}, "mine_b": {"weight": None, "makes_up_for": "living"}}
+    arcs = [replace(arc, **changed.get(arc.id, {})) for arc in network.arcs if arc.id != "import"]
+    run = rollout(VectorEnv(replace(network, arcs=tuple(arcs)), num_envs=1), Neutral())
+    wanted = np.array([network.held(service.low) for service in network.services])
+    stock = run.stock[:, [network.node_index[each] for each in ("cars", "homes")]].T
+    lowest = (stock / wanted).min(axis=0)
+    np.testing.assert_allclose(lowest[run.controls[:, :2].max(axis=1) > 1.0], 1.0, rtol=1e-6)
+    assert (lowest > 1 - 1e-6).all()
+
+
 @pytest.mark.parametrize("network", [cycle("lifetimes"), town((0.25, 0.75))])
 def test_copies_are_lone_environments(network: Network) -> None:
     """To the bit."""

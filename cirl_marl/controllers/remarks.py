@@ -144,7 +144,7 @@ def _lives(network: Network) -> Iterator[str]:
             yield (
                 f"node '{node.id}': lifetime: {chain.stages} stages follow the survival function of this "
                 f"{node.lifetime.distribution} lifetime of {node.lifetime.mean:g} ± {node.lifetime.deviation:g} "
-                f"{network.time_unit} within {chain.error:.1%}; wider ones are followed within {CLOSE:.1%}"
+                f"{network.time_unit} within {chain.error:.1%}; most others are followed within {CLOSE:.1%}"
             )
 
 

@@ -1,13 +1,14 @@
 """What arcs supply that make up for a service while nobody acts on them: business as usual.
 
-Without cuts the interval's map from what they supply to what services measure, q = β + A V, is affine: V_s is what the
-arcs of service s supply together above their lowest flows, each by its weight. One interval with the lowest flows gives
-β, one more for each service a column of A; then ::
+The arcs of service s supply u_k = min(low_k + weight_k V_s, high_k). Without cuts the interval's map from V to what the
+services measure is affine, q = β + A V with A ≥ 0: one interval with V gives q, one more for each service a column of
+A, and then V solves ::
 
-    V = A⁻¹ (D − β),    u_k = clip(low_k + weight_k V_s, low_k, high_k)
+    V_s = 0 where q_s ≥ D_s,    V_s at its most where q_s ≤ D_s,    q_s = D_s elsewhere,
 
-with D the lower ends of the services' bands. What others do in the interval is known. Nothing is said about a service
-of which a bound, or a donor that is empty, keeps the supply too small: its level falls short.
+with D the lower ends of the services' bands: a linear complementarity problem, by projected Gauss-Seidel sweeps. Where
+an arc is at its bound, or a donor delivers less, the map bends; it is then solved again from there. What others do in
+the interval is known. Nothing is said about a service whose supply cannot be enough: its level falls short.
 """
 
 from __future__ import annotations
@@ -20,8 +21,14 @@ from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.model import Bools
 
-TINY = 1e-12
-"""Part of a supply that arrives, below which it is taken for none."""
+TINY = 1e-9
+"""Part of a supply that arrives in an interval, below which it is taken for none."""
+CLOSE = 1e-12
+"""Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
+PROBE = 1e-3
+"""Part of the most that can be supplied by which the columns of A are found."""
+ROUNDS, SWEEPS = 8, 500
+"""Most times that the map is followed where it bends, and Gauss-Seidel sweeps each time."""
 
 
 class Supply:
@@ -76,23 +83,40 @@ class Supply:
         low, high = (
             table[self._rows].take(step, axis=1) for table in (self._dynamics.control_low, self._dynamics.control_high)
         )
-        least = controls.copy()
-        least[self._rows] = np.where(idle, low, controls[self._rows])
-        tried = np.tile(least, (1, 1 + count))
-        size = np.zeros((count, batch))
-        np.maximum.at(size, self._of, np.where(idle, high - low, 0.0))
-        for s in range(count):
-            arcs = self._of == s
-            part = tried[:, (1 + s) * batch : (2 + s) * batch]
-            part[self._rows[arcs]] += np.where(idle[arcs], self._weights[arcs] * size[s], 0.0)
-        measured = self._measured(stock, inner, tried, step, 1 + count).reshape(count, 1 + count, batch)
-        base, more = measured[:, 0], measured[:, 1:] - measured[:, :1]
-        lacking = self._demand.take(step, axis=1) - base
-        supply = size * _solved(more, lacking, size)
-        found = least
-        wanted = low + self._weights * supply[self._of]
-        found[self._rows] = np.where(idle, np.clip(wanted, low, high), controls[self._rows])
-        return found
+        demand = self._demand.take(step, axis=1)
+        most = np.zeros((count, batch))
+        weights = np.broadcast_to(self._weights, low.shape)
+        room = np.divide(high - low, weights, out=np.zeros_like(low), where=idle & (weights > 0))
+        np.maximum.at(most, self._of, room)
+
+        def supplied(supply: Floats) -> Floats:
+            """Return all controls for V, shape (services, B), shape (controls, B)."""
+            found = controls.copy()
+            wanted = np.minimum(low + self._weights * supply[self._of], high)
+            found[self._rows] = np.where(idle, wanted, controls[self._rows])
+            return found
+
+        supply, probe, interval = np.zeros((count, batch)), None, self._dynamics.network.episode.control_interval
+        open_ = np.ones(batch, dtype=bool)
+        for _ in range(ROUNDS):
+            base = self._measured(stock, inner, supplied(supply), step, 1)
+            lacking = demand - base
+            lacks = (lacking > CLOSE * demand) & (supply < most) | (lacking < -CLOSE * demand) & (supply > 0)
+            open_ &= lacks.any(axis=0)
+            if not open_.any():
+                break
+            if probe is None:  # small beside what lacks, as a donor may hold little more than that
+                probe = np.clip(PROBE * np.abs(lacking) / interval, 1e-12 * most, PROBE * most)
+            # from the most downwards, from elsewhere upwards
+            signed = np.where(supply + probe > most, -probe, probe)
+            tried = [supplied(supply + signed * (np.arange(count) == s)[:, None]) for s in range(count)]
+            measured = self._measured(stock, inner, np.concatenate(tried, axis=1), step, count)
+            more = measured.reshape(count, count, batch) - base[:, None]
+            slope = np.divide(more, signed, out=np.zeros_like(more), where=signed != 0)
+            better = _complementary(slope, lacking, supply, most, interval)
+            probe = np.where(open_, np.maximum(PROBE * np.abs(better - supply), 1e-9 * most), probe)
+            supply = np.where(open_, better, supply)
+        return supplied(supply)
 
     def _measured(self, stock: Floats, inner: Floats, controls: Floats, step: Integers, times: int) -> Floats:
         """Return what the services measure at the end of the interval under several controls, shape (services, …)."""
@@ -102,21 +126,29 @@ class Supply:
         return self._measure(np.concatenate([dynamics.rows.stocks(done.stock), flow]))
 
 
-def _solved(more: Floats, lacking: Floats, size: Floats) -> Floats:
-    """Return x, shape (services, B), of Σ_s more_is x_s = lacking_i, with 0 where nobody supplies or nothing lacks.
+def _complementary(slope: Floats, lacking: Floats, supply: Floats, most: Floats, interval: float) -> Floats:
+    """Return V, shape (services, B), at which nothing lacks that can be supplied, for q linear around ``supply``.
 
-    ``more`` has shape (services, services, B). A supply that does not arrive is as large as it can be.
+    Each copy goes its own way, whatever the others in the batch do.
+
+    Args:
+        slope: A, shape (services, services, B).
+        lacking: D − q at ``supply``, shape (services, B).
+        supply: V.
+        most: largest V.
+        interval: length of an interval, by which a flow becomes a stock.
     """
-    count = len(lacking)
-    if count == 1:
-        arrives = more[0] > TINY * size
-        ratio = np.divide(lacking, more[0], out=np.where(lacking > 0, np.inf, 0.0), where=arrives)
-        return np.where(size > 0, np.maximum(ratio, 0.0), 0.0)
-    matrix, right = more.transpose(2, 0, 1).copy(), np.where(size > 0, lacking, 0.0).T.copy()
-    own = np.arange(count)
-    absent = ~(matrix[:, own, own] > TINY * size.T)
-    # a service without supply, or one whose supply does not arrive, has an equation of its own
-    matrix = np.where(absent[:, :, None], np.eye(count), np.where(absent[:, None, :], 0.0, matrix))
-    right = np.where(absent, np.where(right > 0, 1.0 / TINY, 0.0), right)
-    solved = np.linalg.solve(matrix, right[:, :, None])[:, :, 0].T
-    return np.where(size > 0, np.maximum(solved, 0.0), 0.0)
+    count, found = len(lacking), supply.copy()
+    open_ = np.ones(lacking.shape[1], dtype=bool)
+    for _ in range(SWEEPS):
+        before = found.copy()
+        for s in range(count):
+            short = lacking[s] - (slope[s] * (found - supply)).sum(axis=0)
+            arrives = slope[s, s] > TINY * min(1.0, interval)
+            # what does not arrive stays as it is, or is halved where there is too much
+            step = np.divide(short, slope[s, s], out=np.where(short < 0, -found[s] / 2, 0.0), where=arrives)
+            found[s] = np.where(open_, np.clip(found[s] + step, 0.0, most[s]), found[s])
+        open_ &= (np.abs(found - before) > 1e-15 * most).any(axis=0)
+        if count == 1 or not open_.any():
+            break
+    return found

@@ -54,12 +54,12 @@ class Starts:
         given = self._given({} if options is None else options)
         self.streams = streams  # not before, so that what is refused changes nothing
         drawn = self.draw(range(len(streams)))
+        for rows in self._stages.values():
+            if any(self.names[row] in given for row in rows):
+                drawn[rows] = 0.0  # stages that are not given are empty
         for name, values in given.items():
-            if name in self._stages:
-                drawn[self._stages[name]] = self._spread[name][:, None] * values
-        for name, values in given.items():
-            if name not in self._stages:
-                drawn[self._rows[name]] = values
+            spread_ = self._spread.get(name)
+            drawn[self._rows[name]] = values if spread_ is None else spread_[:, None] * values
         return drawn
 
     def draw(self, which: Sequence[int] | range | Integers) -> Floats:
@@ -123,6 +123,10 @@ class Starts:
         for id_ in given:
             if id_ not in self._rows:
                 raise ControlError(f"initial_state: {unknown('node or inner state', id_, self._rows)}")
+        for id_, rows in self._stages.items():
+            named = [self.names[row] for row in rows if self.names[row] in given]
+            if named and id_ in given:
+                raise ControlError(f"initial_state: '{id_}' and '{named[0]}': give the stock, or its stages, not both")
         checked = {id_: self._initial(id_, values) for id_, values in given.items()}
         for owner, whole in self._wholes.items():
             named = [name for name in whole if name in given]

@@ -11,6 +11,9 @@ from cirl_marl.network.elements import Lifetime, Node
 from cirl_marl.network.lifetimes import Chain
 from cirl_marl.network.rowsum import Floats
 
+STEEPEST = 100.0
+"""Most by which the logarithm of what enters may grow in a lifetime."""
+
 
 def slots(lifetime: Lifetime, interval: float) -> int:
     """Return how many control intervals a fixed lifetime takes."""
@@ -33,8 +36,10 @@ def remaining(node: Node, interval: float) -> Floats:
     stages = np.zeros(chain.stages)
     if growth is not None:
         stages = chain.grown(growth * lifetime.mean) * _first(node, interval) * lifetime.mean
+    whole = held_for(chain, interval / lifetime.mean)
     for begin, end, inflow in zip(edges[:-1], edges[1:], history.means(edges), strict=True):
-        kept, got = held_for(chain, (end - begin) / lifetime.mean)
+        shorter = end - begin < interval * (1 - 1e-9)
+        kept, got = held_for(chain, (end - begin) / lifetime.mean) if shorter else whole
         stages = kept @ stages + got * inflow * lifetime.mean
     return stages
 
@@ -105,8 +110,10 @@ def age_problems(node: Node, interval: float) -> Iterator[str]:
     """Yield why the ages of a node's initial stock cannot be told."""
     lifetime, history = node.lifetime, node.history
     assert lifetime is not None
-    chain = lifetime.chain
-    if chain is not None and node.growth is not None and node.growth * lifetime.mean <= -chain.rate:
+    chain, growth = lifetime.chain, node.growth or 0.0
+    if abs(growth) * max(lifetime.mean, interval) > STEEPEST:
+        yield f"growth {growth:g}: in a lifetime of {lifetime.mean:g} it makes too much of nothing; is it in percent?"
+    elif chain is not None and node.growth is not None and node.growth * lifetime.mean <= -chain.rate:
         yield (
             f"growth {node.growth:g}: no stock has a lifetime of {lifetime.mean:g} and shrinks so fast; it must be "
             f"above {-chain.rate / lifetime.mean:.4g}"

@@ -99,7 +99,12 @@ class Series(Checked, Changing):
             return f"series begins at {said(self.times[0])}, not before the episode does"
         if self.end < 0:
             return f"series ends at {said(self.end)}, before the episode begins at {said(0.0)}; give what is missing"
-        other = "" if self.factor is None else self.factor.unfinished(said)
+        if self.factor is None:
+            return ""
+        if self.factor.times[0] > self.times[0]:
+            late = f"series begins at {said(self.factor.times[0])}, after what it multiplies at {said(self.times[0])}"
+            return f"multiplied_by: {late}; give what is missing"
+        other = self.factor.unfinished(said)
         return other and f"multiplied_by: {other}"
 
     def means(self, edges: Floats) -> Floats:

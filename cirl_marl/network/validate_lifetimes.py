@@ -38,7 +38,7 @@ def lifetime_problems(network: Parts, node: Node, arcs: Sequence[Arc]) -> Iterat
     if node.lifetime.distribution == FIXED and (kind is ControlKind.STRETCH or node.stretch != 1.0):
         mistakes.append(f"{where}stretch: a fixed lifetime has none; give it a distribution and a small deviation")
     yield from mistakes
-    if not mistakes:
+    if not mistakes and not [*bound_problems(node)]:
         yield from (f"{where}{each}" for each in age_problems(node, network.episode.control_interval))
 
 

@@ -176,6 +176,7 @@ def _reached(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, in
     found = system.reach(lifetimes.start_reached @ initial, intervals, delayed)
     most = [
         each.rate[intervals.start : intervals.stop] * found.upper[:, each.reached_node]
+        + each.at_once * found.upper[:, each.reached_entry]
         if len(each.rate)
         else np.array([slots[each.reached_arc].most(t, found.entered) for t in range(len(intervals))])
         for each in lifetimes.lived

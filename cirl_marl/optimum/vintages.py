@@ -52,7 +52,9 @@ class Lived:
         leaving: the arc of the planned network through which what has lived goes.
         entering: its arcs through which something enters.
         rate: μ in each interval, shape (steps,), 1/time; empty for a fixed one.
+        at_once: w_0, part of what enters that leaves at once.
         reached_node: the node, or its last stage, among the nodes of ``reached``.
+        reached_entry: where what enters is among them; the node itself of a fixed one.
         reached_arc: ``leaving`` among its arcs.
     """
 
@@ -61,7 +63,9 @@ class Lived:
     leaving: int
     entering: Integers
     rate: Floats
+    at_once: float
     reached_node: int
+    reached_entry: int
     reached_arc: int
 
     def slots(self, initial: Floats) -> Floats:
@@ -109,6 +113,8 @@ class Lifetimes:
                     leaving=planned.arc_index[planned.leaving[node.id]],
                     entering=np.flatnonzero(planned.recipients == planned.node_index[node.id]),
                     rate=rate,
+                    at_once=0.0 if chain is None else chain.weights[0],
+                    reached_entry=self.reached.node_index[node.id if chain is None else f"{node.id}.entry"],
                     reached_node=self.reached.node_index[node.id],
                     reached_arc=self.reached.arc_index[planned.leaving[node.id]],
                 )

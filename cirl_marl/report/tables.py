@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law
+from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Lifetime
 
 
 def networks_table(networks: Mapping[str, Network]) -> Table:
@@ -66,7 +66,7 @@ def law_text(network: Network, arc: Arc) -> str:
     if arc.law is Law.RECIPIENT:
         return f"{arc.rate:g} x({arc.recipient})"
     if arc.law is Law.CONTROLLED:
-        return "u"
+        return f"u, makes up for {arc.makes_up_for}" if arc.makes_up_for else "u"
     if arc.law is Law.COMPARTMENT:
         return f"{arc.rate:g} y({arc.by})"
     if arc.law is Law.BATCH:
@@ -75,14 +75,26 @@ def law_text(network: Network, arc: Arc) -> str:
     if arc.law is Law.SHARE:
         donor = network.nodes[network.node_index[arc.donor]]
         share = "s" if arc.control else "rest" if arc.share is None else f"{arc.share:g}"
+        if donor.lifetime is not None:
+            return f"{share} of what {lifetime_text(donor.lifetime)} in {donor.id} lets go"
         return f"{share} of {donor.rate:g} x({donor.id})" if donor.stores else f"{share} of {donor.id}"
     return f"{arc.flow:g}"
 
 
+def lifetime_text(lifetime: Lifetime) -> str:
+    """Say a lifetime: its mean, its deviation and its distribution."""
+    spread = f" ± {lifetime.deviation:g}" if lifetime.deviation is not None else ""
+    return f"a {lifetime.distribution.replace('_', ' ')} lifetime of {lifetime.mean:g}{spread}"
+
+
 def control_text(network: Network, compartment: Compartment) -> str:
-    """Say what an agent sets: bounds, with the neutral value between them; empty if the compartment does not act."""
+    """Say what an agent sets: bounds, with the neutral value between them; empty if the compartment does not act.
+
+    What makes up for a service while nobody acts has its bounds, too.
+    """
     control = compartment.control
-    if control is None or compartment.id not in network.agents:
+    supplies = isinstance(compartment, Arc) and bool(compartment.makes_up_for)
+    if control is None or not (compartment.id in network.agents or supplies):
         return ""
     bounds = f"{control.low:g} | {control.neutral:g} | {control.high:g}"
     if control.kind is ControlKind.INPUT and compartment.model is not None:
