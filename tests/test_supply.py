@@ -228,7 +228,8 @@ def test_where_one_is_at_its_bound_others_supply_more(high: tuple[float, float])
 def test_services_that_hang_together_are_all_met() -> None:
     """Two sources of one market, one for each product: as much as the product needs that lacks more."""
     network = town((0.25, 0.75))
-    changed: dict[str, dict[str, Any]] = {"mine_a": {"weight": None}, "mine_b": {"weight": None, "makes_up_for": "living"}}
+    homes = {"weight": None, "makes_up_for": "living"}
+    changed: dict[str, dict[str, Any]] = {"mine_a": {"weight": None}, "mine_b": homes}
     arcs = [replace(arc, **changed.get(arc.id, {})) for arc in network.arcs if arc.id != "import"]
     run = rollout(VectorEnv(replace(network, arcs=tuple(arcs)), num_envs=1), Neutral())
     wanted = np.array([network.held(service.low) for service in network.services])
