@@ -261,6 +261,8 @@ def test_bounds_allow_all_that_may_be_supplied() -> None:
     """An idle supply may be anything in the program; its plan is carried out with what is supplied then."""
     network = replace(cycle("lifetimes"), acting=("old_scrap",))
     found = bound(network, min_service=0.999)
+    assert str(found).endswith("smelting may supply anything within bounds in it")
+    assert "may supply" not in str(bound(cycle(), min_service=0.9, horizon=3))
     run = achieved(improved(found))
     assert float(run.episode_circularity[0]) <= found.objective
     neutral = rollout(VectorEnv(network, num_envs=1), Neutral())

@@ -88,10 +88,16 @@ class Bound:
         what = f"λ̄ ≤ {self.objective:.6g} {mass}{demand}"
         if self.service_weight is not None:
             what = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
-        return (
-            f"bound of {self.network.name} over {self.network.episode.horizon} steps: {what}; "
-            f"its plan promises λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
-        )
+        promised = f"λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
+        where = f"bound of {self.network.name} over {self.network.episode.horizon} steps"
+        return f"{where}: {what}; its plan promises {promised}{self._idle}"
+
+    @property
+    def _idle(self) -> str:
+        """Say which supplies nobody acts on, of which the program knows the bounds alone."""
+        acting = self.agents or self.network.agents
+        idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in acting]
+        return f"; {', '.join(idle)} may supply anything within bounds in it" if idle else ""
 
     def verify(self) -> Verification:
         """Compute the bound again from the program's matrices and the multipliers, without the solver."""
