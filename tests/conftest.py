@@ -263,7 +263,7 @@ def _living(rng: np.random.Generator, node: Node, interval: float, horizon: int)
         control=control,
         lifetime=Lifetime(
             mean=mean,
-            deviation=mean * float(rng.uniform(0.25, 1)) if kind not in (FIXED, "exponential") else None,
+            deviation=mean * float(rng.uniform(0.4, 1)) if kind not in (FIXED, "exponential") else None,
             distribution=kind,
         ),
         stretch=changing if kind != FIXED else 1.0,
@@ -348,6 +348,6 @@ st.register_type_strategy(
         st.integers(1, 12),
         st.integers(0, 20),
         runge_kutta=st.sampled_from([False, False, True]),
-        lifetimes=st.booleans(),
+        lifetimes=st.sampled_from([False, False, True]),
     ),
 )

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.medium
 ROOT = Path(__file__).parent.parent
 
 
+@pytest.mark.slow
 def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs are made again if their seeds, options, recipe or network are no longer those of the study."""
     options = (("steps", 320), ("reward", "team"))

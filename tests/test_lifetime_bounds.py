@@ -73,7 +73,7 @@ def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: 
 @pytest.mark.parametrize("lifetime", [LIVES[0], LIVES[2], Lifetime(mean=0.6, deviation=0.3, distribution="weibull")])
 def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | Series) -> None:
     """Those of what leaves, with the moments of an episode that is simulated in short steps."""
-    years = 6
+    years = 4
     network = town(lifetime, INFLOW[:years], initial=30.0, growth=0.02, stretch=stretch)
     programs = Programs(Admissible.of(network), 2, None)
     lifetimes, layout = programs.admissible.lifetimes, programs.layout
@@ -128,17 +128,17 @@ def test_a_delay_is_exact() -> None:
 def test_a_cycle_of_four_products_is_planned() -> None:
     """Within one per cent of the bound at the demanded service; from other starts too, and by MPC as well."""
     network = product_cycle(6)
-    found = bound(network, min_service=0.95)
+    found = bound(network, min_service=0.9)
     assert found.verify().bound == found.objective
     run = achieved(improved(found))
-    assert run.episode_levels[0].min() >= 0.95 - 1e-4
+    assert run.episode_levels[0].min() >= 0.9 - 1e-4
     assert 0.0 <= found.gap(run.episode_circularity)[0] < 0.01
     starts = network.initial[1] * np.array([[0.97], [1.0]])
-    together = envelope(network, starts, min_service=0.95, solves=2)
-    solved = [bound(network, start, min_service=0.95).objective for start in starts]
+    together = envelope(network, starts, min_service=0.9, solves=2)
+    solved = [bound(network, start, min_service=0.9).objective for start in starts]
     assert (together.at(starts) >= np.array(solved) - 1e-6).all()
-    controlled = rollout(VectorEnv(network, num_envs=1), MPC(min_service=0.95))
-    assert controlled.episode_levels[0].min() >= 0.94
+    controlled = rollout(VectorEnv(network, num_envs=1), MPC(min_service=0.9))
+    assert controlled.episode_levels[0].min() >= 0.89
     assert 0.0 <= found.gap(controlled.episode_circularity)[0] < 0.05
 
 

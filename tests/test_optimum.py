@@ -349,7 +349,7 @@ def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float)
 
 
 @pytest.mark.medium
-@settings(max_examples=settings().max_examples // 2)
+@settings(max_examples=settings().max_examples // 3)
 @given(network=st.from_type(Network), seed=st.integers(0, 1000), weight=st.sampled_from([None, 0.3]))
 def test_multipliers_of_one_start_bound_another(network: Network, seed: int, weight: float | None) -> None:
     """``at`` is the bound itself at its own start, and nowhere less than what is solved there."""

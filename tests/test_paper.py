@@ -108,6 +108,7 @@ def cirl(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 
 @pytest.mark.medium
+@pytest.mark.sample(1)
 @pytest.mark.parametrize(("algorithm", "steps", "done"), [("A2C", 300, 300), ("ARS", 300, 800), ("DDPG", 150, 150)])
 def test_row_is_trained_kept_and_not_run_again(
     algorithm: str,

@@ -45,6 +45,8 @@ def evaluations(run: RunDirectory) -> list[dict[str, float]]:
         return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
 
+@pytest.mark.medium
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("demanded", [None, 0.0, 0.97, 1.0])
 def test_the_best_checkpoint_acts(tmp_path: Path, demanded: float | None) -> None:
     """It is the best row by the rule, its policies give the figures of that row again, and the choice is said."""

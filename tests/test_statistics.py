@@ -60,8 +60,7 @@ def test_seeds_are_resampled_within_each_network() -> None:
     assert (found.value, found.low, found.high) == (5.0, 5.0, 5.0)
 
 
-@pytest.mark.medium
-@pytest.mark.sample(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("networks", "seeds", "least", "most"), [(4, 10, 0.915, 0.945), (1, 10, 0.92, 0.95), (1, 5, 0.89, 0.92)]
 )
