@@ -37,6 +37,7 @@ from cirl_marl.network import Network
 from cirl_marl.network.ages import remaining
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.lifetimes import chain_of
+from cirl_marl.report.tables import law_text, nodes_table
 from cirl_marl.report.trajectory import write_trajectory
 
 Floats = NDArray[np.floating]
@@ -338,6 +339,15 @@ def test_an_episode_is_written_with_its_ages(tmp_path: Path) -> None:
         middles = [(float(each["from the age of (year)"]) + float(each["to the age of (year)"])) / 2 for each in now]
         weighted = sum(age * float(each["stock (kt)"]) for age, each in zip(middles, now, strict=True))
         assert weighted / total == pytest.approx(float(row["mean age of use (year)"]), rel=1e-9)
+
+
+def test_lifetimes_are_shown() -> None:
+    """In the law of what leaves, and as the stock at the start that a history leaves."""
+    network = town(LIVES[0], INFLOW[:3], initial=None, history=Series(times=(-9.0,), values=(2.0,)))
+    assert law_text(network, network.arcs[1]) == "rest of what a weibull lifetime of 9 ± 3 in use lets go"
+    table = nodes_table(network, network.initial[0])
+    assert list(table.columns[2].cells)[1] == "left of its history"
+    assert law_text(town(LIVES[1]), network.arcs[1]) == "rest of what a fixed lifetime of 7 in use lets go"
 
 
 def test_narrow_lifetimes_are_remarked_on() -> None:

@@ -119,6 +119,8 @@ def save_bands(path: str | Path, found: SampledEpisodes, *, title: str) -> Path:
         axes.plot(time, middle, color=SERIES[0], label="median")
         dressed(axes, title=spoken(name), ylabel=unit, size=8.0)
         time_axis(axes, dated(np.array([0.0, ends[-1]]), network), network)
+        if name.startswith("level"):
+            axes.set_ylim(-0.03, 1.06)
     for axes in grid[len(shown) :]:
         axes.set_axis_off()
     handles, names = grid[0].get_legend_handles_labels()

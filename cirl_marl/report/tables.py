@@ -33,7 +33,8 @@ def nodes_table(network: Network, stock: Floats) -> Table:
         if node.stores:
             low, high = network.initial[:, i]
             span = f"{low:g}" if low == high else f"{low:g} – {high:g}"
-            span, held = "all that is asked for" if node.initial is None else span, f"{stock[i]:.5g}"
+            known = "left of its history" if node.history is not None else "all that is asked for"
+            span, held = span if node.initial is not None else known, f"{stock[i]:.5g}"
         table.add_row(node.id, node.role.value, span, held, _target(node), control_text(network, node))
     return table
 
