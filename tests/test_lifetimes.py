@@ -11,6 +11,8 @@ from typing import Any
 import flodym
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import optimize, special
 
@@ -33,6 +35,7 @@ from cirl_marl.controllers.pyramids import pyramids
 from cirl_marl.controllers.remarks import remarks
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.definitions.reading import write_network
+from cirl_marl.dynamics.stages import staged
 from cirl_marl.network import Network
 from cirl_marl.network.ages import remaining
 from cirl_marl.network.elements import Lifetime
@@ -317,6 +320,29 @@ def test_ages_are_those_of_cohorts(lifetime: Lifetime, stretch: float | Series) 
         np.testing.assert_allclose(found.mass[20], INFLOW[59:52:-1])
 
 
+@given(network=st.from_type(Network))
+def test_stages_count_as_their_node(network: Network) -> None:
+    """In λ, whatever its role: what moves within a node counts nothing, what enters and leaves it as it did."""
+    written, arcs = staged(network), len(network.arcs)
+    np.testing.assert_array_equal(written.sustainability[:arcs], network.sustainability)
+    np.testing.assert_array_equal(written.environmental[:arcs], network.environmental)
+    assert not written.sustainability[arcs:].any() and not written.environmental[arcs:].any()
+
+
+def test_shorter_lives_are_within_what_is_observed() -> None:
+    """Flows that a stretch below 1 makes larger lie in the space, and are solved with as many steps as they need."""
+    control = Control(kind=ControlKind.STRETCH, low=0.05, neutral=1.0, high=2.0)
+    network = town(LIVES[0], np.full(6, 5.0), initial=45.0, control=control)
+    env = VectorEnv(network, num_envs=1, observe="full")
+    seen = env.reset(seed=0)
+    for _ in range(5):
+        assert env.observation_spaces["use"].contains(seen["use"][0])
+        seen = env.step({"use": np.array([[-1.0]])})[0]
+    short = replace(network.nodes[1], control=None, lifetime=replace(LIVES[0], mean=0.45, deviation=0.15))
+    other = replace(network, nodes=(network.nodes[0], short, network.nodes[2]))
+    assert env.dynamics.substeps == VectorEnv(other, num_envs=1).dynamics.substeps
+
+
 def test_a_stretch_that_agents_set_makes_stocks_older() -> None:
     """The pyramid follows what they did."""
     control = Control(kind=ControlKind.STRETCH, low=0.5, neutral=1.0, high=2.0)
@@ -327,7 +353,7 @@ def test_a_stretch_that_agents_set_makes_stocks_older() -> None:
         start = env.rows.stocks(env.physical.stock)[:, 0].copy()
         run = rollout(env, Constant({"use": action}))
         (found,) = pyramids(network, run, start)
-        np.testing.assert_allclose(found.mass.sum(axis=1)[1:], run.stock[:, 1], rtol=1e-3)
+        np.testing.assert_allclose(found.mass.sum(axis=1)[1:], run.stock[:, 1], rtol=5e-5)
         means.append(found.mean_age[-1])
     np.testing.assert_allclose(np.array(means) / means[1], [0.5, 1.0, 2.0], rtol=0.1)
 
@@ -350,6 +376,18 @@ def test_an_episode_is_written_with_its_ages(tmp_path: Path) -> None:
         middles = [(float(each["from the age of (year)"]) + float(each["to the age of (year)"])) / 2 for each in now]
         weighted = sum(age * float(each["stock (kt)"]) for age, each in zip(middles, now, strict=True))
         assert weighted / total == pytest.approx(float(row["mean age of use (year)"]), rel=1e-9)
+
+
+def test_the_oldest_stay_in_their_class() -> None:
+    """Of what nothing is added to, all that is left is old, and none of it is lost from the pyramid."""
+    network = town(LIVES[0], np.zeros(16), initial=40.0)
+    env = VectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    start = env.rows.stocks(env.physical.stock)[:, 0].copy()
+    run = rollout(env, Neutral())
+    (found,) = pyramids(network, run, start)
+    np.testing.assert_allclose(found.mass.sum(axis=1)[1:], run.stock[:, 1], rtol=1e-2)
+    assert run.stock[-1, 1] < 0.01 and found.mean_age[-1] > 15
 
 
 def test_lifetimes_are_shown() -> None:

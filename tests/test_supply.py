@@ -69,6 +69,17 @@ def test_supply_is_what_lacks(scenario: str) -> None:
     assert (met > 15).all()
 
 
+def test_the_first_flows_are_those_of_business_as_usual() -> None:
+    """What is seen before anybody acts: nothing is mined unless something lacks."""
+    network = cycle()
+    env = VectorEnv(network, num_envs=2)
+    env.reset(seed=0, options={"initial_state": {"use": np.array([900.0, 1150.0])}})
+    first = env.physical.flow[0].copy()
+    neutral = env.advance(env.stack(env.neutral_action)).flow[0]
+    assert first[0] > 50.0 and first[1] == 0.0
+    np.testing.assert_allclose(first, neutral, rtol=1e-6)
+
+
 def test_a_chain_falls_short_as_far_as_its_bounds_say() -> None:
     """Then all that can be had is supplied, and the level of the service tells what lacks."""
     network = cycle(high=60.0)
@@ -106,11 +117,11 @@ def test_counterfactuals_supply_anew(acting: list[str]) -> None:
     network = cycle()
     env = VectorEnv(network, num_envs=2, agents=acting, reward="difference")
     other = VectorEnv(network, num_envs=2, agents=acting, reward="circularity")
-    env.reset(3)
-    other.reset(3)
+    for each in (env, other):
+        each.reset(3, options={"initial_state": {"use": 1000.0}})
     rng = np.random.default_rng(0)
     for _ in range(8):
-        actions, here = rng.uniform(-1, 1, (len(acting), 2)), env.snapshot()
+        actions, here = rng.uniform(-1, -0.8, (len(acting), 2)), env.snapshot()  # too little to need nothing more
         reward = env.advance(actions).reward
         for row, agent in enumerate(acting):
             other.restore(here)

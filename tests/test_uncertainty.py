@@ -83,6 +83,8 @@ def test_shares_stay_shares() -> None:
     wide = Spread(low=0.1, high=9.0, distribution="uniform")
     stated = drawn(line({"arcs.tails.share": wide}, kept=0.8), [1.0])
     assert stated.arcs[1].share == pytest.approx(1.8 / 2.6) and stated.arcs[2].share == pytest.approx(0.8 / 2.6)
+    little = drawn(line({"arcs.tails.share": wide}, kept=0.8), [0.0])
+    assert little.arcs[1].share == pytest.approx(0.02 / 0.82) and little.arcs[2].share == pytest.approx(0.8 / 0.82)
     rest = drawn(line({"arcs.tails.share": wide}), [1.0])
     assert rest.arcs[1].share == pytest.approx(1.0)
     assert drawn(line({"arcs.tails.share": wide}), [0.0]).arcs[1].share == pytest.approx(0.02)
