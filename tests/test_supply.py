@@ -204,10 +204,11 @@ def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0
     )
 
 
+@pytest.mark.parametrize("most", [50.0, 1e4, 1e7])
 @pytest.mark.parametrize(("stock", "export"), [(12.0, 0.0), (1000.0, 0.0), (120.0, 10.0)])
-def test_a_small_reserve_gives_no_more_than_is_needed(stock: float, export: float) -> None:
+def test_a_small_reserve_gives_no_more_than_is_needed(stock: float, export: float, most: float) -> None:
     """However wide the bounds of the control; when it is used up the service falls short."""
-    run = rollout(VectorEnv(reserve(stock, 1e4, export=export), num_envs=1), Neutral())
+    run = rollout(VectorEnv(reserve(stock, most, export=export), num_envs=1), Neutral())
     use, left = run.stock[:, 1], run.stock[:, 0]
     enough = left > 1e-6
     np.testing.assert_allclose(use[enough], 47.0, rtol=1e-9)

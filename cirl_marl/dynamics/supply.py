@@ -25,8 +25,8 @@ TINY = 1e-9
 """Part of a supply that arrives in an interval, below which it is taken for none."""
 CLOSE = 1e-12
 """Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
-PROBE = 1e-3
-"""Part of the most that can be supplied by which the columns of A are found."""
+PROBE, LEAST = 1e-3, 1e-6
+"""Parts of what lacks, and of what is demanded, by the larger of which the columns of A are found."""
 ROUNDS, SWEEPS = 8, 500
 """Most times that the map is followed where it bends, and Gauss-Seidel sweeps each time."""
 
@@ -96,7 +96,7 @@ class Supply:
             found[self._rows] = np.where(idle, wanted, controls[self._rows])
             return found
 
-        supply, probe, interval = np.zeros((count, batch)), None, self._dynamics.network.episode.control_interval
+        supply, interval = np.zeros((count, batch)), self._dynamics.network.episode.control_interval
         open_ = np.ones(batch, dtype=bool)
         for _ in range(ROUNDS):
             base = self._measured(stock, inner, supplied(supply), step, 1)
@@ -105,16 +105,13 @@ class Supply:
             open_ &= lacks.any(axis=0)
             if not open_.any():
                 break
-            if probe is None:  # small beside what lacks, as a donor may hold little more than that
-                probe = np.clip(PROBE * np.abs(lacking) / interval, 1e-12 * most, PROBE * most)
-            # from the most downwards, from elsewhere upwards
-            signed = np.where(supply + probe > most, -probe, probe)
-            tried = [supplied(supply + signed * (np.arange(count) == s)[:, None]) for s in range(count)]
+            # small beside what lacks, as a donor may hold little more than that, and not lost in rounding
+            probe = np.minimum(np.maximum(PROBE * np.abs(lacking), LEAST * demand) / interval, PROBE * most)
+            tried = [supplied(supply + probe * (np.arange(count) == s)[:, None]) for s in range(count)]
             measured = self._measured(stock, inner, np.concatenate(tried, axis=1), step, count)
             more = measured.reshape(count, count, batch) - base[:, None]
-            slope = np.divide(more, signed, out=np.zeros_like(more), where=signed != 0)
+            slope = np.divide(more, probe, out=np.zeros_like(more), where=probe > 0)
             better = _complementary(slope, lacking, supply, most, interval)
-            probe = np.where(open_, np.maximum(PROBE * np.abs(better - supply), 1e-9 * most), probe)
             supply = np.where(open_, better, supply)
         return supplied(supply)
 
@@ -145,10 +142,10 @@ def _complementary(slope: Floats, lacking: Floats, supply: Floats, most: Floats,
         for s in range(count):
             short = lacking[s] - (slope[s] * (found - supply)).sum(axis=0)
             arrives = slope[s, s] > TINY * min(1.0, interval)
-            # what does not arrive stays as it is, or is halved where there is too much
-            step = np.divide(short, slope[s, s], out=np.where(short < 0, -found[s] / 2, 0.0), where=arrives)
+            # more of what does not arrive is not supplied
+            step = np.divide(short, slope[s, s], out=np.zeros_like(short), where=arrives)
             found[s] = np.where(open_, np.clip(found[s] + step, 0.0, most[s]), found[s])
-        open_ &= (np.abs(found - before) > 1e-15 * most).any(axis=0)
+        open_ &= (np.abs(found - before) > 1e-15 * found).any(axis=0)
         if count == 1 or not open_.any():
             break
     return found
