@@ -22,11 +22,11 @@ from scipy import special
 
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.kernels import weighted
 from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.reach import Linear
 from cirl_marl.optimum.rows import ProgramRows
 from cirl_marl.optimum.shared import followers, leader
-from cirl_marl.optimum.vintages import weighted
 
 FAST = (0.5, 2.0, 8.0)
 """Turnovers in a piece from which on a stock counts as fast; there are rows for each choice."""
