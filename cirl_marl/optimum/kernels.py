@@ -1,0 +1,166 @@
+"""What leaves a chain of stages, weighted with Bernstein polynomials: kernels, and polynomials that enclose them.
+
+Theorem 4 of docs/bound.md has the notation; here a piece has length 1, and σ = 1 − τ is the time that is left of it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.linalg import expm
+
+from cirl_marl.network import Floats
+from cirl_marl.network.lifetimes import Chain
+
+TERMS = 26
+"""Degree to which kernels are expanded; what is left out is below 1e-13 of them."""
+MARGIN = 1e-12
+"""Widening of every enclosure, relative to the largest value of its kernel, for rounding errors, which are smaller."""
+
+
+class Kernel:
+    """What leaves a chain in pieces of equal length, of what is there and of what enters.
+
+    Attributes:
+        known: of what is there in each stage, shape (pieces, d + 1, stages), 1/time.
+        low: c̲ of each piece and moment, by those of what enters, shape (pieces, d + 1, pieces, d + 1).
+        high: c̄, likewise; both with w_0.
+    """
+
+    def __init__(self, chain: Chain, rate: Floats, length: float, degree: int) -> None:
+        """Compute it for a rate μ in each piece, shape (pieces,), 1/time."""
+        pieces, stages, moments = len(rate), chain.stages, degree + 1
+        shape = (pieces, moments, pieces, moments)
+        self.known, self.low, self.high = np.zeros((pieces, moments, stages)), np.zeros(shape), np.zeros(shape)
+        unit = chain.matrix / chain.rate
+        motions = {each: _Motion(unit, each * length, chain.entering, degree) for each in np.unique(rate).tolist()}
+        parts = [motions[each] for each in rate.tolist()]
+        gathered, passed = np.empty((0, moments, stages)), np.eye(stages)
+        for p, motion in enumerate(parts):
+            self.known[p] = motion.left @ passed / length
+            passed = motion.whole @ passed
+        for q in reversed(range(pieces)):
+            # of what is there at the end of piece q, what leaves in each later one
+            if q + 1 < pieces:
+                gathered = np.concatenate([parts[q + 1].left[None], gathered @ parts[q + 1].whole])
+            for target, (low, high) in (
+                (slice(q, q + 1), parts[q].own),
+                (slice(q + 1, pieces), parts[q].later.enclosed(gathered.reshape(-1, stages) / moments)),
+            ):
+                self.low[target, :, q], self.high[target, :, q] = (
+                    each.reshape(-1, moments, moments) for each in (low, high)
+                )
+        at_once = chain.weights[0] * np.eye(pieces * moments).reshape(shape)
+        self.low += at_once
+        self.high += at_once
+
+
+class _Motion:
+    """The motion of stages in a piece in which they have passed on μδ times what they hold.
+
+    Attributes:
+        whole: e^(Aδ), shape (stages, stages).
+        left: what leaves, weighted with B_i and times (d + 1), of what is there at its start, shape (d + 1, stages).
+        later: of what enters in the piece, where it is at its end.
+        own: enclosure of what leaves in the piece of what enters in it, shape (d + 1, d + 1) each.
+    """
+
+    def __init__(self, unit: Floats, turnover: float, entering: Floats, degree: int) -> None:
+        stages, matrix = len(unit), unit * turnover
+        means, self.whole = weighted(matrix, degree)
+        self.left = turnover * means[:, -1]
+        self.later = _Smooth(matrix, entering[:, None], degree)
+        # y' = A y + E ψ_0, ψ_l' = ψ_(l+1): with ψ_0 the polynomial, read from the end of the piece
+        chained = np.zeros((stages + degree + 1,) * 2)
+        chained[:stages, :stages], chained[:stages, stages] = matrix, entering
+        chained[stages:, stages:] = np.eye(degree + 1, k=1)
+        start = np.zeros((stages + degree + 1, degree + 1))
+        start[stages:] = np.stack([_derivatives(degree, degree - i) for i in range(degree + 1)], axis=1)
+        last = np.zeros((1, stages + degree + 1))
+        last[0, stages - 1] = turnover
+        low, high = _Smooth(chained, start, degree).enclosed(last)
+        self.own = low, high
+
+
+class _Smooth:
+    """f(τ) = v e^(M(1 − τ)) z on [0, 1], for many v and z."""
+
+    def __init__(self, matrix: Floats, start: Floats, degree: int) -> None:
+        """Expand e^(Mσ) z for the columns z of ``start``."""
+        self._degree, self._columns = degree, start.shape[1]
+        count = max(1, math.ceil(float(np.abs(matrix).sum(axis=0).max(initial=0.0)) / 2))
+        nodes = (1 - np.cos(np.pi * (2 * np.arange(degree + 1) + 1) / (2 * degree + 2))) / 2
+        bernstein = np.stack([_polynomial(degree, j, nodes) for j in range(degree + 1)], axis=1)
+        values = np.stack([expm(matrix * node) @ start for node in nodes], axis=2)
+        self._near = values @ np.linalg.inv(bernstein).T  # coefficients of B_j(σ) that interpolate, shape (n, z, d + 1)
+        step, at = expm(matrix / count), start
+        found = []
+        for part in range(count):
+            term, powers = at, []
+            for m in range(TERMS + 1):
+                powers.append(term)
+                term = matrix @ term / (count * (m + 1))
+            found.append(np.stack(powers, axis=2) @ _to_bernstein(TERMS) - self._near @ _within(degree, part, count))
+            at = step @ at
+        self._rest = np.concatenate(found, axis=2)
+
+    def enclosed(self, rows: Floats) -> tuple[Floats, Floats]:
+        """Return the coefficients of B_j(τ) below and above f, shape (v, z, d + 1) each."""
+        near = np.einsum("vn,nzj->vzj", rows, self._near, optimize=True)
+        rest = np.einsum("vn,nzj->vzj", rows, self._rest, optimize=True)
+        margin = MARGIN * np.abs(near).max(axis=2, initial=0.0, keepdims=True)
+        low = near + rest.min(axis=2, initial=0.0, keepdims=True) - margin
+        high = near + rest.max(axis=2, initial=0.0, keepdims=True) + margin
+        return low[:, :, ::-1], high[:, :, ::-1]
+
+
+def weighted(matrix: Floats, degree: int, length: float = 1.0) -> tuple[Floats, Floats]:
+    """Return the means of e^{Ms} under B_0 … B_d, and e^{Mδ}, shape (d + 1, n, n) and (n, n).
+
+    The first row of exp of the blocks [[M, I, 0, …], [0, 0, I, …], …]·δ has e^{Mδ}, then, for m = 0 … d, the integrals
+    of e^{Ms}(δ − s)^m/m! (Van Loan 1978); B_i is a sum of powers of 1 − s/δ.
+    """
+    n = len(matrix)
+    blocks = np.kron(np.eye(degree + 2, k=1), np.eye(n))
+    blocks[:n, :n] = matrix
+    first = expm(blocks * length)[:n].reshape(n, degree + 2, n).transpose(1, 0, 2)
+    powers = [first[m + 1] * math.factorial(m) / length**m for m in range(degree + 1)]
+    means = [
+        sum(math.comb(i, j) * (-1) ** j * powers[degree - i + j] for j in range(i + 1))
+        * (math.comb(degree, i) * (degree + 1) / length)
+        for i in range(degree + 1)
+    ]
+    return np.array(means), first[0]
+
+
+def _polynomial(degree: int, j: int, at: Floats) -> Floats:
+    return math.comb(degree, j) * at**j * (1 - at) ** (degree - j)
+
+
+def _derivatives(degree: int, j: int) -> Floats:
+    """Return the derivatives of B_j at 0, of order 0 … d."""
+    power = np.polynomial.polynomial.polypow([1.0, -1.0], degree - j)
+    coefficients = np.concatenate([np.zeros(j), math.comb(degree, j) * power])
+    found: Floats = coefficients * np.array([math.factorial(order) for order in range(degree + 1)])
+    return found
+
+
+def _to_bernstein(degree: int) -> Floats:
+    """Return what turns coefficients of powers into those of B_j, shape (d + 1, d + 1)."""
+    return np.array(
+        [
+            [math.comb(j, m) / math.comb(degree, m) if m <= j else 0.0 for j in range(degree + 1)]
+            for m in range(degree + 1)
+        ]
+    )
+
+
+def _within(degree: int, part: int, count: int) -> Floats:
+    """Return what turns coefficients of B_j on [0, 1] into those of degree ``TERMS`` on one of equal parts of it."""
+    found = np.zeros((degree + 1, TERMS + 1))
+    inside = np.polynomial.Polynomial([part / count, 1 / count])
+    for j in range(degree + 1):
+        powers = np.polynomial.Polynomial(_derivatives(degree, j) / [math.factorial(m) for m in range(degree + 1)])
+        found[j, : degree + 1] = np.resize(np.append(powers(inside).coef, np.zeros(degree + 1)), degree + 1)
+    return found @ _to_bernstein(TERMS)
