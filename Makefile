@@ -40,7 +40,7 @@ wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clea
 	$(BIN)/python -m build --wheel --outdir dist . > /dev/null
 	$(BIN)/check-wheel-contents dist
 	$(PYTHON) -m venv build/clean
-	build/clean/bin/python -m pip install --disable-pip-version-check --quiet -c constraints.txt dist/*.whl
+	build/clean/bin/python -m pip install --disable-pip-version-check --quiet --no-compile -c constraints.txt dist/*.whl
 	$(PYTHON) tests/installed.py build/clean
 
 written: $(VENV)/.runtime  ## the JSON schema of networks and docs/format.md, from the declarations of fields
@@ -64,7 +64,7 @@ $(VENV)/.runtime: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) install --quiet -c constraints.txt -e '.[dev,human]'
+	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[dev,human]'
 	touch $@ $(VENV)/.runtime
 
 clean:  ## what these commands made, but for runs
