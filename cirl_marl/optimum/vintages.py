@@ -166,12 +166,7 @@ class Lifetimes:
     @cached_property
     def totals(self) -> Any:
         """What the stocks of the network are of those of the planned one, shape (stores, stores)."""
-        stores = self.planned.stages if isinstance(self.planned, StagedNetwork) else {}
-        found = sparse.lil_array((len(self.network.stores), len(self.planned.stores)))
-        for i, node in enumerate(self.network.stores):
-            for store in stores.get(node.id, (node.id,)):
-                found[i, self.planned.node_index[store]] = 1.0
-        return sparse.csr_array(found)
+        return _sums(self.planned, self.network)[: len(self.network.stores), : len(self.planned.stores)]
 
     def rows(self, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
         """Return the rows G v ≤ g of all lifetimes that nobody controls, and g.
@@ -239,6 +234,6 @@ def _sums(given: Network, wanted: Network) -> Any:
     whole = wanted.stages if isinstance(wanted, StagedNetwork) else {}
     found = sparse.lil_array((len(wanted.nodes), len(given.nodes)))
     for i, node in enumerate(wanted.nodes):
-        for part in stages[node.id] if len(whole.get(node.id, ())) == 1 else (node.id,):
+        for part in (node.id,) if len(whole.get(node.id, ())) > 1 else stages.get(node.id, (node.id,)):
             found[i, given.node_index[part]] = 1.0
     return sparse.csr_array(found)
