@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import random_network
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -153,6 +154,7 @@ def test_random_networks_conform(network: Network, seed: int) -> None:
 
 
 @given(network=st.from_type(Network), seed=st.integers(0, 2**31), mode=st.sampled_from(["neighbours", "full"]))
+@example(network=random_network(14662095, 8, 0, lifetimes=True), seed=0, mode="neighbours")  # what comes out of slots
 def test_wider_observations_conform(network: Network, seed: int, mode: str) -> None:
     """Membership in the other observation modes."""
     check_vector_env(lambda: VectorEnv(network, num_envs=2, observe=mode), steps=6, seed=seed)

@@ -3,23 +3,49 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy import stats
 from typer.testing import CliRunner
 
-from cirl_marl import Arc, CirlError, Episode, Law, Network, NetworkError, Node, Role, Series, VectorEnv, load_network
+from cirl_marl import (
+    Arc,
+    CirlError,
+    ControlError,
+    Episode,
+    Law,
+    Network,
+    NetworkError,
+    Node,
+    Role,
+    RunError,
+    Series,
+    VectorEnv,
+    load_network,
+    parallel_env,
+    single_agent_env,
+)
 from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import write_network
+from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.environments.state import Outcome
+from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.sampling import sampled, sensitivities
-from cirl_marl.network.uncertainty import Spread, drawn
+from cirl_marl.learners import train
+from cirl_marl.network.uncertainty import DISTRIBUTIONS, Spread, drawn
+from cirl_marl.optimum import bound
 
+Floats = NDArray[np.floating]
 EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
 
 
@@ -55,13 +81,16 @@ def line(uncertain: dict[str, Spread], **rates: Any) -> Network:
             Spread(deviation=0.3, distribution="lognormal"),
             stats.lognorm(np.sqrt(np.log(1.09)), scale=1 / np.sqrt(1.09)),
         ),
+        (Spread(deviation=0.6, distribution="gamma"), stats.gamma(1 / 0.36, scale=0.36)),
     ],
 )
 def test_draws_follow_their_distribution(spread: Spread, law: Any) -> None:
     """That of SciPy, cut to the range."""
     draws = spread.at(np.random.default_rng(0).random(4000))
     assert stats.kstest(draws, law.cdf).pvalue > 1e-3
-    assert draws.min() >= spread.low and draws.max() <= spread.high
+    assert spread.low <= spread.ends[0] <= draws.min() and draws.max() <= spread.ends[1] <= spread.high
+    assert law.cdf(spread.ends[0]) < 1e-4 and law.cdf(spread.ends[1]) > 1 - 1e-4
+    np.testing.assert_array_equal(spread.ends, spread.at(np.array([0.0, 1.0])))
 
 
 def test_a_draw_is_the_network_with_other_numbers() -> None:
@@ -69,7 +98,7 @@ def test_a_draw_is_the_network_with_other_numbers() -> None:
     twice = Spread(low=1.0, high=2.0, distribution="uniform")
     flow = Series(times=(0.0, 2.0), values=(10.0, 4.0))
     network = line({"arcs.dig.flow": twice, "arcs.leak.rate": twice, "arcs.tails.share": twice}, flow=flow)
-    found = drawn(network, [1.0, 0.5, 1.0])
+    found = drawn(network, [2.0, 1.5, 2.0])
     dig, tails, metal, leak = found.arcs
     assert dig.flow == replace(flow, values=(20.0, 8.0)) and leak.rate == pytest.approx(0.15)
     assert tails.share == pytest.approx(0.4) and metal.share is None
@@ -81,13 +110,13 @@ def test_a_draw_is_the_network_with_other_numbers() -> None:
 def test_shares_stay_shares() -> None:
     """Where all are stated they are divided by their sum; where one takes the rest it is never less than none."""
     wide = Spread(low=0.1, high=9.0, distribution="uniform")
-    stated = drawn(line({"arcs.tails.share": wide}, kept=0.8), [1.0])
+    stated = drawn(line({"arcs.tails.share": wide}, kept=0.8), [9.0])
     assert stated.arcs[1].share == pytest.approx(1.8 / 2.6) and stated.arcs[2].share == pytest.approx(0.8 / 2.6)
-    little = drawn(line({"arcs.tails.share": wide}, kept=0.8), [0.0])
+    little = drawn(line({"arcs.tails.share": wide}, kept=0.8), [0.1])
     assert little.arcs[1].share == pytest.approx(0.02 / 0.82) and little.arcs[2].share == pytest.approx(0.8 / 0.82)
-    rest = drawn(line({"arcs.tails.share": wide}), [1.0])
+    rest = drawn(line({"arcs.tails.share": wide}), [9.0])
     assert rest.arcs[1].share == pytest.approx(1.0)
-    assert drawn(line({"arcs.tails.share": wide}), [0.0]).arcs[1].share == pytest.approx(0.02)
+    assert drawn(line({"arcs.tails.share": wide}), [0.1]).arcs[1].share == pytest.approx(0.02)
 
 
 def test_samples_are_single_simulations() -> None:
@@ -121,11 +150,11 @@ def test_causes_are_the_shares_of_the_variance() -> None:
     (causes,) = sensitivities(found)
     parts = []
     for k in range(2):
-        shares = np.full((2, 3), 0.5)
-        shares[:, k] = stats.norm.cdf([-1, 1])
+        factors = np.ones((2, 3))
+        factors[:, k] += np.array([-1, 1]) * (0.1, 0.4)[k]
         low, high = (
             rollout(VectorEnv(drawn(network, each.tolist()), num_envs=1), Neutral()).episode_circularity[0]
-            for each in shares
+            for each in factors
         )
         parts.append(((high - low) / 2) ** 2)
     expected = np.array([*parts, 0.0]) / sum(parts)
@@ -175,12 +204,212 @@ def test_what_cannot_spread_is_refused(written: str, said: str, tmp_path: Path) 
         ("episode.horizon", r"only numbers of nodes, arcs, services can be uncertain"),
         ("arcs.metal.share", r"'share' is not given"),
         ("arcs.dig.rate", r"it is 0, and so is every draw"),
+        ("nodes.store.stretch", r"only a lifetime with a deviation can be stretched"),
     ],
 )
 def test_paths_are_checked(where: str, said: str) -> None:
     """Of networks made in Python."""
     with pytest.raises(NetworkError, match=said):
         line({where: Spread(deviation=0.1)})
+
+
+@st.composite
+def uncertain_networks(draw: st.DrawFn) -> Network:
+    """Draw networks with numbers of every kind that are uncertain."""
+    network = draw(st.from_type(Network))
+    paths = [f"arcs.{each.id}.{name}" for each in network.arcs for name in ("rate", "flow", "share")]
+    paths += [f"nodes.{each.id}.{name}" for each in network.nodes for name in ("rate", "stretch")]
+    paths += [f"services.{each.id}.{end}" for each in network.services for end in ("low", "high")]
+    uncertain: Mapping[str, Spread] = {}
+    for where in draw(st.lists(st.sampled_from(paths), unique=True, min_size=1, max_size=12)):
+        kind = draw(st.sampled_from(DISTRIBUTIONS))
+        spread = Spread(low=0.6, high=1.1, distribution=kind, deviation=None if kind == "uniform" else 0.3)
+        try:
+            uncertain = replace(network, uncertain={**uncertain, where: spread}).uncertain
+        except NetworkError:
+            pass  # this number is not stated, or 0
+    assume(uncertain)
+    step = network.episode.solver_step  # the fastest draws need a shorter one
+    episode = (
+        {}
+        if step is None
+        else {"solver_step": network.episode.control_interval / round(2 * network.episode.control_interval / step)}
+    )
+    return replace(network, uncertain=uncertain).with_options(episode=episode)
+
+
+def randomly(env: VectorEnv, steps: int, seed: int) -> Iterator[Outcome]:
+    """Act at random in a copy of an environment that has been reset."""
+    rng = np.random.default_rng(seed)
+    entries = sum(space.shape[0] for space in env.action_spaces.values())
+    for _ in range(min(steps, env.network.episode.horizon)):
+        yield env.advance(np.repeat(rng.uniform(-1, 1, (entries, 1)), env.num_envs, axis=1))
+
+
+@given(uncertain_networks(), st.integers(0, 99))
+def test_each_copy_is_the_network_with_what_it_drew(network: Network, seed: int) -> None:
+    """Simulated alone, with numbers that are certain; a copy of a batch is a lone environment, to the bit."""
+    env = VectorEnv(network, num_envs=2, uncertain=True, reward="mixed_difference")
+    env.reset(seed=seed)
+    start, factors = env.physical.stock[env.rows.nodes], env.physical.factors
+    lone = VectorEnv(network, num_envs=1, uncertain=True, reward="mixed_difference")
+    lone.reset(seed=seed + 1)
+    others = [VectorEnv(drawn(network, factors[:, i].tolist()), num_envs=1, reward="mixed_difference") for i in (0, 1)]
+    names = env.rows.start_names
+    # what is cut follows the substeps, of which the fastest draws need most
+    assume(all(other.dynamics.substeps == env.dynamics.substeps for other in others))
+    for i, other in enumerate(others):
+        other.reset(seed=0, options={"initial_state": dict(zip(names, start[:, i].tolist(), strict=True))})
+        np.testing.assert_allclose(other.physical.flow[:, 0], env.physical.flow[:, i], rtol=1e-9, atol=1e-9)
+    for outcome, alone, *certain in zip(*(randomly(each, 4, seed) for each in (env, lone, *others)), strict=True):
+        np.testing.assert_array_equal(outcome.observation[:, 1], alone.observation[:, 0])
+        np.testing.assert_array_equal(outcome.reward[:, 1], alone.reward[:, 0])
+        for i, other in enumerate(certain):
+            for what in ("flow", "circularity_mean", "levels", "reward", "local"):
+                ours, theirs = getattr(outcome, what)[..., i], getattr(other, what)[..., 0]
+                np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-8, err_msg=what)
+
+
+def test_supplies_make_up_for_what_was_drawn() -> None:
+    """Business as usual meets the demand of the draw, with what the others do."""
+    network = load_network(EXAMPLE).scenario("business_as_usual")
+    env = VectorEnv(network, num_envs=3, uncertain=True, reward="difference")
+    run = rollout(env, Neutral(), seed=2)
+    for i in range(3):
+        other = VectorEnv(drawn(network, env.physical.factors[:, i].tolist()), num_envs=3, reward="difference")
+        alone = rollout(other, Neutral(), seed=2)
+        np.testing.assert_allclose(run.circularity_mean[i], alone.circularity_mean[i], rtol=1e-9)
+        np.testing.assert_allclose(run.levels[i], alone.levels[i], rtol=1e-9)
+        np.testing.assert_allclose(run.returns[:, i], alone.returns[:, i], atol=1e-9)
+    assert np.ptp(run.episode_circularity) > 1
+
+
+def test_draws_differ_and_last_an_episode() -> None:
+    """From each copy's own stream, in every info and in the snapshot; starts are those of the certain environment."""
+    network = load_network(EXAMPLE).scenario("business_as_usual").with_options(episode={"horizon": 3})
+    env = VectorEnv(network, num_envs=3, uncertain=True)
+    env.reset(seed=5)
+    certain = VectorEnv(network, num_envs=3)
+    certain.reset(seed=5)
+    np.testing.assert_array_equal(env.physical.stock, certain.physical.stock)
+    first = env.physical.factors.copy()
+    assert len(np.unique(first[0])) == 3 and (first[0] >= 0.5).all() and (first[0] <= 1.5).all()
+    saved = env.snapshot()
+    seen = []
+    for _ in range(3):
+        *_, infos = env.step(env.neutral_action)
+        for info in infos.values():
+            np.testing.assert_array_equal(info["drawn"], first.T)
+        seen.append(env.physical.stock.copy())
+    second = env.physical.factors.copy()
+    assert (second != first).all()
+    env.restore(saved)
+    np.testing.assert_array_equal(env.physical.factors, first)
+    for stock in seen:
+        env.step(env.neutral_action)
+        np.testing.assert_array_equal(env.physical.stock, stock)
+    np.testing.assert_array_equal(env.physical.factors, second)
+    with pytest.raises(ControlError, match=r"3 copies, agents .*, uncertain; this is"):
+        certain.restore(saved)
+    assert "drawn" not in certain.step(certain.neutral_action)[-1][certain.agents[0]]
+    with pytest.raises(CirlError, match="nothing is uncertain; give a number a deviation"):
+        VectorEnv("copper_net", uncertain=True)
+
+
+def test_every_view_draws() -> None:
+    """PettingZoo and Gymnasium environments with the same seed draw the same."""
+    network = load_network(EXAMPLE).scenario("business_as_usual")
+    parallel = parallel_env(network, uncertain=True)
+    _, infos = parallel.reset(seed=3)
+    told = infos[parallel.agents[0]]["drawn"]
+    *_, infos = parallel.step({agent: space.sample() for agent, space in parallel.action_spaces.items()})
+    np.testing.assert_array_equal(infos[parallel.agents[0]]["drawn"], told)
+    single = single_agent_env(network, agent=parallel.agents[0], uncertain=True)
+    np.testing.assert_array_equal(single.reset(seed=3)[1]["drawn"], told)
+    np.testing.assert_array_equal(single.step(single.action_space.sample())[-1]["drawn"], told)
+
+
+def rates_of_draws(network: Network) -> tuple[Floats, Floats, Floats]:
+    """Return draws from one end of the ranges to the other, r under them, shape (arcs, draws), and the bound of r."""
+    laws, draws = FlowLaws(network, uncertain=True), np.linspace(0, 1, 50)
+    factors = np.array([spread.at(draws) for spread in network.uncertain.values()])
+    low, _, high = network.control_bounds[:, :, :1]
+    controls = np.where(draws < 0.5, low, high)
+    return factors, laws.rate(controls, np.zeros(50, dtype=np.intp), factors), laws.max_rate
+
+
+def test_levels_and_neutral_actions_are_of_what_was_drawn() -> None:
+    """Both ends of a band; what is observed again is what was observed; a supply that acts as if it did not."""
+    network = load_network(EXAMPLE).scenario("business_as_usual").with_options(episode={"horizon": 4})
+    service = replace(network.services[0], high=900.0)
+    uncertain = {**network.uncertain, "services.supply.high": Spread(low=0.98, high=1.5, distribution="uniform")}
+    network = replace(network, services=(replace(service, low=700.0),), uncertain=uncertain)
+    env = VectorEnv(network, num_envs=8, uncertain=True, observe="full", agents=["smelting", "old_scrap"])
+    env.reset(seed=0, options={"initial_state": {"use": np.linspace(600.0, 1100.0, 8)}})
+    idle = VectorEnv(network, num_envs=8, uncertain=True, agents=["old_scrap"])
+    idle.reset(seed=0, options={"initial_state": {"use": np.linspace(600.0, 1100.0, 8)}})
+    rows = [tuple(network.uncertain).index(f"services.supply.{end}") for end in ("low", "high")]
+    low, high = np.array([[700.0], [900.0]]) * env.physical.factors[rows]
+    for _ in range(3):
+        outcome = env.advance(env.stack(env.neutral_action))
+        idle.advance(idle.stack(idle.neutral_action))
+        np.testing.assert_allclose(env.physical.stock, idle.physical.stock, rtol=1e-9)
+        use = env.rows.stocks(env.physical.stock)[network.node_index["use"]]
+        np.testing.assert_allclose(outcome.levels[0], np.minimum(1.0, np.minimum(use / low, high / use)))
+        for agent, seen in env.observations().items():
+            np.testing.assert_array_equal(seen, env.by_agent(outcome.observation)[agent])
+
+
+def test_no_draw_exceeds_what_arrays_are_made_for() -> None:
+    """Rates, substeps and reserves come from the ends of the ranges: no rate exceeds its bound, no source runs out."""
+    wide = Spread(low=0.2, high=5.0, distribution="uniform")
+    example = load_network(EXAMPLE).scenario("lifetimes")
+    stated = line({"arcs.tails.share": Spread(low=0.5, high=2.0, distribution="uniform")}, kept=0.8)
+    for each in (stated, replace(example, uncertain={"nodes.use.stretch": Spread(low=0.5, high=2.0, deviation=1.0)})):
+        _, rates, bounds = rates_of_draws(each)
+        assert (rates <= bounds[:, None] * (1 + 1e-12)).all()
+    np.testing.assert_allclose(rates_of_draws(stated)[1].max(axis=1), [10.0, 1 / 3, 0.8 / 0.9, 0.1], rtol=1e-12)
+    np.testing.assert_allclose(rates_of_draws(stated)[2], [10.0, 1 / 3, 0.8 / 0.9, 0.1], rtol=1e-12)
+    network = line({"arcs.dig.flow": wide, "arcs.leak.rate": wide, "arcs.tails.share": wide}, leak=0.3)
+    mine = Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR)
+    network = replace(network, nodes=tuple(mine if each.id == "mine" else each for each in network.nodes))
+    factors, rates, bounds = rates_of_draws(network)
+    np.testing.assert_allclose(rates.max(axis=1), bounds, rtol=1e-12)
+    assert VectorEnv(network, num_envs=1, uncertain=True).dynamics.substeps == 2
+    (mine_,) = (i for i, node in enumerate(network.stores) if node.id == "mine")
+    assert network.initial[0, mine_] == pytest.approx(10.0 * 5.0 * 4)
+    np.testing.assert_array_equal(drawn(network, factors[:, 7].tolist()).initial, network.initial)
+
+
+def test_an_episode_is_held_against_what_it_drew(tmp_path: Path) -> None:
+    """Everyone meets the same draws; the bound is that of a network with these numbers, for the service delivered."""
+    network = load_network(EXAMPLE).with_options(episode={"horizon": 4})
+    found = compare((), ("neutral", "optimum"), network=network, episodes=3, uncertain=True)
+    env = VectorEnv(network, num_envs=3, uncertain=True)
+    env.reset(seed=found.first_seed)
+    starts, factors = env.physical.stock[env.rows.nodes], env.physical.factors
+    assert np.ptp(factors[0]) > 0.1
+    for entry in found.entries:
+        assert entry.bound is not None
+        for i in range(3):
+            certain, levels = drawn(network, factors[:, i].tolist()), entry.rollout.episode_levels[i]
+            least, most = (bound(certain, starts[:, i], min_service=levels - cut).objective for cut in (1e-7, 2e-4))
+            assert least - 1e-6 <= entry.bound[i] <= most
+            assert entry.bound[i] >= entry.circularity[i]
+    certain = compare((), ("neutral",), network=network, episodes=3)
+    assert certain.yardstick.envelope is not None
+    assert (certain.entries[0].circularity != found.entries[0].circularity).all()
+    run = train(network, "independent_ars", steps=128, envs=2, uncertain=True, directory=tmp_path / "run").run
+    assert run is not None and run.make_env(1).uncertain
+    assert compare([run], network=network, episodes=2, bounds=False).entries[0].circularity.shape == (2,)
+    certain_run = train(network, "independent_ars", steps=128, envs=2, directory=tmp_path / "certain").run
+    assert certain_run is not None
+    with pytest.raises(RunError, match=r"uncertain numbers not drawn, there drawn; say which with uncertain"):
+        compare([run, certain_run], episodes=2, bounds=False)
+    for asked, draws in ((None, True), (False, False)):
+        neutral = compare([run], episodes=2, bounds=False, uncertain=asked).entries[1]
+        same = rollout(VectorEnv(network, num_envs=2, uncertain=draws), Neutral(), seed=found.first_seed)
+        np.testing.assert_array_equal(neutral.circularity, same.episode_circularity)
 
 
 def test_the_command_writes_bands_and_causes(tmp_path: Path) -> None:

@@ -40,6 +40,10 @@ StartSeed = Annotated[
     ),
 ]
 EpisodeCount = Annotated[int, typer.Option(min=2, help="Fresh episodes to evaluate on.")]
+Uncertain = Annotated[
+    bool | None,
+    typer.Option("--uncertain/--certain", help="Whether every episode draws the uncertain numbers of the network."),
+]
 MinService = Annotated[
     float | None,
     typer.Option(min=0.0, max=1.0, help="Mean level of each service, for mpc and optimum; default: all there is."),

@@ -8,7 +8,18 @@ from typing import Annotated, Any
 import typer
 
 from cirl_marl.cli import common
-from cirl_marl.cli.common import EpisodeCount, MinService, NetworkName, Scenario, Seed, app, console, say, shares
+from cirl_marl.cli.common import (
+    EpisodeCount,
+    MinService,
+    NetworkName,
+    Scenario,
+    Seed,
+    Uncertain,
+    app,
+    console,
+    say,
+    shares,
+)
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.optimum.named import CONTROLLERS
 
@@ -29,6 +40,7 @@ def compare(
     episodes: EpisodeCount = 16,
     seed: Seed = 0,
     min_service: MinService = None,
+    uncertain: Uncertain = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for episodes.csv, summary.csv, summary.json and comparison.png.")
     ] = None,
@@ -45,7 +57,7 @@ def compare(
 
     names = common.listed(controllers)
     folder = None if out is None else common.folder_for(out, "--out")
-    asked: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service}
+    asked: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service, "uncertain": uncertain}
     with shares() as progress:
         found = compared(runs or [], names, network=network, scenario=scenario, progress=progress, **asked)
     console.print(comparison_table(found))

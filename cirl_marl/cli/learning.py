@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cirl_marl.cli.common import EpisodeCount, RunPath, Scenario, Seed, app, console, listed, say, shares, training_bar
+from cirl_marl.cli.common import (
+    EpisodeCount,
+    RunPath,
+    Scenario,
+    Seed,
+    Uncertain,
+    app,
+    console,
+    listed,
+    say,
+    shares,
+    training_bar,
+)
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.controllers.shortages import shortages, unsupplied
 from cirl_marl.definitions.catalogue import load_network
@@ -51,6 +63,7 @@ def train(
     observe: Annotated[
         str | None, typer.Option(help=f"{', '.join(OBSERVE)}; default: the recipe's, else the definition's.")
     ] = None,
+    uncertain: Uncertain = None,
     out: Annotated[Path | None, typer.Option(help="Run directory; default: runs/NETWORK-RECIPE-seedN.")] = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run; with --steps, to so many.")
@@ -67,7 +80,7 @@ def train(
     if resume is not None:
         _only_resume(context)
     options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
-    options["min_service"] = min_service
+    options |= {"min_service": min_service, "uncertain": uncertain}
     options |= {"observe": observe, "agents": None if agents is None else listed(agents), "device": device}
     directories = [resume] if resume is not None else _directories(out, str(network), recipe, range(seed, seed + seeds))
     with training_bar() as report:

@@ -18,6 +18,7 @@ from typing import Annotated
 
 import numpy as np
 
+from cirl_marl.dynamics.factors import DrawnFlows
 from cirl_marl.dynamics.routing import Routing
 from cirl_marl.dynamics.rows import Rows
 from cirl_marl.dynamics.shares import Shares
@@ -67,7 +68,7 @@ LAWS: Mapping[Law, FlowLaw] = {
 
 
 class FlowLaws:
-    """Drivers, rates and controls of every arc.
+    """Drivers, rates and controls of every arc; with ``uncertain``, of copies with draws of the uncertain numbers.
 
     Attributes:
         network: whose laws they are.
@@ -90,7 +91,7 @@ class FlowLaws:
         routing: what passes through nodes that store nothing.
     """
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: Network, *, uncertain: bool = False) -> None:
         """Compile ``network``."""
         self.network = network
         self.inside = network = inside(network)
@@ -112,7 +113,8 @@ class FlowLaws:
         changing = [(k, network.held(value)) for k, value in enumerate(base) if isinstance(value, Series)]
         self._series_arcs: Integers = np.array([k for k, _ in changing], dtype=np.intp)
         self._series = np.array([means for _, means in changing]).reshape(len(changing), network.episode.horizon)
-        self._shares = Shares(network)
+        self._drawn = DrawnFlows(network) if uncertain else None
+        self._shares = Shares(network, uncertain=uncertain)
         named = [*self._series_arcs, *(self._shares.varying if self._shares.changing else ())]
         self.timed = tuple(network.arcs[k].id for k in named)
         self._bound_rates()
@@ -126,6 +128,8 @@ class FlowLaws:
         self.max_rate: Floats = self._unshared(widest)[:, 0]
         if len(self._series_arcs):
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
+        if self._drawn is not None:
+            self.max_rate[self._drawn.arcs] *= self._drawn.highest
         # the arcs of a split carry together what one of them would carry alone
         stores = self.rows.nodes.stop
         counted, ends = self.driver < stores, np.minimum(self.inside.recipients, stores)
@@ -147,22 +151,27 @@ class FlowLaws:
         self._constant_shares = shares.constant[~once], shares.values[~once]
         self.fixed[self._series_arcs] = False
         self.fixed[shares.varying] = False
+        if self._drawn is not None:
+            self.fixed[self._drawn.arcs] = False
 
-    def rate(self, controls: Floats, step: Integers | None = None) -> Floats:
+    def rate(self, controls: Floats, step: Integers | None = None, factors: Floats | None = None) -> Floats:
         """Return r of each arc, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
 
         Args:
             controls: physical values in the rows of ``network.control_rows``, shape (controls, B).
             step: index of the control interval in each copy, shape (B,); without it time series count as 1.
+            factors: on the uncertain numbers, shape (numbers, B); None leaves them as they are stated.
         """
         rate = self._unshared(controls)
         if len(self._constant_shares[0]):
             arcs, shares = self._constant_shares
             rate[arcs] *= shares
         if len(self._shares.varying):
-            rate[self._shares.varying] *= self._shares(controls, step)
+            rate[self._shares.varying] *= self._shares(controls, step, factors)
         if step is not None and len(self._series_arcs):
             rate[self._series_arcs] *= self._series[:, step]
+        if factors is not None and self._drawn is not None:
+            self._drawn.multiply(rate, factors)
         return rate
 
     def neutral_in(self, step: Integers) -> Floats:

@@ -54,6 +54,7 @@ class Dynamics(FlowLaws):
     donor holds.
 
     Attributes:
+        slots: those of fixed lifetimes; None if there are none.
         inner: the models of the compartments.
         batches: the batch arcs.
         physical: whether stocks are kept non-negative.
@@ -61,11 +62,11 @@ class Dynamics(FlowLaws):
         terms: terms of the series of the exact solver.
     """
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: Network, *, uncertain: bool = False) -> None:
         """Compile ``network``."""
-        super().__init__(network)
+        super().__init__(network, uncertain=uncertain)
         rows, network = self.rows, self.inside
-        self._fixed = FixedLifetimes(network) if isinstance(network, StagedNetwork) and network.lines else None
+        self.slots = FixedLifetimes(network) if isinstance(network, StagedNetwork) and network.lines else None
         self.inner, self.batches = InnerPhysics(network, rows), BatchTransport(network, rows)
         episode = network.episode
         self.physical = episode.solver != "euler"
@@ -122,7 +123,14 @@ class Dynamics(FlowLaws):
         rows, columns = [*order_slot, *exit_slot], [*self._order_arcs, *exits]
         self._orders_and_exits = RowSum(rows, columns, 1.0, (2 * len(slot), len(network.arcs)))
 
-    def advance(self, stock: Floats, inner: Floats, controls: Floats, step: Integers | None = None) -> Transition:
+    def advance(
+        self,
+        stock: Floats,
+        inner: Floats,
+        controls: Floats,
+        step: Integers | None = None,
+        factors: Floats | None = None,
+    ) -> Transition:
         """Hold ``controls`` for one control interval; arguments are as in ``Transition`` and ``FlowLaws.rate``.
 
         In the physical mode scheduled flows are first cut to what their donor can deliver, so the realised flows may be
@@ -137,10 +145,10 @@ class Dynamics(FlowLaws):
                 f"network '{self.network.name}': advance needs step, the index of the control interval of each copy: "
                 f"time series and batches depend on it, those of arc '{self._timed[0]}' for one"
             )
-        rate = realised = self.rate(controls, step)
-        if self._fixed is not None:
-            stock = self._fixed.moved_on(stock)
-            self._fixed.come_out(stock, rate)
+        rate = realised = self.rate(controls, step, factors)
+        if self.slots is not None:
+            stock = self.slots.moved_on(stock)
+            self.slots.come_out(stock, rate)
         routes = self.routing.routes(rate)
         sent = None
         if self.batches.lines and step is not None:
@@ -178,12 +186,12 @@ class Dynamics(FlowLaws):
             f"{self.network.time_unit}; take a shorter solver_step or tighter bounds of the controls"
         )
 
-    def start_flow(self, stock: Floats, inner: Floats, controls: Floats) -> Floats:
+    def start_flow(self, stock: Floats, inner: Floats, controls: Floats, factors: Floats | None = None) -> Floats:
         """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
-        rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp))
-        if self._fixed is not None:
-            stock = self._fixed.moved_on(stock)
-            self._fixed.come_out(stock, rate)
+        rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp), factors)
+        if self.slots is not None:
+            stock = self.slots.moved_on(stock)
+            self.slots.come_out(stock, rate)
         if self.physical:
             rate = self._limit_orders(stock, rate)
         routes = self.routing.routes(rate)

@@ -22,7 +22,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.ages import slots
 from cirl_marl.network.elements import Arc, Law, Node, Role, Service
 from cirl_marl.network.rowsum import Integers
-from cirl_marl.network.series import Series, Value
+from cirl_marl.network.series import Value, in_intervals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,14 +191,15 @@ class _Parts:
         """Return the rate of a node's stages, divided by the stretch of each interval."""
         assert node.lifetime is not None and node.lifetime.chain is not None
         rate = node.lifetime.chain.rate / node.lifetime.mean
-        if not isinstance(node.stretch, Series):
-            return rate / node.stretch
-        interval, held = self.network.episode.control_interval, self.network.held(node.stretch)
-        return Series(times=tuple(interval * np.arange(len(held))), values=tuple(rate / held))
+        return in_intervals(rate / self.network.held(node.stretch), self.network.episode.control_interval)
 
 
 class FixedLifetimes:
-    """The slots of fixed lifetimes, which move on at the start of each interval."""
+    """The slots of fixed lifetimes, which move on at the start of each interval.
+
+    Attributes:
+        arcs: through which what has lived comes out.
+    """
 
     def __init__(self, network: StagedNetwork) -> None:
         """Compile the lines of ``network``."""
@@ -208,7 +209,7 @@ class FixedLifetimes:
         self._to = np.concatenate([rows[1:] for rows in places])
         self._young = np.array([rows[0] for rows in places], dtype=np.intp)
         self._old = np.array([rows[-1] for rows in places], dtype=np.intp)
-        self._arcs = np.array([network.arc_index[arc] for arc in network.lines.values()], dtype=np.intp)
+        self.arcs: Integers = np.array([network.arc_index[arc] for arc in network.lines.values()], dtype=np.intp)
 
     def moved_on(self, stock: Floats) -> Floats:
         """Return the masses, shape (rows, B), with those of each slot in the next one, and an empty first slot."""
@@ -222,4 +223,4 @@ class FixedLifetimes:
 
     def come_out(self, stock: Floats, rate: Floats) -> None:
         """Set the flows of what comes out in the interval, in place; ``rate`` has shape (arcs, B)."""
-        rate[self._arcs] = stock[self._old] / self._interval
+        rate[self.arcs] = stock[self._old] / self._interval

@@ -17,9 +17,11 @@ from collections.abc import Container
 
 import numpy as np
 
+from cirl_marl.dynamics.factors import Scaled
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network import Floats, Integers, RowSum
 from cirl_marl.network.model import Bools
+from cirl_marl.network.uncertainty import numbers_of
 
 TINY = 1e-9
 """Part of a supply that arrives in an interval, below which it is taken for none."""
@@ -52,6 +54,8 @@ class Supply:
         self._weights = np.array(weights).reshape(-1, 1)
         demand = [network.held(service.low) for service in services]
         self._demand = np.array(demand).reshape(len(services), network.episode.horizon)
+        numbers = numbers_of(network, "services", "low")
+        self._drawn = Scaled({row: numbers[each.id] for row, each in enumerate(services) if each.id in numbers})
         stores, rows, columns = len(network.stores), [], []
         for row, service in enumerate(services):
             if service.quantity == "stock":
@@ -66,7 +70,15 @@ class Supply:
         """Return which of ``arcs`` nobody acts on, shape (arcs, 1)."""
         return np.array([arc not in agents for arc in self.arcs], dtype=bool).reshape(-1, 1)
 
-    def __call__(self, stock: Floats, inner: Floats, controls: Floats, step: Integers, idle: Bools) -> Floats:
+    def __call__(
+        self,
+        stock: Floats,
+        inner: Floats,
+        controls: Floats,
+        step: Integers,
+        idle: Bools,
+        factors: Floats | None = None,
+    ) -> Floats:
         """Return the controls of an interval with what ``idle`` arcs supply, shape (controls, B).
 
         Args:
@@ -75,6 +87,7 @@ class Supply:
             controls: of all others.
             step: index of the interval in each copy, shape (B,).
             idle: which arcs nobody acts on in each copy, shape (arcs, B or 1).
+            factors: on the uncertain numbers, as ``Dynamics.advance`` takes them.
         """
         if not idle.any():
             return controls
@@ -83,7 +96,7 @@ class Supply:
         low, high = (
             table[self._rows].take(step, axis=1) for table in (self._dynamics.control_low, self._dynamics.control_high)
         )
-        demand = self._demand.take(step, axis=1)
+        demand = self._drawn(self._demand.take(step, axis=1), factors)
         most = np.zeros((count, batch))
         weights = np.broadcast_to(self._weights, low.shape)
         room = np.divide(high - low, weights, out=np.zeros_like(low), where=idle & (weights > 0))
@@ -99,7 +112,7 @@ class Supply:
         supply, interval = np.zeros((count, batch)), self._dynamics.network.episode.control_interval
         open_ = np.ones(batch, dtype=bool)
         for _ in range(ROUNDS):
-            base = self._measured(stock, inner, supplied(supply), step, 1)
+            base = self._measured(stock, inner, supplied(supply), step, 1, factors)
             lacking = demand - base
             lacks = (lacking > CLOSE * demand) & (supply < most) | (lacking < -CLOSE * demand) & (supply > 0)
             open_ &= lacks.any(axis=0)
@@ -108,17 +121,22 @@ class Supply:
             # small beside what lacks, as a donor may hold little more than that, and not lost in rounding
             probe = np.minimum(np.maximum(PROBE * np.abs(lacking), LEAST * demand) / interval, PROBE * most)
             tried = [supplied(supply + probe * (np.arange(count) == s)[:, None]) for s in range(count)]
-            measured = self._measured(stock, inner, np.concatenate(tried, axis=1), step, count)
+            measured = self._measured(stock, inner, np.concatenate(tried, axis=1), step, count, factors)
             more = measured.reshape(count, count, batch) - base[:, None]
             slope = np.divide(more, probe, out=np.zeros_like(more), where=probe > 0)
             better = _complementary(slope, lacking, supply, most, interval)
             supply = np.where(open_, better, supply)
         return supplied(supply)
 
-    def _measured(self, stock: Floats, inner: Floats, controls: Floats, step: Integers, times: int) -> Floats:
+    def _measured(
+        self, stock: Floats, inner: Floats, controls: Floats, step: Integers, times: int, factors: Floats | None
+    ) -> Floats:
         """Return what the services measure at the end of the interval under several controls, shape (services, …)."""
         dynamics = self._dynamics
-        done = dynamics.advance(np.tile(stock, (1, times)), np.tile(inner, (1, times)), controls, np.tile(step, times))
+        start, drawn = (np.tile(stock, (1, times)), np.tile(inner, (1, times))), None
+        if factors is not None:
+            drawn = np.tile(factors, (1, times))
+        done = dynamics.advance(*start, controls, np.tile(step, times), drawn)
         flow = done.moved / dynamics.network.episode.control_interval
         return self._measure(np.concatenate([dynamics.rows.stocks(done.stock), flow]))
 

@@ -187,6 +187,8 @@ class ObservationLayout:
             drive[dynamics.driver > dynamics.rows.unit] = np.inf
             flows = drive * dynamics.max_rate
             flows[dynamics.batches.arcs] = mass
+            if dynamics.slots is not None:
+                flows[dynamics.slots.arcs] = mass / network.episode.control_interval
             routing = dynamics.routing
             through = routing.most(flows)
             flows[routing.arcs] = through.take(routing.donors) * dynamics.max_rate[routing.arcs]

@@ -20,7 +20,7 @@ from cirl_marl.network import Floats, Network
 
 RENDER_MODES = ("rgb_array", "human")
 _Seen = dict[str, NDArray[np.float32]]
-OPTIONS = ("observe", "circularity", "circularity_weight", "horizon")
+OPTIONS = ("observe", "circularity", "circularity_weight", "horizon", "uncertain")
 
 
 def check_options(options: Iterable[str], known: Sequence[str], *named: str) -> None:
@@ -36,7 +36,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
     Each agent has its own Box(−1, 1) action and its own float32 observation; ``observation_names[agent]`` says what
     each entry is. Episodes end by truncation at the horizon. ``infos[agent]`` carries ``circularity`` (λ at the end of
     the step, mass), ``local_reward``, ``flows`` (mean flows in the order of ``network.arcs``, mass/time) and
-    ``service_level``; for an agent whose model has a criterion of success also ``success``.
+    ``service_level``; for an agent whose model has a criterion of success also ``success``; and with ``uncertain`` what
+    was ``drawn``, factors in the order of ``network.uncertain``.
 
     Attributes:
         network: the network under the chosen scenario.
@@ -102,7 +103,8 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         self.agents = list(self.possible_agents)
         if self.render_mode == "human":
             self.render()
-        return {agent: seen[0] for agent, seen in observation.items()}, {agent: {} for agent in self.agents}
+        infos: Infos = {agent: self._drawn() for agent in self.agents}
+        return {agent: seen[0] for agent, seen in observation.items()}, infos
 
     def step(
         self, actions: Mapping[str, ArrayLike]
@@ -209,7 +211,12 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         if (year := self.batch.year) is not None:
             for info in infos.values():
                 info["year"] = float(year[0])
-        return infos
+        return {agent: info | self._drawn() for agent, info in infos.items()}
+
+    def _drawn(self) -> dict[str, Any]:
+        """Return what was drawn, for an info; nothing if nothing is uncertain."""
+        drawn = self.batch.physical.drawn
+        return {} if drawn is None else {"drawn": drawn[:, 0]}
 
 
 def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParallelEnv:

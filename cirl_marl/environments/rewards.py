@@ -126,7 +126,9 @@ class Credit:
             np.tile(state.inner, (1, count)),
             np.tile(state.step, count),
         )
-        transition = dynamics.advance(stock, inner, self._supply(stock, inner, imagined, step, idle), step)
+        drawn = None if state.drawn is None else np.tile(state.drawn, (1, count))
+        held = self._supply(stock, inner, imagined, step, idle, drawn)
+        transition = dynamics.advance(stock, inner, held, step, drawn)
         imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
         flow = transition.moved / dynamics.network.episode.control_interval
         end, mean, _ = self.circularity(imagined_state, transition, flow)

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cirl_marl.dynamics.factors import Scaled
 from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.rowsum import RowSum
 from cirl_marl.network.series import Series
+from cirl_marl.network.uncertainty import numbers_of
 
 
 class Scoring:
@@ -41,6 +43,11 @@ class Scoring:
         width = network.episode.horizon if self._varying else 1
         bands = [np.array([network.held(getattr(s, end))[:width] for s in services]) for end in ("low", "high")]
         self._low, self._high = (each.reshape(len(services), width) for each in bands)
+        drawn = [numbers_of(network, "services", end) for end in ("low", "high")]
+        self._drawn = [
+            Scaled({row: numbers[each.id] for row, each in enumerate(services) if each.id in numbers})
+            for numbers in drawn
+        ]
         self._bounded = bool(np.isfinite(self._high).any())
         modelled = [position[c.id] for c in compartments if c.model is not None]
         count = len(compartments)
@@ -59,12 +66,16 @@ class Scoring:
         self._weighted_shortfall = RowSum([0] * len(services), every, [s.weight for s in services], shape)
         self._sum_of_levels = RowSum([0] * len(services), every, 1.0, shape)
 
-    def levels(self, quantities: Floats, step: Integers) -> Floats:
-        """Return the level of each service in [0, 1], shape (services, B), in the interval ``step`` of each copy."""
+    def levels(self, quantities: Floats, step: Integers, factors: Floats | None = None) -> Floats:
+        """Return the level of each service in [0, 1], shape (services, B), in the interval ``step`` of each copy.
+
+        ``factors`` are those on the uncertain numbers, shape (numbers, B), if any were drawn.
+        """
         measured = self._measure(quantities)
         low, high = self._low, self._high
         if self._varying:
             low, high = low.take(step, axis=1), high.take(step, axis=1)
+        low, high = (scaled(band, factors) for scaled, band in zip(self._drawn, (low, high), strict=True))
         level: Floats = np.divide(measured, low, out=np.ones_like(measured), where=low > 0)
         if self._bounded:
             np.divide(high, measured, out=level, where=measured > high)

@@ -89,8 +89,8 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode; ``options={"initial_state": …}`` takes a mapping or, in the paper scenarios, an array."""
         super().reset(seed=seed)
-        observations, _ = self.parallel.reset(seed=seed, options=options)
-        return observations[self.agent], {"state": self._paper_state()}
+        observations, infos = self.parallel.reset(seed=seed, options=options)
+        return observations[self.agent], {**infos[self.agent], "state": self._paper_state()}
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Hold the action, shape (1,) in [−1, 1], for one control interval."""

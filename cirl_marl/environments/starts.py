@@ -45,6 +45,7 @@ class Starts:
         stores = len(network.stores)
         self._drawn = np.concatenate([np.arange(stores), self._stocks + inner.ranged])
         self._own = np.setdiff1d(np.arange(self._stocks, len(self.names)), self._drawn)
+        self._spreads = tuple(network.uncertain.values())
         self._low = np.concatenate([network.initial[0], inner.low])
         self._width = np.concatenate([network.initial[1], inner.high]) - self._low
 
@@ -83,6 +84,13 @@ class Starts:
         for id_, rows in self._stages.items():
             drawn[rows] = self._spread[id_][:, None] * uniform[self._network.node_index[id_]]
         return drawn
+
+    def factors(self, which: Sequence[int] | range | Integers) -> Floats:
+        """Draw factors on the uncertain numbers in some copies, each from its own stream, (numbers, len(which))."""
+        shares = np.array([self.streams[i].random(len(self._spreads)) for i in which])
+        shares = np.ascontiguousarray(shares.reshape(len(which), len(self._spreads)).T)
+        drawn = [spread.at(share) for spread, share in zip(self._spreads, shares, strict=True)]
+        return np.array(drawn).reshape(shares.shape)
 
     def saved_streams(self) -> tuple[Mapping[str, Any], ...]:
         """Return a copy of the state of every stream."""

@@ -24,9 +24,15 @@ class State:
     flow: Annotated[Floats, "mean flows of the last control interval, shape (arcs, B), mass/time"]
     measures: Annotated[Floats, "what the models measured at its end, under its controls, shape (measures, B)"]
     step: Annotated[Integers, "control intervals done, shape (B,)"]
+    factors: Annotated[Floats, "drawn factors on the uncertain numbers, shape (numbers, B); no rows if none are drawn"]
     batched: Annotated[Floats, "m_fb of this episode, in two parts as in ``Network.circularity``, shape (2, B), mass"]
     circularity: Annotated[Floats, "sum over the episode of the interval means of λ, shape (B,), mass"]
     service: Annotated[Floats, "sum over the episode of the level of each service, shape (services, B)"]
+
+    @property
+    def drawn(self) -> Floats | None:
+        """The factors, None if none are drawn."""
+        return self.factors if len(self.factors) else None
 
     def copied(self) -> State:
         """Return the state with arrays of its own."""
@@ -48,9 +54,11 @@ class Snapshot:
     network: Annotated[Network, "what it is a snapshot of, under its scenario and horizon"]
     elapsed: Annotated[int, "the published step counter of a one-agent environment with ``legacy_episode``"] = 0
 
-    def check(self, network: Network, copies: int, agents: tuple[str, ...]) -> None:
+    def check(self, network: Network, copies: int, agents: tuple[str, ...], *, uncertain: bool) -> None:
         """Raise a ``ControlError`` unless ``copies`` of ``network``, in which ``agents`` act, can go back to this."""
-        theirs, ours = _described(self.network, len(self.streams), self.agents), _described(network, copies, agents)
+        drawn = self.state.drawn is not None
+        theirs = _described(self.network, len(self.streams), self.agents, drawn)
+        ours = _described(network, copies, agents, uncertain)
         if theirs != ours:
             raise ControlError(f"the snapshot does not fit: it is of {theirs}; this is {ours}")
         if self.network != network:
@@ -83,8 +91,8 @@ class Outcome:
         return infos
 
 
-def _described(network: Network, copies: int, agents: tuple[str, ...]) -> str:
+def _described(network: Network, copies: int, agents: tuple[str, ...], uncertain: bool) -> str:
     return (
         f"network '{network.name}', scenario '{network.scenario_name}', {network.episode.horizon} steps, "
-        f"{copies} copies, agents {', '.join(agents)}"
+        f"{copies} copies, agents {', '.join(agents)}{', uncertain' if uncertain else ''}"
     )

@@ -41,6 +41,7 @@ class VectorEnv:
     Attributes:
         network: the network under the chosen scenario.
         agents: compartments that act, in the order of every stacked array.
+        uncertain: whether the uncertain numbers are drawn.
         reward_mode: one of those of ``credit.Credit``.
         observation_spaces: by agent.
         observation_names: by agent, what each entry of its observation is.
@@ -66,6 +67,7 @@ class VectorEnv:
         circularity: str = "end",
         circularity_weight: float | None = None,
         horizon: int | None = None,
+        uncertain: bool = False,
     ) -> None:
         """Make the environments.
 
@@ -79,6 +81,9 @@ class VectorEnv:
             circularity: whether the team reward is λ at the ``end`` of the interval or its ``mean`` over it.
             circularity_weight: w in [0, 1], weight of λ in the reward; None takes the definition's.
             horizon: decisions per episode; None takes the definition's.
+            uncertain: whether each copy draws the network's uncertain numbers (``Network.uncertain``) at each reset,
+                after its start and from the same stream. Agents do not see the draw; it is in ``physical.factors``
+                and, as ``drawn``, in every info.
 
         Raises:
             CirlError: for an unknown network, scenario, agent or option.
@@ -98,7 +103,11 @@ class VectorEnv:
         self.num_envs = num_envs
         self.reward_mode = _choice("reward", found.objective.reward if reward is None else reward, REWARDS)
         measure = _choice("circularity", circularity, MOMENTS)
-        self.dynamics = Dynamics(found)
+        if uncertain and not found.uncertain:
+            remedy = "give a number a deviation or a range, or leave out uncertain"
+            raise CirlError(f"network '{found.name}': nothing is uncertain; {remedy}")
+        self.uncertain = uncertain
+        self.dynamics = Dynamics(found, uncertain=uncertain)
         self.supply = Supply(self.dynamics)
         self._actuators = Actuators(self.dynamics, agents, num_envs)
         self.agents = self._actuators.agents
@@ -147,7 +156,7 @@ class VectorEnv:
             controls = self._actuators.controls(self.stack(every), step)
             idle = self.supply.idle([agent for agent in self.agents if agent not in waiting])
             state = self._state
-            found = self.supply(state.stock, state.inner, controls, step, idle)
+            found = self.supply(state.stock, state.inner, controls, step, idle, state.drawn)
             for arc in waiting:
                 every[arc] = self.normalised(arc, found[self.network.control_rows[arc]])
         return every
@@ -185,7 +194,8 @@ class VectorEnv:
         Raises:
             ControlError: for a seed, option or state that cannot be used; the environment is left as it was.
         """
-        self._state = self._fresh(self._starts.begin(seed, options))
+        start = self._starts.begin(seed, options)
+        self._state = self._fresh(start, self._factors(range(self.num_envs)))
         self.episodes = self.episodes + 1
         return self.by_agent(self._observe(self._state))
 
@@ -199,6 +209,8 @@ class VectorEnv:
         """
         outcome = self.advance(self.stack(actions))
         infos: Infos = outcome.infos(self.agents)
+        if (drawn := self.physical.drawn) is not None:
+            infos = {agent: {**info, "drawn": drawn.T} for agent, info in infos.items()}
         if (year := self.year) is not None:
             year.flags.writeable = False  # the same for all agents
             for info in infos.values():
@@ -237,10 +249,11 @@ class VectorEnv:
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         controls = self._actuators.controls(actions, state.step)
-        controls = self.held = self.supply(state.stock, state.inner, controls, state.step, self._idle)
-        transition = dynamics.advance(state.stock, state.inner, controls, state.step)
+        drawn = state.drawn
+        controls = self.held = self.supply(state.stock, state.inner, controls, state.step, self._idle, drawn)
+        transition = dynamics.advance(state.stock, state.inner, controls, state.step, drawn)
         quantities, flow = self._measured(transition, controls)
-        levels = self.scoring.levels(quantities, state.step)
+        levels = self.scoring.levels(quantities, state.step, drawn)
         service = self.scoring.service_level(levels)
         terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
         local = self.scoring.local(terms)
@@ -248,7 +261,7 @@ class VectorEnv:
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
         measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + levels)
-        self._state = State(transition.stock, transition.inner, flow, measures, step, batched, *totals)
+        self._state = State(transition.stock, transition.inner, flow, measures, step, state.factors, batched, *totals)
         observation = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)
@@ -259,7 +272,7 @@ class VectorEnv:
         done = np.maximum(state.step - 1, 0)  # the interval that the state is scored in
         quantities = self._quantities(state)
         inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral_in(done))
-        levels = self.scoring.levels(quantities, done)
+        levels = self.scoring.levels(quantities, done, state.drawn)
         rewards = self.scoring.local_of_all(self.scoring.terms(quantities, levels, inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
 
@@ -279,7 +292,7 @@ class VectorEnv:
 
     def restore(self, snapshot: Snapshot) -> _Seen:
         """Go back to a snapshot, which must be of the same network, horizon, batch size and agents, and observe."""
-        snapshot.check(self.network, self.num_envs, self.agents)
+        snapshot.check(self.network, self.num_envs, self.agents, uncertain=self.uncertain)
         self._starts.restore_streams(snapshot.streams)
         self._state = snapshot.state.copied()
         self.episodes = self.episodes + 1
@@ -309,7 +322,9 @@ class VectorEnv:
         old = self.physical
         drawn = self.rows.start_of(old.stock, old.inner)
         drawn[:, which] = self._starts.draw(which)
-        self._state = old.renewed(ended, self._fresh(drawn))
+        factors = old.factors.copy()
+        factors[:, which] = self._factors(which)
+        self._state = old.renewed(ended, self._fresh(drawn, factors))
         return self._observe(self._state)
 
     def _coming(self) -> Integers:
@@ -317,16 +332,21 @@ class VectorEnv:
         step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
         return np.minimum(step, self.network.episode.horizon - 1)
 
-    def _fresh(self, drawn: Floats) -> State:
+    def _factors(self, which: range | Integers) -> Floats:
+        """Draw factors on the uncertain numbers in some copies; no rows if none are to be drawn."""
+        return self._starts.factors(which) if self.uncertain else np.empty((0, len(which)))
+
+    def _fresh(self, start: Floats, factors: Floats) -> State:
         """State at the start of an episode; flows and measures are those that neutral control would give."""
-        dynamics, batch = self.dynamics, drawn.shape[1]
-        stocks, inner = self.rows.split(drawn)
+        dynamics, batch = self.dynamics, start.shape[1]
+        stocks, inner = self.rows.split(start)
+        drawn = factors if self.uncertain else None
         stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
         every = np.ones((len(self.supply.arcs), 1), dtype=bool)
-        neutral = self.supply(stock, inner, dynamics.neutral_in(step), step, every)
-        flow, measures = dynamics.start_flow(stock, inner, neutral), dynamics.inner.measures(inner, neutral)
+        neutral = self.supply(stock, inner, dynamics.neutral_in(step), step, every, drawn)
+        flow, measures = dynamics.start_flow(stock, inner, neutral, drawn), dynamics.inner.measures(inner, neutral)
         sums = (np.zeros(shape) for shape in ((2, batch), (batch,), (len(self.network.services), batch)))
-        return State(stock, inner, flow, measures, step, *sums)
+        return State(stock, inner, flow, measures, step, factors, *sums)
 
     def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
         """Return all quantities in one array, and the mean flows, which are read-only."""
@@ -352,7 +372,7 @@ class VectorEnv:
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
-        levels = self.scoring.levels(quantities, np.maximum(state.step - 1, 0))
+        levels = self.scoring.levels(quantities, np.maximum(state.step - 1, 0), state.drawn)
         return self.layout.observe(quantities, time, levels)
 
 

@@ -17,7 +17,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.contenders import contenders
 from cirl_marl.evaluation.figures import gain
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds
-from cirl_marl.evaluation.yardsticks import Yardstick, yardstick
+from cirl_marl.evaluation.yardsticks import Yardstick, bounds_of_draws, yardstick
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import NoCertificate, gap
@@ -130,6 +130,7 @@ def compare(
     seed: int = 0,
     min_service: ArrayLike | None = None,
     bounds: bool = True,
+    uncertain: bool | None = None,
     progress: ProgressReport = lambda what, share: None,
 ) -> Comparison:
     """Let trained policies and controllers act in the same fresh episodes.
@@ -147,6 +148,8 @@ def compare(
         min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
             None: as much as can be had.
         bounds: whether to hold the episodes against the best possible.
+        uncertain: whether each episode draws the uncertain numbers of the network, the same for everyone; each is then
+            held against the best possible with the numbers that it drew. None: if it was so in the training.
         progress: called with what is being done and the share of all that is done.
 
     Raises:
@@ -162,7 +165,9 @@ def compare(
 
     asked = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
     everyone = controllers if "neutral" in controllers else ["neutral", *controllers]
-    entered, env = contenders(asked, everyone, None if found is None else found.scenario(scenario), min_service)
+    entered, env = contenders(
+        asked, everyone, None if found is None else found.scenario(scenario), min_service, uncertain
+    )
     first = first_seed(seed)
     share = 1 / (len(entered) + (len({each.name for each in entered}) if bounds else 0))
     rollouts, checkpoints = [], []
@@ -173,10 +178,13 @@ def compare(
         rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.acted))
     measure, proved = _unproved(len(entered), "")
     if bounds:
-        starts = starting_stocks(entered[0].env(episodes), first)
-        done = len(entered) * share
-        names = [each.name for each in entered]
-        measure, proved = _measured(env, starts, names, rollouts, part_of(progress, "bounds", done, 1 - done))
+        first_env, done = entered[0].env(episodes), len(entered) * share
+        starts, names = starting_stocks(first_env, first), [each.name for each in entered]
+        told = part_of(progress, "bounds", done, 1 - done)
+        if (factors := first_env.physical.drawn) is None:
+            measure, proved = _measured(env, starts, names, rollouts, told)
+        else:
+            measure, proved = _measured_draws(env, starts, factors.T, rollouts, told)
     neutral = next(run for who, run in zip(entered, rollouts, strict=True) if who.run is None and who.name == "neutral")
     entries = tuple(
         Entry(who.name, who.seed, who.run, checkpoint, run, gain(run, neutral), bound)
@@ -211,6 +219,18 @@ def _measured(
     except NoCertificate as missing:
         progress(1.0)
         return _unproved(len(rollouts), str(missing))
+
+
+def _measured_draws(
+    env: VectorEnv, starts: Floats, factors: Floats, rollouts: Sequence[Rollout], progress: Callable[[float], None]
+) -> tuple[Yardstick, list[Floats | None]]:
+    """Return the bounds of the episodes of each rollout, every episode with the numbers that it drew."""
+    levels = [run.episode_levels for run in rollouts]
+    try:
+        proved = bounds_of_draws(env.network, env.agents, starts, factors, levels, progress=progress)
+    except NoCertificate as missing:
+        return _unproved(len(rollouts), str(missing))
+    return Yardstick(None, np.empty((0, 2))), [*proved]
 
 
 def _unproved(entries: int, reason: str) -> tuple[Yardstick, list[Floats | None]]:

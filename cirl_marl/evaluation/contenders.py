@@ -32,11 +32,16 @@ class Contender:
 
 
 def contenders(
-    runs: Sequence[RunDirectory], controllers: Sequence[str], network: Network | None, min_service: ArrayLike | None
+    runs: Sequence[RunDirectory],
+    controllers: Sequence[str],
+    network: Network | None,
+    min_service: ArrayLike | None,
+    uncertain: bool | None = None,
 ) -> tuple[list[Contender], VectorEnv]:
     """Return everyone who is compared, and a copy of the environment that they share.
 
     What a policy observes and is rewarded with is its own affair; network, acting agents and horizon must be the same.
+    Uncertain numbers are drawn for all or none, by default as in the training of the runs.
 
     Raises:
         CirlError: if there is nothing to compare, a controller is unknown or named twice, or two runs are of one seed.
@@ -46,10 +51,11 @@ def contenders(
         raise CirlError("nothing to compare in: give a training run or a network")
     if len(set(controllers)) != len(controllers):
         raise CirlError(f"controllers {list(controllers)} must be distinct")
-    envs = [run.make_env(1) for run in runs]
-    first = envs[0] if network is None else VectorEnv(network, num_envs=1)
+    envs = [run.make_env(1, uncertain=uncertain) for run in runs]
+    draws = bool(uncertain) if not envs else envs[0].uncertain
+    first = envs[0] if network is None else VectorEnv(network, num_envs=1, uncertain=draws)
     if envs and envs[0].network.name == first.network.name:
-        first = VectorEnv(first.network, num_envs=1, agents=envs[0].agents)
+        first = VectorEnv(first.network, num_envs=1, agents=envs[0].agents, uncertain=draws)
     for run, env in zip(runs, envs, strict=True):
         where = "the network given" if network is not None else str(runs[0].path)
         if found := list(differences(env, first)):
@@ -57,11 +63,11 @@ def contenders(
 
     def shared(copies: int) -> VectorEnv:
         if network is None:
-            return runs[0].make_env(copies)
-        return VectorEnv(network, num_envs=copies, agents=first.agents)
+            return runs[0].make_env(copies, uncertain=uncertain)
+        return VectorEnv(network, num_envs=copies, agents=first.agents, uncertain=draws)
 
     plain = [_untrained(name, shared, min_service) for name in controllers]
-    return [*_trained(runs), *plain], first
+    return [*_trained(runs, uncertain), *plain], first
 
 
 def differences(env: VectorEnv, other: VectorEnv) -> Iterator[str]:
@@ -72,6 +78,9 @@ def differences(env: VectorEnv, other: VectorEnv) -> Iterator[str]:
         return
     if env.agents != other.agents:
         yield f"agents {list(env.agents)}, not {list(other.agents)}"
+    if env.uncertain != other.uncertain:
+        said = ("drawn", "not drawn") if env.uncertain else ("not drawn", "drawn")
+        yield f"uncertain numbers {said[0]}, there {said[1]}; say which with uncertain"
     physics, reference = _physics(ours), _physics(theirs)
     found = [
         f"{what} {physics[what]!r}, not {reference[what]!r}" for what in physics if physics[what] != reference[what]
@@ -103,7 +112,7 @@ def _parts(network: Network) -> dict[tuple[str, str], object]:
     return parts | {("service", service.id): service for service in network.services}
 
 
-def _trained(runs: Sequence[RunDirectory]) -> Iterator[Contender]:
+def _trained(runs: Sequence[RunDirectory], uncertain: bool | None) -> Iterator[Contender]:
     """Yield the policies; runs that differ in their seed alone have one name, and one that is not complete its own."""
     names: dict[str, str] = {}
     seen: dict[tuple[str, int], RunDirectory] = {}
@@ -121,7 +130,8 @@ def _trained(runs: Sequence[RunDirectory]) -> Iterator[Contender]:
         twin = seen.setdefault((asked, config.seed), run)
         if twin is not run:
             raise RunError(f"{run.path}: the same recipe and seed {config.seed} as {twin.path}; give one of them")
-        yield Contender(names[asked], config.seed, run, partial(_policy, run), run.make_env)
+        env = partial(run.make_env, uncertain=uncertain)
+        yield Contender(names[asked], config.seed, run, partial(_policy, run), env)
 
 
 def _policy(run: RunDirectory) -> Controller:

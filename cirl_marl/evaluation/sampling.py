@@ -8,12 +8,11 @@ from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.controllers.rollout import beginning, first_seed, rollout
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
-from cirl_marl.network.uncertainty import drawn
 from cirl_marl.optimum.named import named_controller
 
 FEWEST = 70
@@ -30,7 +29,6 @@ class SampledEpisodes:
     network: Annotated[Network, "the network, its numbers as they are stated"]
     names: Annotated[tuple[str, ...], "paths of the uncertain numbers"]
     factors: Annotated[Floats, "what was drawn, relative to what is stated, shape (samples, numbers)"]
-    shares: Annotated[Floats, "share of all draws below each, shape (samples, numbers)"]
     circularity: Annotated[Floats, "mean of λ over each interval, shape (samples, steps), mass"]
     levels: Annotated[Floats, "level of each service, shape (samples, services, steps)"]
     stock: Annotated[Floats, "stocks after each interval, shape (samples, steps, stores), mass"]
@@ -57,46 +55,34 @@ def sampled(
 ) -> SampledEpisodes:
     """Simulate draws of the uncertain numbers, each in an episode from the middle of all initial ranges.
 
-    Sample i draws from ``[seed, i]``, so that more samples add to those before, and the numbers of a network without
-    one of them stay what they were.
+    The samples are copies of one environment, so that more of them add to those before. The controller knows the
+    numbers as they are stated, not what was drawn.
 
     Args:
         network: with uncertain numbers.
         samples: how many, at least 2.
-        control: controller of all agents, started anew in each episode.
-        seed: of the draws.
+        control: controller of all agents.
+        seed: of the draws; different seeds share none.
         progress: called with the share that is done.
 
     Raises:
         CirlError: if nothing is uncertain, or there are too few samples.
     """
-    if not network.uncertain:
-        remedy = "give a number a deviation or a range"
-        raise CirlError(
-            f"network '{network.name}': nothing is uncertain, so that all samples would be the same; {remedy}"
-        )
     if samples < 2:
         raise CirlError(f"samples must be at least 2, got {samples}")
-    names = tuple(network.uncertain)
-    shares = np.array([np.random.default_rng([seed, i]).random(len(names)) for i in range(samples)])
-    spreads = network.uncertain.values()
-    factors = np.stack([spread.at(each) for spread, each in zip(spreads, shares.T, strict=True)], axis=1)
-    runs = []
-    for i, row in enumerate(shares.tolist()):
-        env = VectorEnv(drawn(network, row), num_envs=1)
-        begun = beginning(env)
-        runs.append(rollout(env, named_controller(control), seed=begun.seed, start=begun.given))
-        progress((i + 1) / samples)
-    return SampledEpisodes(
-        network,
-        names,
-        factors,
-        shares,
-        np.array([run.circularity_mean[0] for run in runs]),
-        np.array([run.levels[0] for run in runs]),
-        np.array([run.stock for run in runs]),
-        np.array([run.flow for run in runs]),
-    )
+    env = VectorEnv(network, num_envs=samples, uncertain=True)
+    begun, horizon = beginning(env), network.episode.horizon
+    stock = np.empty((samples, horizon, len(network.stores)))
+    flow = np.empty((samples, horizon, len(network.arcs)))
+
+    def keep(steps: int) -> None:
+        stock[:, steps - 1] = env.rows.stocks(env.physical.stock).T
+        flow[:, steps - 1] = env.physical.flow.T
+        progress(steps / horizon)
+
+    run = rollout(env, named_controller(control), seed=first_seed(seed), start=begun.given, progress=keep)
+    factors = env.physical.factors.T.copy()
+    return SampledEpisodes(network, tuple(network.uncertain), factors, run.circularity_mean, run.levels, stock, flow)
 
 
 def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
@@ -113,6 +99,7 @@ def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
     count = len(found.circularity)
     if count < FEWEST:
         raise CirlError(f"{count} samples are too few to tell which number matters; take {FEWEST} or more")
+    # it takes the order of the draws alone
     problem = {"num_vars": len(found.names), "names": list(found.names), "bounds": [[0.0, 1.0]] * len(found.names)}
     figures = {"λ̄": found.circularity.mean(axis=1)}
     levels = found.levels.mean(axis=2)
@@ -123,6 +110,6 @@ def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
             nothing = np.full(len(found.names), np.nan)
             told.append(Sensitivity(name, nothing, nothing))
             continue
-        solved = rbd_fast.analyze(problem, found.shares, values, num_resamples=RESAMPLES, seed=0)
+        solved = rbd_fast.analyze(problem, found.factors, values, num_resamples=RESAMPLES, seed=0)
         told.append(Sensitivity(name, np.array(solved["S1"]), np.array(solved["S1_conf"])))
     return told

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum import Bound, Envelope, envelope
+from cirl_marl.network.uncertainty import drawn
+from cirl_marl.optimum import Bound, Envelope, bound, envelope
 
 STEP = 1e-4
 """Service levels are demanded in these steps, rounded down: rows that hardly differ share their programs."""
@@ -71,7 +72,7 @@ def yardstick(
             progress((row + solved / SOLVES) / len(services))
 
         tell(0)
-        demanded = np.maximum(np.floor((service - MARGIN) / STEP) * STEP, 0.0)
+        demanded = _rounded(service)
         level = tuple(np.rint(demanded.mean(axis=0) / STEP).astype(int).tolist())
         if level not in members:
             found = envelope(
@@ -83,3 +84,45 @@ def yardstick(
     least = [min(level, default=1.0 / STEP) for level in members]
     levels = STEP * np.linspace(min(least), max(least), FRONT)
     return Yardstick(everyone, np.stack([levels, everyone.at(starts.mean(axis=0), levels[:, None])], axis=1))
+
+
+def bounds_of_draws(
+    network: Network,
+    agents: Sequence[str],
+    starts: Floats,
+    factors: Floats,
+    services: Sequence[Floats],
+    *,
+    progress: Callable[[float], None] = lambda share: None,
+) -> list[Floats]:
+    """Return the bounds of episodes that drew uncertain numbers, for each of ``services``, shape (episodes,) each.
+
+    An episode is held against the best that somebody could reach who knew what it drew. Every draw has programs of its
+    own: multipliers of the stated numbers would hold too, but prove less, and to write a program down takes as long as
+    to solve it.
+
+    Args:
+        network: with uncertain numbers.
+        agents: who acts.
+        starts: shape (episodes, nodes), mass.
+        factors: what each episode drew, shape (episodes, numbers).
+        services: mean levels that each row delivered, shape (episodes, services).
+        progress: called with the share that is done.
+
+    Raises:
+        NoCertificate: if the network has flows for which nothing is proved.
+        CirlError: if the solver fails.
+    """
+    found = np.empty((len(services), len(starts)))
+    for i, (start, row) in enumerate(zip(starts, factors.tolist(), strict=True)):
+        certain, near = drawn(network, row), None
+        for k, levels in enumerate(services):
+            near = bound(certain, start, min_service=_rounded(levels[i]), agents=agents or None, near=near)
+            found[k, i] = near.objective
+            progress((i + (k + 1) / len(services)) / len(starts))
+    return [*found]
+
+
+def _rounded(levels: Floats) -> Floats:
+    """Return the levels that programs demand of episodes that delivered ``levels``."""
+    return np.asarray(np.maximum(np.floor((levels - MARGIN) / STEP) * STEP, 0.0))

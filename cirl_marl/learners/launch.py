@@ -57,8 +57,8 @@ def train(
         callbacks: Stable-Baselines3 callbacks by name of the learner; learners that have one run in lockstep.
         report: called after every joint step.
         device: where stacked learners compute, as torch names it.
-        **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``, ``horizon``; they
-            override the recipe's.
+        **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``, ``horizon``,
+            ``uncertain``; they override the recipe's.
 
     Returns:
         The finished training; ``learners[name].model`` is the Stable-Baselines3 model.

@@ -50,6 +50,7 @@ class Options(Settings):
     circularity: Moment = "end"
     circularity_weight: Annotated[Number, Field(ge=0, le=1)] | None = None
     horizon: Count | None = None
+    uncertain: StrictBool = False
     scenario: StrictStr | None = None
 
 

@@ -208,10 +208,14 @@ class RunDirectory:
         """The file of the network; a ``RunError`` if it is missing."""
         return self._file("network/network.toml" if self.config.data_sha256 else "network.toml")
 
-    def make_env(self, num_envs: int) -> VectorEnv:
-        """Return the environment that the run trained in, with ``num_envs`` copies."""
+    def make_env(self, num_envs: int, *, uncertain: bool | None = None) -> VectorEnv:
+        """Return the environment that the run trained in, with ``num_envs`` copies.
+
+        ``uncertain`` says whether uncertain numbers are drawn; None: if they were in the training.
+        """
         config = self.config
-        return VectorEnv(self.network(), num_envs=num_envs, agents=config.agents, **config.options)
+        options = config.options if uncertain is None else {**config.options, "uncertain": uncertain}
+        return VectorEnv(self.network(), num_envs=num_envs, agents=config.agents, **options)
 
     def save_checkpoint(self, joint_steps: int, write: Callable[[Path], None], state: str, reason: str = "") -> None:
         """Let ``write`` fill a new checkpoint folder, then make it the one that counts and drop the older ones.

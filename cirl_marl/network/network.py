@@ -30,6 +30,7 @@ from cirl_marl.network.elements import SINKS, Compartment, ControlKind, Law, Nod
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
+from cirl_marl.network.uncertainty import highest_factor
 from cirl_marl.network.validate import problems
 
 if TYPE_CHECKING:
@@ -125,7 +126,8 @@ class Network(Parts):
         unknown_ = {node.id for node in self.stores if node.initial is None and node.history is None}
         for arc in self.arcs:
             if arc.donor in unknown_:
-                donor, base = self.nodes[self.node_index[arc.donor]], self.held(arc.flow)
+                donor = self.nodes[self.node_index[arc.donor]]
+                base = self.held(arc.flow) * highest_factor(self, f"arcs.{arc.id}.flow")
                 base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
                 # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
                 sets = [c.control for c in (arc, donor) if c.control is not None]

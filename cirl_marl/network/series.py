@@ -169,6 +169,13 @@ Value = float | Series
 """What may change in time."""
 
 
+def in_intervals(values: Floats, interval: float) -> Value:
+    """Return what has these values in control intervals of some length; a number if they are all the same."""
+    if (values == values[0]).all():
+        return float(values[0])
+    return Series(times=tuple((interval * np.arange(len(values))).tolist()), values=tuple(values.tolist()))
+
+
 def extremes(value: Value) -> tuple[float, float]:
     """Return the lowest and the highest value."""
     return value.extremes if isinstance(value, Series) else (value, value)

@@ -45,12 +45,7 @@ class Split:
     def proportions(self) -> Floats:
         """Return π of the other arcs, which sum to 1, shape (others, horizon)."""
         bounds, given = narrowed(self.bounds), narrowed(self.given)
-        left = np.maximum(1.0 - bounds[1].sum(axis=0) - np.nansum(given, axis=0), 0.0)
-        weights = np.where(np.isnan(given), left, given)
-        total = weights.sum(axis=0)
-        # where neutral control leaves nothing to them, the one of the rest takes what there may be
-        weights = np.where(total > 0, weights, np.isnan(given))
-        return np.broadcast_to(weights / weights.sum(axis=0), self.given.shape)
+        return np.broadcast_to(proportions(given, 1.0 - bounds[1].sum(axis=0)), self.given.shape)
 
     @property
     def table(self) -> Floats:
@@ -87,6 +82,22 @@ class Split:
             yield f"{where}: the shares of its arcs sum to {worst:g}, not to 1; one may be left out and takes the rest"
         elif not rests and (given == 0).any():
             yield f"{where}: nothing is left for the shares without control; leave one out, and it takes the rest"
+
+
+def proportions(given: Floats, left: Floats) -> Floats:
+    """Return π of arcs without control, which sum to 1, shape (arcs, …).
+
+    Args:
+        given: their shares, NaN for the one that takes the rest, shape (arcs, …).
+        left: what neutral control leaves to them, shape (…).
+    """
+    rest = np.isnan(given)
+    weights = np.where(rest, np.maximum(left - np.nansum(given, axis=0), 0.0), given)
+    total = weights.sum(axis=0)
+    # where neutral control leaves nothing to them, the one of the rest takes what there may be
+    weights = np.where(total > 0, weights, rest)
+    found: Floats = weights / weights.sum(axis=0)
+    return found
 
 
 def splits(network: Parts) -> list[Split]:

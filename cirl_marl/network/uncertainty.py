@@ -8,19 +8,19 @@ from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from cirl_marl.errors import unknown
 from cirl_marl.network.declared import Checked, Positive, Quantity, Word, declarations, frozen
-from cirl_marl.network.elements import Arc, Node, Service
+from cirl_marl.network.elements import FIXED, Arc, Law, Node, Service
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats
-from cirl_marl.network.series import Series, extremes
-from cirl_marl.network.splits import splits
+from cirl_marl.network.series import Series, extremes, in_intervals
+from cirl_marl.network.splits import proportions, splits
 
 WIDE = 4.0
-"""Deviations up to which a normal distribution goes if it states no range."""
-DISTRIBUTIONS = ("normal", "lognormal", "uniform")
+"""Deviations of a normal distribution up to which every distribution goes that states no range, by probability."""
+DISTRIBUTIONS = ("normal", "lognormal", "gamma", "uniform")
 KINDS: Mapping[str, type[Any]] = {"nodes": Node, "arcs": Arc, "services": Service}
 """Parts of a network whose numbers may be uncertain, by the key of their table."""
 
@@ -36,7 +36,7 @@ class Spread(Checked):
     high: Annotated[float, Quantity("highest value, likewise", joint=True)] = math.inf
     distribution: Annotated[
         str,
-        Word("``normal`` or ``lognormal``, cut to the range, or ``uniform``", of=("normal", "lognormal", "uniform")),
+        Word("``normal``, ``lognormal`` or ``gamma``, cut to the range, or ``uniform``", of=DISTRIBUTIONS),
     ] = "normal"
 
     def problems(self) -> Iterator[str]:
@@ -50,20 +50,58 @@ class Spread(Checked):
         elif self.distribution != "uniform" and self.deviation is None:
             yield f"distribution '{self.distribution}' needs a deviation"
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Lowest and highest factor that can be drawn."""
+        return (self.low, self.high) if self.deviation is None else self._ends(self.deviation)
+
     def at(self, share: Floats) -> Floats:
         """Return the factors below which these shares of all draws lie, in the shape of ``share``."""
         if self.deviation is None:
             return np.asarray(self.low + share * (self.high - self.low))
-        low, high = self.low, self.high
-        if self.distribution == "normal":
-            law = stats.norm(1.0, self.deviation)
-            low, high = max(low, 1 - WIDE * self.deviation), min(high, 1 + WIDE * self.deviation)
-        else:
-            width = math.sqrt(math.log1p(self.deviation**2))
-            law = stats.lognorm(width, scale=math.exp(-(width**2) / 2))
-        first, last = law.cdf(low), law.cdf(high)
-        found: Floats = np.clip(law.ppf(first + share * (last - first)), low, high)
+        low, high = self._ends(self.deviation)
+        first, last = (self._below(end, self.deviation) for end in (low, high))
+        found: Floats = np.clip(self._factor(first + share * (last - first), self.deviation), low, high)
         return found
+
+    def _ends(self, deviation: float) -> tuple[float, float]:
+        """Return the range, cut to where next to nothing is drawn."""
+        widest = special.ndtr(np.array([-WIDE, WIDE]))
+        least, most = self._factor(widest, deviation).tolist()
+        return max(self.low, least), min(self.high, most)
+
+    def _below(self, factor: float, deviation: float) -> float:
+        """Return the probability of less than a factor."""
+        if self.distribution == "gamma":
+            return float(special.gammainc(deviation**-2, factor * deviation**-2))
+        if self.distribution == "normal":
+            return float(special.ndtr((factor - 1.0) / deviation))
+        width = math.sqrt(math.log1p(deviation**2))
+        return float(special.ndtr(math.log(factor) / width + width / 2)) if factor > 0 else 0.0
+
+    def _factor(self, share: Floats, deviation: float) -> Floats:
+        """Return what is less with these probabilities, before it is cut to the range."""
+        if self.distribution == "gamma":
+            return np.asarray(special.gammaincinv(deviation**-2, share) * deviation**2)
+        if self.distribution == "normal":
+            return np.asarray(1.0 + deviation * special.ndtri(share))
+        width = math.sqrt(math.log1p(deviation**2))
+        return np.asarray(np.exp(width * special.ndtri(share) - width**2 / 2))
+
+
+def numbers_of(network: Parts, kind: str, field: str) -> dict[str, int]:
+    """Return the rows of uncertain numbers among the factors, by the id of the part of which they are a field."""
+    found = {}
+    for row, where in enumerate(network.uncertain):
+        each, id_, name = _split(where)
+        if (each, name) == (kind, field):
+            found[id_] = row
+    return found
+
+
+def highest_factor(network: Parts, where: str) -> float:
+    """Return the greatest factor on the number at a path; 1 if it is known exactly."""
+    return float(network.uncertain[where].ends[1]) if where in network.uncertain else 1.0
 
 
 def uncertainty_problems(network: Parts) -> Iterator[str]:
@@ -77,28 +115,63 @@ def uncertainty_problems(network: Parts) -> Iterator[str]:
         mistakes = list(spread.problems())
         if not mistakes and extremes(getattr(part, name)) == (0.0, 0.0):
             mistakes = ["it is 0, and so is every draw; give the number"]
+        if not mistakes:
+            mistakes = list(_undrawable(network, part, name, spread))
         yield from (f"{where}: {each}" for each in mistakes)
 
 
-def drawn(network: Any, shares: Sequence[float]) -> Any:
-    """Return a network whose uncertain numbers lie where these shares of all draws are below them.
+def _undrawable(network: Parts, part: Any, name: str, spread: Spread) -> Iterator[str]:
+    """Yield why no network could have some of the draws."""
+    if name == "rate" and isinstance(part, Arc) and part.law is Law.BATCH:
+        yield "the mass of what is released in batches cannot be uncertain"
+    elif name == "stretch" and (part.lifetime is None or part.lifetime.distribution == FIXED):
+        yield "only a lifetime with a deviation can be stretched"
+    elif name == "stretch" and spread.ends[0] <= 0:
+        yield "some draws are 0; give a range above it"
+    elif isinstance(part, Service):
+        low, high = (highest_factor(network, f"services.{part.id}.low"), 1.0)
+        if f"services.{part.id}.high" in network.uncertain:
+            high = network.uncertain[f"services.{part.id}.high"].ends[0]
+        ends = network.held(part.low) * low, network.held(part.high) * high
+        if (ends[0] > ends[1]).any():
+            yield "some draws turn the band upside down; give ranges that do not overlap"
 
-    Shares of a donor that sum to 1 are divided by their sum, others are cut so that they leave nothing less than none.
+
+def drawn(network: Any, factors: Sequence[float]) -> Any:
+    """Return the network whose numbers are certain: those that were uncertain, times what was drawn.
+
+    Shares of a donor stay shares of a whole: those that have no control keep their proportions to each other, and an
+    arc that takes the rest gets what they leave, if anything. Sources without a known reserve keep that of ``network``.
 
     Args:
         network: with uncertain numbers.
-        shares: in [0, 1], one for each of ``network.uncertain``, in their order.
+        factors: of ``network.uncertain``, in their order.
     """
     changed: dict[int, tuple[Any, dict[str, Any]]] = {}
-    for (where, spread), share in zip(network.uncertain.items(), shares, strict=True):
-        part, name = _found(network, where)
-        factor, value = float(spread.at(np.float64(share))), getattr(part, name)
-        if isinstance(value, Series):
-            value = replace(value, values=tuple(each * factor for each in value.values))
-        else:
-            value *= factor
+
+    def change(part: Any, name: str, value: Any) -> None:
         changed.setdefault(id(part), (part, {}))[1][name] = value
-    _share_out(network, changed)
+
+    for where, factor in zip(network.uncertain, factors, strict=True):
+        part, name = _found(network, where)
+        value = getattr(part, name)
+        if isinstance(value, Series):
+            change(part, name, replace(value, values=tuple(each * float(factor) for each in value.values)))
+        else:
+            change(part, name, value * float(factor))
+    for split in splits(network):
+        arcs = [network.arcs[k] for k in split.others]
+        told = [changed.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs]
+        if any(value is not arc.share for value, arc in zip(told, arcs, strict=True)):
+            given = np.array([network.held(np.nan if value is None else value) for value in told])
+            left = 1.0 - split.bounds[1].sum(axis=0)
+            for arc, shares in zip(arcs, proportions(given, left) * left, strict=True):
+                if arc.share is not None:
+                    change(arc, "share", in_intervals(shares, network.episode.control_interval))
+    initial: dict[str, Any] = dict(zip((node.id for node in network.stores), network.initial.T.tolist(), strict=True))
+    for node in network.stores:
+        if node.initial is None and node.history is None:
+            change(node, "initial", tuple(initial[node.id]))
     groups = {
         key: tuple(
             replace(each, **changed[id(each)][1]) if id(each) in changed else each for each in getattr(network, key)
@@ -108,37 +181,13 @@ def drawn(network: Any, shares: Sequence[float]) -> Any:
     return replace(network, **groups, uncertain={}, scenarios={})
 
 
-def _share_out(network: Parts, changed: dict[int, tuple[Any, dict[str, Any]]]) -> None:
-    """Scale drawn shares of a donor so that they are shares of a whole."""
-    for split in splits(network):
-        arcs = [network.arcs[k] for k in split.others]
-        told = {id(arc): changed.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs}
-        if not any("share" in changed.get(key, (None, {}))[1] for key in told):
-            continue
-        given = [value for value in told.values() if value is not None]
-        held = np.sum([network.held(value) for value in given], axis=0)
-        room = 1.0 - network.held(0.0) - split.bounds[1].sum(axis=0)
-        over = float((held / np.maximum(room, 1e-300)).max())
-        if len(given) == len(told) or over > 1.0:
-            for arc in arcs:
-                value = told[id(arc)]
-                if value is not None:
-                    scaled = (
-                        replace(value, values=tuple(each / over for each in value.values))
-                        if isinstance(value, Series)
-                        else value / over
-                    )
-                    changed.setdefault(id(arc), (arc, {}))[1]["share"] = scaled
-
-
 def _found(network: Parts, where: str) -> tuple[Any, str]:
     """Return the part and the name of the field at a path such as ``arcs.mining.rate``.
 
     Raises:
         KeyError: with what is wrong with the path.
     """
-    kind, _, rest = where.partition(".")
-    id_, _, name = rest.partition(".")
+    kind, id_, name = _split(where)
     if kind not in KINDS:
         raise KeyError(f"only numbers of {', '.join(KINDS)} can be uncertain")
     parts = {part.id: part for part in getattr(network, kind)}
@@ -151,3 +200,10 @@ def _found(network: Parts, where: str) -> tuple[Any, str]:
     if getattr(parts[id_], name) is None:
         raise KeyError(f"'{name}' is not given, so that nothing can be drawn")
     return parts[id_], name
+
+
+def _split(where: str) -> tuple[str, str, str]:
+    """Return kind, id and field of a path."""
+    kind, _, rest = where.partition(".")
+    id_, _, name = rest.rpartition(".")
+    return kind, id_, name

@@ -45,9 +45,10 @@ def comparison_notes(comparison: Comparison) -> list[str]:
         )
     if any(row.few for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
-    if comparison.yardstick.envelope is not None:
+    if comparison.entries[0].bound is not None:
+        drawn = "" if comparison.yardstick.envelope is not None else ", whatever anybody knew of what was drawn,"
         notes.append(
-            "bound: no episode from the same start with at least the same level of each service has a higher λ̄"
+            f"bound: no episode from the same start with at least the same level of each service{drawn} has a higher λ̄"
         )
     elif comparison.yardstick.reason:
         notes.append(f"gap to bound: {comparison.yardstick.reason}")
