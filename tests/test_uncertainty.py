@@ -365,7 +365,7 @@ def test_no_draw_exceeds_what_arrays_are_made_for() -> None:
     wide = Spread(low=0.2, high=5.0, distribution="uniform")
     example = load_network(EXAMPLE).scenario("lifetimes")
     stated = line({"arcs.tails.share": Spread(low=0.5, high=2.0, distribution="uniform")}, kept=0.8)
-    for each in (stated, replace(example, uncertain={"nodes.use.stretch": Spread(low=0.5, high=2.0, deviation=1.0)})):
+    for each in (stated, replace(example, uncertain={"nodes.use.stretch": Spread(low=0.5, high=1.5, deviation=1.0)})):
         _, rates, bounds = rates_of_draws(each)
         assert (rates <= bounds[:, None] * (1 + 1e-12)).all()
     np.testing.assert_allclose(rates_of_draws(stated)[1].max(axis=1), [10.0, 1 / 3, 0.8 / 0.9, 0.1], rtol=1e-12)
