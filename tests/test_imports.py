@@ -18,7 +18,7 @@ LAYERS = (
     ("dynamics",),
     ("environments",),
     ("__init__", "controllers", "testing"),
-    ("optimum",),
+    ("importing", "optimum"),
     ("learners",),
     ("evaluation", "paper"),
     ("report",),

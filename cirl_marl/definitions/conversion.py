@@ -23,6 +23,7 @@ from cirl_marl.network.units import factor
 
 GIVEN = ("rate", "flow", "batches")
 """Keys of which a law needs one, if it takes any of them."""
+CONSTANT = "cannot change in time; fix the time, too, in 'where', and leave no column of times"
 REGION = "{region}"
 """What stands for the text of the region in the title and in ``where``."""
 
@@ -64,9 +65,9 @@ class Converter:
             except CirlError as error:
                 raise NetworkError(table.name, [f"units.{key}: {error}"]) from None
         for key, kind, scale in (("stock", "mass", table.scales.stock), ("flow", "flow", table.scales.flow)):
-            self.scales[kind] = self._value(scale, kind, f"scales.{key}")
+            self.scales[kind] = self._number(scale, kind, f"scales.{key}")
             if self.scales[kind] <= 0:
-                self.mistakes.append(f"scales.{key}: {scale.value} must be positive")
+                self.mistakes.append(f"scales.{key}: {self.scales[kind]} must be positive")
         services = table.services.items()
         parts: dict[str, Any] = {
             "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
@@ -112,6 +113,9 @@ class Converter:
             if declared.shared:
                 return given * self._factor(table.unit, kind, where)
             value: Any = None if given == declared.none else self._value(given, kind, where)
+            if isinstance(value, Series) and not declared.varies:
+                self.mistakes.append(f"{where}: {CONSTANT}")
+                return 1
             if kind != "steps":
                 return value
             if value != int(value):
@@ -123,6 +127,9 @@ class Converter:
             assert isinstance(declared, Numbers)
             scale = self._factor(given.unit, declared.of, where)
             return given.low * scale, given.high * scale
+        if isinstance(declared, Numbers) and declared.spelled == "range":
+            stock = self._number(given, declared.of, where)
+            return stock, stock
         if isinstance(given, Batches):
             return self._batches(given, where)
         return tuple(given) if isinstance(given, list) else given
@@ -204,6 +211,14 @@ class Converter:
             side: self._in_time(getattr(control, side), unit, f"{where}.{side}") for side in ("low", "neutral", "high")
         }
         return Control(kind=control.kind, **sides)
+
+    def _number(self, quantity: Any, kind: str, where: str) -> float:
+        """Return a quantity that does not change in time."""
+        value = self._value(quantity, kind, where)
+        if isinstance(value, Series):
+            self.mistakes.append(f"{where}: {CONSTANT}")
+            return 1.0
+        return value
 
     def _value(self, quantity: Any, kind: str, where: str) -> Value:
         other, name = quantity.multiplied_by, quantity.unit

@@ -32,7 +32,7 @@ class StatedTable(Table):
         None, description="standard deviation of what is not known exactly, in the same unit; of a series of its mean"
     )
     range: tuple[Number, Number] | None = Field(None, description="lowest and highest value that it may have, likewise")
-    distribution: Literal["normal", "lognormal", "uniform"] | None = Field(
+    distribution: Literal["normal", "lognormal", "gamma", "uniform"] | None = Field(
         None, description="of what it may be; default: ``normal`` with a deviation, else ``uniform``"
     )
 

@@ -106,7 +106,7 @@ def _spelled(declared: Declared, hint: Any) -> Any:
     if isinstance(declared, Word):
         return declared.of if isinstance(declared.of, type) else Literal[declared.of]
     if isinstance(declared, Numbers):
-        tables = {"range": Range, "batches": Batches, "amount": VaryingAmount}
+        tables = {"range": varying(Range, None, ColumnTable), "batches": Batches, "amount": VaryingAmount}
         return tables[declared.spelled] if declared.spelled else None
     if isinstance(declared, Nested):
         return {"control": ControlTable, "lifetime": LifetimeTable, "model": ModelTable}[declared.of]
@@ -119,16 +119,16 @@ def _spelled(declared: Declared, hint: Any) -> Any:
     if isinstance(declared, Quantity) and declared.varies:
         return varying(QuantityTable, SeriesTable, ColumnTable, declared.none)
     if isinstance(declared, Quantity):
-        return QuantityTable
+        return FixedQuantity
     return {bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
 
 
-TITLE: Any = (str, "")
+FixedQuantity = varying(QuantityTable, None, ColumnTable)
 ControlTable = table_of(Control)
 LifetimeTable = table_of(Lifetime)
-NodeTable = table_of(Node, title=TITLE)
-ArcTable = table_of(Arc, title=TITLE)
-ServiceTable = table_of(Service, title=TITLE)
+NodeTable = table_of(Node)
+ArcTable = table_of(Arc)
+ServiceTable = table_of(Service)
 EpisodeTable = table_of(Episode)
 ObjectiveTable = table_of(Objective)
 ObservationTable = table_of(Observation)
@@ -144,8 +144,8 @@ class UnitsTable(Table):
 class ScalesTable(Table):
     """Reference stock and flow of compartments that state none of their own."""
 
-    stock: QuantityTable
-    flow: QuantityTable
+    stock: FixedQuantity  # type: ignore[valid-type]
+    flow: FixedQuantity  # type: ignore[valid-type]
 
 
 class NetworkTable(Table):

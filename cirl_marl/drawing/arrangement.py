@@ -10,7 +10,6 @@ from functools import lru_cache
 import numpy as np
 
 from cirl_marl.drawing.places import place
-from cirl_marl.drawing.style import spoken
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Role
 
@@ -63,7 +62,7 @@ class Arrangement:
 
 def arrangement_of(network: Network, aspect: float) -> Arrangement:
     """Return the layout of ``network`` for pictures of about this width over height."""
-    nodes = tuple((node.id, node.role) for node in network.nodes)
+    nodes = tuple((node.label, node.role) for node in network.nodes)
     arcs = tuple((arc.donor, arc.recipient) for arc in network.arcs)
     return _layout(_Structure(nodes, arcs, network), round(2 * aspect) / 2 or 0.5)
 
@@ -80,7 +79,7 @@ class _Structure:
 @lru_cache(maxsize=16)
 def _layout(structure: _Structure, aspect: float) -> Arrangement:
     network = structure.network
-    names = tuple(_lines(node.id) for node in network.nodes)
+    names = tuple(_lines(node.label) for node in network.nodes)
     letters = max(len(line) for name in names for line in name)
     box = np.array([max(5.5, 0.62 * letters + 1.0), 1.2 * (max(map(len, names)) + 1) + 0.6])
     positions = place(network, box + np.array([4.8, 3.7]), aspect)
@@ -89,9 +88,9 @@ def _layout(structure: _Structure, aspect: float) -> Arrangement:
     return Arrangement(positions, routes, box, names)
 
 
-def _lines(identifier: str) -> tuple[str, ...]:
-    """Break an id into lines at its spaces."""
-    lines = textwrap.wrap(spoken(identifier), LINE_LETTERS, break_long_words=False, break_on_hyphens=False)
+def _lines(label: str) -> tuple[str, ...]:
+    """Break a label into lines at its spaces."""
+    lines = textwrap.wrap(label, LINE_LETTERS, break_long_words=False, break_on_hyphens=False)
     return tuple(lines) or ("",)
 
 

@@ -131,7 +131,7 @@ def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, sha
     for arc, (x, y), value, colour in zip(network.arcs, routes.labels, flow, colours, strict=True):
         ink = MUTED if colour is NEUTRAL else colour
         parallel = ends[arc.donor, arc.recipient] > 1
-        label = f"{spoken(arc.id)}\n{number(value)}" if parallel else number(value)
+        label = f"{arc.label}\n{number(value)}" if parallel else number(value)
         axes.text(x, y, label, color=ink, fontsize=(0.8 if parallel else 0.95) * em, ha="center", va="center",
                   zorder=5, path_effects=halo)  # fmt: skip
 

@@ -155,6 +155,7 @@ class Lifetime(Checked):
 LIFETIME = Nested("how long what enters stays, for arcs of law ``share`` to split what leaves", of="lifetime")
 CONTROL = Nested("its actuator; None if it cannot act")
 MODEL = Nested("inner physics; None for a plain store or transport", of="model")
+TITLE = Declared("what it is called in tables and pictures; its id if left out")
 INNER = Numbers(
     "(low, high) of the initial value of each inner state of the model, drawn uniformly; empty for a model that draws "
     "its own start",
@@ -168,12 +169,18 @@ class Compartment(Checked):
     """What nodes and arcs have in common."""
 
     id: str
+    title: Annotated[str, TITLE] = ""
     set_point: float | None = None
     scale: float = 1.0
     control: Annotated[Control | None, CONTROL] = None
     model: Annotated[CompartmentModel | None, MODEL] = None
     inner: Annotated[tuple[Pair, ...], INNER] = ()
     reward_scale: Annotated[float, Positive("the model's reward is divided by it")] = 1.0
+
+    @property
+    def label(self) -> str:
+        """What it is called in pictures: its title, or its id in words."""
+        return self.title or self.id.replace("_", " ")
 
     @property
     def actions(self) -> int:
@@ -339,6 +346,7 @@ class Service(Checked):
     """
 
     id: str
+    title: Annotated[str, TITLE] = ""
     provider: Annotated[str, Declared("compartment at which it is measured")]
     quantity: Annotated[
         str,

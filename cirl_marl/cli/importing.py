@@ -1,0 +1,108 @@
+"""``cirl import``: from tables of measured flows to a definition file."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cirl_marl.cli.common import app, bar, say
+from cirl_marl.network.elements import Role
+
+Patterns = list[str] | None
+LISTED = 12
+"""Most changes that are listed on screen."""
+
+
+@app.command("import")
+def import_(
+    flows: Annotated[Path, typer.Argument(metavar="FLOWS", help="CSV or .xlsx: a long table, or a matrix.")],
+    stocks: Annotated[
+        Path | None, typer.Argument(metavar="STOCKS", help="Stocks at the ends of years: process, year, value, unit.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="The definition to write; data files come beside it.")] = Path(
+        "network.toml"
+    ),
+    reservoir: Annotated[Patterns, typer.Option(help="Non-renewable reservoirs; * stands for any text.")] = None,
+    landfill: Annotated[Patterns, typer.Option(help="Landfills, and other losses for good.")] = None,
+    incinerator: Annotated[Patterns, typer.Option(help="Incinerators.")] = None,
+    environment: Annotated[Patterns, typer.Option(help="Air, water, soil.")] = None,
+    outside: Annotated[Patterns, typer.Option(help="Sources and sinks that are other economies: trade.")] = None,
+    store: Annotated[Patterns, typer.Option(help="Processes that hold a stock.")] = None,
+    region: Annotated[Patterns, typer.Option(help="Regions to take; default: all, each a network of its own.")] = None,
+    reconcile: Annotated[bool, typer.Option("--reconcile", help="Adjust flows so that processes balance.")] = False,
+    sheet: Annotated[str | None, typer.Option(help="Sheet of the workbook.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of the flows, if the table states none.")] = None,
+    year: Annotated[int | None, typer.Option(help="Year of a matrix, or of a table without years.")] = None,
+    title: Annotated[str, typer.Option(help="Title of the network.")] = "",
+    source: Annotated[str, typer.Option(help="Where the numbers come from, with the licence.")] = "",
+) -> None:
+    """Make a network of a table of flows: processes become nodes, what passes through them shares, years series.
+
+    A long table has the columns source, target, year, value, unit, and may have type, region and uncertainty.
+    What sources and sinks are is asked for, or given. The neutral simulation of the network gives back the table.
+    """
+    from cirl_marl.importing.assembly import imported
+    from cirl_marl.importing.balances import Kind
+
+    given = {
+        Role.NONRENEWABLE_RESERVOIR: reservoir,
+        Role.LANDFILL: landfill,
+        Role.INCINERATOR: incinerator,
+        Role.ENVIRONMENT: environment,
+        Role.TECHNOSPHERE: outside,
+    }
+    with bar("checking") as progress:
+        found = imported(
+            flows,
+            out,
+            stocks,
+            roles={role.value: names for role, names in given.items() if names},
+            stores=store or (),
+            regions=region or (),
+            ask=_ask if sys.stdin.isatty() else None,
+            reconcile=reconcile,
+            sheet=sheet,
+            unit=unit,
+            year=year,
+            title=title,
+            source=source,
+            progress=progress,
+        )
+    table = found.table
+    for kind in Kind:
+        if names := found.processes.of(kind):
+            say(f"{KINDS[kind.value]}: {', '.join(names)}")
+    for name in found.processes.assumed:
+        say(f"'{name}' takes more than it gives, so that it became a store; without --store it was not said to be one")
+    if found.changes:
+        say(f"{len(found.changes)} flows were adjusted; the largest changes are")
+        for change in sorted(found.changes, key=lambda each: -abs(each.after - each.before))[:LISTED]:
+            where = f"{change.region}, {change.year}" if change.region else str(change.year)
+            say(f"  {change.pair} ({where}): {change.before:g} → {change.after:g} {table.unit}")
+    for name, apart in found.stock_mistakes.items():
+        say(f"stocks of '{name}': their growth and the flows are up to {apart:g} {table.unit} apart")
+    say(f"simulated without agents, no flow is further than {found.largest_error:.2g} {table.unit} from the table")
+    say(f"wrote {', '.join(map(str, found.files))}")
+
+
+KINDS = {
+    "source": "sources",
+    "sink": "sinks",
+    "passing": "without stock, as they balance",
+    "store": "stores",
+}
+ANSWERS = {"reservoir": Role.NONRENEWABLE_RESERVOIR, "outside": Role.TECHNOSPHERE} | {
+    role.value: role for role in (Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT)
+}
+
+
+def _ask(name: str, kind: str) -> Role:
+    """Ask what a source or a sink is."""
+    choices = ", ".join(ANSWERS)
+    while True:
+        answer = str(typer.prompt(f"{kind} '{name}': {choices}?")).strip().lower()
+        if answer in ANSWERS:
+            return ANSWERS[answer]

@@ -1,0 +1,221 @@
+"""Import a table of flows: read, classify, reconcile, write, and check that the network gives the table back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from cirl_marl.controllers.basic import Neutral
+from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.importing.balances import Change, Kind, Processes, Residual
+from cirl_marl.importing.definition import Definition, identifiers, written
+from cirl_marl.importing.tables import FlowTable, read_flows, read_stocks
+from cirl_marl.network.declared import itemised
+from cirl_marl.network.elements import Role
+from cirl_marl.records.files import published, write_table
+
+SHOWN = 10
+"""Most residuals that a message lists."""
+WRONG = 1e-5
+"""Part of the largest flow of a region by which a simulated flow may miss the table."""
+
+Ask = Callable[[str, Kind], Role]
+"""Returns the role of a source or a sink."""
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What an import found and wrote."""
+
+    table: Annotated[FlowTable, "the flows, as they were reconciled"]
+    processes: Annotated[Processes, "what each process is"]
+    roles: Annotated[Mapping[str, Role], "of sources, sinks and stores"]
+    changes: Annotated[tuple[Change, ...], "flows that were adjusted"]
+    stock_mistakes: Annotated[Mapping[str, float], "by store how far its stocks and flows are apart at most, mass"]
+    largest_error: Annotated[float, "largest difference between a simulated flow and the table, mass/time"]
+    files: Annotated[tuple[Path, ...], "what was written, the definition first"]
+
+
+def imported(
+    flows: Path,
+    out: Path,
+    stocks: Path | None = None,
+    *,
+    roles: Mapping[str, Sequence[str]],
+    stores: Sequence[str] = (),
+    regions: Sequence[str] = (),
+    ask: Ask | None = None,
+    reconcile: bool = False,
+    sheet: str | None = None,
+    unit: str | None = None,
+    year: int | None = None,
+    title: str = "",
+    source: str = "",
+    progress: Callable[[float], None] = lambda share: None,
+) -> Imported:
+    """Write the definition of the network that a table of flows describes, and its data beside it; all or nothing.
+
+    Args:
+        flows: the table, see ``read_flows``.
+        out: the definition file to write; it must not exist.
+        stocks: a table of stocks, at the ends of years; see ``read_stocks``.
+        roles: by role (see ``Role``) the processes that have it; ``*`` stands for any text.
+        stores: processes that hold a stock, likewise.
+        regions: those to take; none means all.
+        ask: gives the role of a source or sink that ``roles`` do not name; None: that is an error.
+        reconcile: whether to adjust flows so that every process without stock balances.
+        sheet: as ``read_flows`` takes it.
+        unit: likewise.
+        year: likewise.
+        title: in words; the name of the file if empty.
+        source: where the numbers come from; the name of the table if empty.
+        progress: called with the share that is done.
+
+    Raises:
+        CirlError: naming file, line and value, or what does not balance, with what to do; nothing is written.
+    """
+    if out.suffix != ".toml":
+        raise CirlError(f"--out {out}: needs the name of a .toml file")
+    if out.exists():
+        raise CirlError(f"--out {out}: exists, and may have been changed by hand; choose another name, or remove it")
+    table = read_flows(flows, sheet=sheet, unit=unit, year=year)
+    if regions:
+        table = table.of(regions)
+    known_stocks = {} if stocks is None else read_stocks(stocks, table.unit.rpartition("/")[0])
+    processes = Processes(table, _named(table, [*stores, *_stocked(table, known_stocks)], "store"))
+    changes: list[Change] = []
+    if residuals := processes.residuals:
+        if not reconcile:
+            raise CirlError(_unbalanced(table, residuals))
+        table, changes = processes.reconciled()
+        processes = Processes(table, processes.of(Kind.STORE))
+    told = _roles(table, processes, roles, ask)
+    name = identifiers([out.stem])[out.stem]
+    if name != out.stem:
+        raise CirlError(f"--out {out}: the name of a network has lower case letters, digits and _, as {name}.toml")
+    made = written(
+        table,
+        processes,
+        told,
+        known_stocks,
+        name=name,
+        title=title or name,
+        source=source or f"imported from {flows.name}",
+    )
+    with published(out.parent) as partial:
+        files = _write(partial, out.name, name, made, changes)
+        error = _largest_error(partial / out.name, table, made, progress)
+    mistakes = processes.stock_mistakes(known_stocks)
+    return Imported(table, processes, told, tuple(changes), mistakes, error, tuple(out.parent / file for file in files))
+
+
+def _named(table: FlowTable, patterns: Sequence[str], what: str) -> list[str]:
+    """Return the processes that names or patterns stand for; a ``CirlError`` for one that stands for none."""
+    names = list(dict.fromkeys(end for pair in table.pairs for end in (pair.source, pair.target)))
+    found: list[str] = []
+    for pattern in patterns:
+        matching = [name for name in names if fnmatchcase(name, pattern)]
+        if not matching:
+            raise CirlError(f"{table.name}: {what}: {unknown('process', pattern, names)}")
+        found += matching
+    return list(dict.fromkeys(found))
+
+
+def _stocked(table: FlowTable, stocks: Mapping[tuple[str, str, int], float]) -> list[str]:
+    regions = {region for region, _, _ in stocks}
+    for region in regions:
+        if region not in table.regions:
+            raise CirlError(f"stocks: {unknown('region', region, table.regions)}")
+    return list(dict.fromkeys(process for _, process, _ in stocks))
+
+
+def _roles(
+    table: FlowTable, processes: Processes, roles: Mapping[str, Sequence[str]], ask: Ask | None
+) -> dict[str, Role]:
+    """Return the roles of processes; sources and sinks all have one."""
+    told: dict[str, Role] = {}
+    for role, patterns in roles.items():
+        for name in _named(table, patterns, role):
+            if told.setdefault(name, Role(role)) is not Role(role):
+                raise CirlError(f"'{name}' is given two roles, {told[name].value} and {role}; leave one out")
+            if processes.kinds[name] is Kind.PASSING and Role(role) is not Role.TECHNOSPHERE:
+                raise CirlError(f"'{name}' is given the role {role}, but what enters it leaves it; it has none")
+    missing = [name for name in processes.of(Kind.SOURCE, Kind.SINK) if name not in told]
+    if missing and ask is None:
+        said = "; ".join(f"'{name}' ({processes.kinds[name].value})" for name in missing)
+        choices = "--reservoir, --landfill, --incinerator, --environment, or --outside (trade, other economies)"
+        raise CirlError(f"{table.name}: what is {said}? Say so by {choices}, such as --outside 'Imports of *'")
+    for name in missing:
+        assert ask is not None
+        told[name] = ask(name, processes.kinds[name])
+    return told
+
+
+def _unbalanced(table: FlowTable, residuals: Sequence[Residual]) -> str:
+    """Say what does not balance."""
+    names = dict.fromkeys(each.process for each in residuals)
+    lines = [f"  {each}" for each in residuals[:SHOWN]]
+    more = [f"  and {len(residuals) - SHOWN} more"] if len(residuals) > SHOWN else []
+    remedy = "Name those that hold a stock with --store, or adjust the flows with --reconcile"
+    said = f"{table.name}: {len(names)} processes do not balance ({table.unit}); the largest residuals are"
+    return "\n".join([said, *lines, *more, f"{remedy}; nothing was written."])
+
+
+def _write(folder: Path, file: str, name: str, made: Definition, changes: Sequence[Change]) -> list[str]:
+    """Write the files and return their names."""
+    files = [file, f"{name}.csv"]
+    (folder / file).write_text(made.text, encoding="utf-8")
+    write_table(folder / files[1], made.header, made.rows)
+    if made.scales:
+        files.append(f"{name}_scales.csv")
+        write_table(folder / files[-1], ["region", "flow", "stock"], made.scales)
+    if changes:
+        files.append(f"{name}_changes.csv")
+        header = ["region", "year", "source", "target", "type", "before", "after", "deviation", "in deviations"]
+        rows = [
+            (c.region, c.year, c.pair.source, c.pair.target, c.pair.type, c.before, c.after, c.deviation, c.weighed)
+            for c in sorted(changes, key=lambda each: -abs(each.after - each.before))
+        ]
+        write_table(folder / files[-1], header, rows)
+    return files
+
+
+def _largest_error(path: Path, table: FlowTable, made: Definition, progress: Callable[[float], None]) -> float:
+    """Simulate every region without agents, and return how far a flow is from the table.
+
+    Raises:
+        CirlError: for a flow that the network does not give back.
+    """
+    worst = 0.0
+    ids = identifiers(table.regions) if table.regions != ("",) else {"": ""}
+    for done, (region, id_) in enumerate(ids.items()):
+        network = load_network(f"{path}:{id_}" if id_ else path)
+        env = VectorEnv(network, num_envs=1)
+        begun = beginning(env)
+        run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+        expected = np.array(
+            [[table.flows.get((region, year, pair), 0.0) for pair in made.arcs] for year in table.years]
+        )
+        order = [network.arc_index[arc] for arc in made.arcs.values()]
+        errors = np.abs(run.flow[:, order] - expected)
+        if errors.max() > WRONG * expected.max():
+            y, k = np.unravel_index(int(errors.argmax()), errors.shape)
+            pair = [*made.arcs][int(k)]
+            simulated = run.flow[y, order[int(k)]]
+            when = f"{table.years[int(y)]}{f' in {region}' if region else ''}"
+            raise CirlError(
+                f"{table.name}: the network does not give back {pair} in {when}: {simulated:g}, not {expected[y, k]:g} "
+                f"{table.unit}; a store may run empty: give stocks"
+            )
+        worst = max(worst, float(errors.max()))
+        progress((done + 1) / len(ids))
+    return worst

@@ -1,0 +1,208 @@
+"""What processes of a table of flows are, what does not balance, and the flows closest to it that do."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Annotated
+
+import numpy as np
+
+from cirl_marl.errors import CirlError
+from cirl_marl.importing.tables import FlowTable, Pair
+from cirl_marl.network import Floats
+from cirl_marl.network.declared import itemised
+
+ROUNDING = 1e-6
+"""Part of the largest flow of a region by which a process may fail to balance, as tables are rounded."""
+GROWS = 0.2
+"""Part of all that enters a process from which on what stays there is taken for a growing stock."""
+UNCERTAIN = 0.1
+"""Standard deviation, relative to the flow, of flows that state none."""
+SWEEPS = 1000
+
+
+class Kind(StrEnum):
+    """What a process does with what enters it."""
+
+    SOURCE = "source"
+    SINK = "sink"
+    PASSING = "passing"
+    STORE = "store"
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class Residual:
+    """What entered a process and did not leave it, though it is no store."""
+
+    process: Annotated[str, "its name"]
+    region: Annotated[str, "empty without regions"]
+    year: Annotated[int, "the year"]
+    entered: Annotated[float, "sum of its inflows"]
+    left: Annotated[float, "sum of its outflows"]
+
+    def __str__(self) -> str:
+        """Say it as in a message."""
+        where = f"{self.region}, {self.year}" if self.region else str(self.year)
+        return f"'{self.process}' ({where}): {self.entered:g} enter, {self.left:g} leave"
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A flow that was adjusted."""
+
+    region: Annotated[str, "empty without regions"]
+    year: Annotated[int, "the year"]
+    pair: Annotated[Pair, "the flow"]
+    before: Annotated[float, "as the table has it"]
+    after: Annotated[float, "as it was adjusted"]
+    deviation: Annotated[float, "standard deviation that it was weighted by"]
+
+    @property
+    def weighed(self) -> float:
+        """The change in standard deviations."""
+        return (self.after - self.before) / self.deviation
+
+
+class Processes:
+    """The processes of a table.
+
+    Attributes:
+        names: in the order in which the table names them.
+        kinds: what each is.
+        assumed: stores that nobody named as such, found by what stays in them.
+    """
+
+    def __init__(self, table: FlowTable, stores: Collection[str] = ()) -> None:
+        """Find out what each process of ``table`` is.
+
+        ``stores`` hold a stock; if none is named, those do in which much of what enters stays.
+        """
+        self._table = table
+        self.names = tuple(dict.fromkeys(end for pair in table.pairs for end in (pair.source, pair.target)))
+        self._place = {name: i for i, name in enumerate(self.names)}
+        regions, years, pairs = table.regions, table.years, table.pairs
+        self.flows = np.zeros((len(regions), len(years), len(pairs)))
+        at = [{key: i for i, key in enumerate(keys)} for keys in (regions, years, pairs)]
+        for (region, year, pair), value in table.flows.items():
+            self.flows[at[0][region], at[1][year], at[2][pair]] = value
+        self._incidence = np.zeros((len(self.names), len(pairs)))
+        for k, pair in enumerate(pairs):
+            self._incidence[self._place[pair.source], k] -= 1.0
+            self._incidence[self._place[pair.target], k] += 1.0
+        entered, left = self._sums(1.0), self._sums(-1.0)
+        stays = entered - left
+        beyond = np.abs(stays) > self._tolerance()[:, None, None]
+        whole = entered.sum(axis=(0, 1))
+        grows = stays.sum(axis=(0, 1)) >= GROWS * whole
+        self.kinds: dict[str, Kind] = {}
+        assumed = []
+        for i, name in enumerate(self.names):
+            if whole[i] == 0:
+                kind = Kind.SOURCE
+            elif not left[:, :, i].any():
+                kind = Kind.SINK
+            elif name in stores:
+                kind = Kind.STORE
+            elif not stores and beyond[:, :, i].any() and grows[i]:
+                kind = Kind.STORE
+                assumed.append(name)
+            else:
+                kind = Kind.PASSING
+            self.kinds[name] = kind
+        self.assumed = tuple(assumed)
+
+    def of(self, *kinds: Kind) -> tuple[str, ...]:
+        """Return the processes of some kinds."""
+        return tuple(name for name, kind in self.kinds.items() if kind in kinds)
+
+    @property
+    def residuals(self) -> list[Residual]:
+        """What does not balance beyond rounding, the largest first."""
+        entered, left = self._sums(1.0), self._sums(-1.0)
+        passing = np.array([kind is Kind.PASSING for kind in self.kinds.values()])
+        wrong = (np.abs(entered - left) > self._tolerance()[:, None, None]) & passing
+        found = [
+            Residual(self.names[i], self._table.regions[r], self._table.years[y], entered[r, y, i], left[r, y, i])
+            for r, y, i in np.argwhere(wrong).tolist()
+        ]
+        return sorted(found, key=lambda each: -abs(each.entered - each.left))
+
+    def reconciled(self) -> tuple[FlowTable, list[Change]]:
+        """Return flows that balance and are closest to those of the table, and what was changed.
+
+        In each region and year they minimise Σ ((x − m)/σ)² for x ≥ 0 and inflow = outflow of every process that
+        stores nothing, m the flows of the table and σ their standard deviations, or 10 % of flows that state none
+        (Cencic and Rechberger 2008). A flow of 0 stays 0.
+        """
+        table, flows = self._table, dict(self._table.flows)
+        rows = np.array([kind is Kind.PASSING for kind in self.kinds.values()])
+        balances, changes = self._incidence[rows], []
+        for r, region in enumerate(table.regions):
+            for y, year in enumerate(table.years):
+                measured = self.flows[r, y]
+                own = [table.deviations.get((region, year, pair)) for pair in table.pairs]
+                stated = np.array([np.nan if each is None else each for each in own])
+                deviations = np.where(np.isnan(stated), UNCERTAIN * measured, stated)
+                found = _closest(measured, np.where(measured > 0, deviations, 0.0), balances)
+                if found is None:
+                    where = f"{region}, {year}" if region else str(year)
+                    remedy = "state how uncertain they are"
+                    raise CirlError(f"{table.name}: {where}: flows whose uncertainty is 0 do not balance; {remedy}")
+                for k in np.flatnonzero(np.abs(found - measured) > 1e-9 * measured.max()).tolist():
+                    pair = table.pairs[k]
+                    flows[region, year, pair] = float(found[k])
+                    changes.append(Change(region, year, pair, measured[k], float(found[k]), float(deviations[k])))
+        return replace(table, flows=flows), changes
+
+    def stock_mistakes(self, stocks: Mapping[tuple[str, str, int], float]) -> dict[str, float]:
+        """Return, for each process with stocks, the largest difference between their growth and what the flows say.
+
+        The stock of a year is that at its end; stocks are by region, process and year.
+        """
+        worst: dict[str, float] = {}
+        table, net = self._table, self.flows @ self._incidence.T
+        for (region, name, year), stock in stocks.items():
+            before = stocks.get((region, name, year - 1))
+            if before is not None and year in table.years:
+                said = float(net[table.regions.index(region), table.years.index(year), self._place[name]])
+                worst[name] = max(worst.get(name, 0.0), abs(stock - before - said))
+        return worst
+
+    def _sums(self, sign: float) -> Floats:
+        """Return what enters (1) or leaves (−1) each process, shape (regions, years, processes)."""
+        ends = np.maximum(sign * self._incidence, 0.0)
+        return np.asarray(self.flows @ ends.T)
+
+    def _tolerance(self) -> Floats:
+        """Return what counts as rounding in each region, shape (regions,)."""
+        return np.asarray(ROUNDING * self.flows.max(axis=(1, 2)))
+
+
+def _closest(measured: Floats, deviations: Floats, balances: Floats) -> Floats | None:
+    """Return the x ≥ 0 with ``balances`` x = 0 that minimises Σ ((x − m)/σ)², by an active set; None if there is none.
+
+    Where σ = 0 x is m.
+    """
+    free, found = deviations > 0, measured.copy()
+    scale = float(measured.max(initial=0.0)) or 1.0
+    for _ in range(SWEEPS):
+        weights = np.where(free, deviations**2, 0.0)
+        start = np.where(free | (deviations == 0), measured, 0.0)
+        system = (balances * weights) @ balances.T
+        prices = np.linalg.lstsq(system, balances @ start, rcond=1e-13)[0]
+        found = start - weights * (balances.T @ prices)
+        if (found < -1e-12 * scale).any():
+            free &= found >= -1e-12 * scale
+            continue
+        # what would rise if it were let go
+        held = ~free & (deviations > 0)
+        pull = np.where(held, measured - deviations**2 * (balances.T @ prices), -np.inf)
+        if pull.max(initial=-np.inf) <= 1e-9 * scale:
+            break
+        free[int(pull.argmax())] = True
+    found = np.maximum(found, 0.0)
+    return found if np.abs(balances @ found).max(initial=0.0) <= 1e-7 * scale else None

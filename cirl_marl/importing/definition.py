@@ -1,0 +1,269 @@
+"""From flows that balance to a definition file and its data, as an engineer would have written them."""
+
+from __future__ import annotations
+
+import json
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from cirl_marl.importing.balances import Kind, Processes
+from cirl_marl.importing.tables import FlowTable, Pair
+from cirl_marl.network import Floats
+from cirl_marl.network.declared import itemised
+from cirl_marl.network.elements import Role
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """The files of an imported network."""
+
+    text: Annotated[str, "the definition"]
+    header: Annotated[tuple[str, ...], "columns of the data file"]
+    rows: Annotated[list[tuple[object, ...]], "its rows: flows, and shares of what leaves processes without stock"]
+    arcs: Annotated[Mapping[Pair, str], "id of the arc of each pair"]
+    scales: Annotated[list[tuple[object, ...]], "reference flow and stock of each region; empty without regions"]
+
+
+def written(
+    table: FlowTable,
+    processes: Processes,
+    roles: Mapping[str, Role],
+    stocks: Mapping[tuple[str, str, int], float],
+    *,
+    name: str,
+    title: str,
+    source: str,
+) -> Definition:
+    """Return the definition of a network whose neutral simulation gives back the flows of a table.
+
+    Flows from sources and stores are series; what passes through a process without stock is shared out as it was.
+    Where nothing passed, the shares are those of the nearest year with any, or of all regions together.
+
+    Args:
+        table: flows that balance.
+        processes: its processes.
+        roles: of sources, sinks and stores; those that are not named belong to the technosphere.
+        stocks: by region, process and year, in the unit of mass of the table; at the end of a year.
+        name: of the network, and of the data file.
+        title: in words.
+        source: where the numbers come from.
+    """
+    return _Writer(table, processes, roles, stocks, name, title, source).definition()
+
+
+def identifier(text: str) -> str:
+    """Return what a process is called in files: lower case, without accents, words joined by ``_``.
+
+    >>> identifier("Market of Ingots & semis")
+    'market_of_ingots_semis'
+    """
+    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+    found = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")
+    return found if found[:1].isalpha() else f"process_{found}".rstrip("_")
+
+
+def identifiers(texts: Iterable[str]) -> dict[str, str]:
+    """Return an identifier for each text, no two alike."""
+    found: dict[str, str] = {}
+    for text in texts:
+        first = identifier(text)
+        number, chosen = 2, first
+        while chosen in found.values():
+            number, chosen = number + 1, f"{first}_{number}"
+        found[text] = chosen
+    return found
+
+
+def shares_of(flows: Floats) -> Floats:
+    """Return the shares of outflows of a process, shape (regions, years, arcs), of flows of that shape.
+
+    Where nothing leaves they are those of the nearest year of the region with any, the earlier of two; without any,
+    those of all regions and years together.
+    """
+    total = flows.sum(axis=2, keepdims=True)
+    pooled = flows.sum(axis=(0, 1)) / flows.sum()
+    shares = np.divide(flows, total, out=np.broadcast_to(pooled, flows.shape).copy(), where=total > 0)
+    years = np.arange(flows.shape[1])
+    for region, active in enumerate(total[:, :, 0] > 0):
+        if active.any():
+            known = years[active]
+            nearest = known[np.abs(known[None] - years[:, None]).argmin(axis=1)]
+            shares[region] = shares[region, nearest]
+    return np.asarray(shares)
+
+
+class _Writer:
+    def __init__(
+        self,
+        table: FlowTable,
+        processes: Processes,
+        roles: Mapping[str, Role],
+        stocks: Mapping[tuple[str, str, int], float],
+        name: str,
+        title: str,
+        source: str,
+    ) -> None:
+        self._table, self._processes, self._roles, self._stocks = table, processes, roles, stocks
+        self._name, self._title, self._source = name, title, source
+        self._mass = table.unit.rpartition("/")[0]
+        self._regional = table.regions != ("",)
+        self._nodes = identifiers(processes.names)
+        between: dict[tuple[str, str], list[Pair]] = {}
+        for pair in table.pairs:
+            between.setdefault((pair.source, pair.target), []).append(pair)
+        texts = {
+            pair: f"{pair.source} to {pair.target}" + (f" {pair.type}" if len(group) > 1 else "")
+            for group in between.values()
+            for pair in group
+        }
+        self._arcs = {pair: id_ for pair, id_ in zip(texts, identifiers(texts.values()).values(), strict=True)}
+        self._regions = identifiers(table.regions) if self._regional else {}
+
+    def definition(self) -> Definition:
+        """Write everything."""
+        lines = [*self._head(), *self._node_tables(), *self._arc_tables()]
+        regional = ("region",) if self._regional else ()
+        return Definition(
+            "\n".join(lines) + "\n",
+            (*regional, "arc", "year", "flow", "share"),
+            self._rows(),
+            self._arcs,
+            self._scales(),
+        )
+
+    def _head(self) -> Iterator[str]:
+        years, unit, source = self._table.years, self._table.unit, _text(self._source)
+        yield f"# {self._title}"
+        yield "# Made by cirl import, and yours to change: `cirl check` names mistakes."
+        yield f"name = {_text(self._name)}"
+        yield f"title = {_text(self._title + (' of {region}' if self._regional else ''))}"
+        yield 'material = "not stated"'
+        yield f"references = [{source}]"
+        yield from ("", "[units]", f"mass = {_text(self._mass)}", 'time = "year"')
+        if self._regional:
+            yield from ("", "[regions]")
+            yield from (f"{id_} = {_text(region)}" for region, id_ in self._regions.items())
+        flow, stock = self._references()[0]
+        yield from ("", "[scales]")
+        yield f"stock = {self._scale('stock', stock, self._mass, 'the largest flow, times the years')}"
+        yield f"flow = {self._scale('flow', flow, unit, 'the largest flow')}"
+        yield from ("", "[episode]", f"start = {years[0]}")
+        yield 'control_interval = { value = 1, unit = "year", source = "the table has years" }'
+        yield f'horizon = {{ value = {len(years)}, unit = "1", source = "{years[0]} to {years[-1]}" }}'
+        yield from ("", "[objective]")
+        yield 'reference_interval = { value = 1, unit = "year", source = "chosen: flows of a year" }'
+        yield f"circularity_scale = {self._scale('flow', flow, self._mass, 'the largest flow, for a year')}"
+        yield 'circularity_weight = { value = 0.5, unit = "1", source = "chosen" }'
+        yield from ('net_zero = "signed"', 'reward = "mixed"', "", "[observation]", 'mode = "local"')
+
+    def _references(self) -> list[tuple[float, float]]:
+        """Return reference flow and stock of each region, to two digits."""
+        largest = self._processes.flows.max(axis=(1, 2))
+        return [(_rounded(each), _rounded(each * len(self._table.years))) for each in largest.tolist()]
+
+    def _scales(self) -> list[tuple[object, ...]]:
+        if not self._regional:
+            return []
+        return [(region, *each) for region, each in zip(self._table.regions, self._references(), strict=True)]
+
+    def _scale(self, what: str, value: float, unit: str, source: str) -> str:
+        if not self._regional:
+            return f"{{ value = {value:g}, unit = {_text(unit)}, source = {_text(source)} }}"
+        where = f'file = "{self._name}_scales.csv", column = "{what}", where = {{ region = "{{region}}" }}'
+        return f"{{ {where}, unit = {_text(unit)}, source = {_text(source)} }}"
+
+    def _node_tables(self) -> Iterator[str]:
+        for process, id_ in self._nodes.items():
+            kind = self._processes.kinds[process]
+            yield from ("", f"[nodes.{id_}]")
+            if id_ != process:
+                yield f"title = {_text(process)}"
+            yield f'role = "{self._roles.get(process, Role.TECHNOSPHERE).value}"'
+            if kind is Kind.PASSING:
+                yield "stores = false"
+            elif kind is Kind.SINK:
+                since = _text(f"counted from {self._table.years[0]}")
+                yield f"initial = {{ low = 0, high = 0, unit = {_text(self._mass)}, source = {since} }}"
+            elif stock := self._initial(process):
+                yield stock
+            elif kind is Kind.STORE:
+                yield "# no initial stock is known: it starts with what leaves it in all these years"
+
+    def _initial(self, process: str) -> str:
+        """Return the initial stock of a store, if it is known: that at the end of the year before the first."""
+        before = self._table.years[0] - 1
+        known = {region: self._stocks.get((region, process, before)) for region in self._table.regions}
+        if any(stock is None for stock in known.values()):
+            return ""
+        told = f"unit = {_text(self._mass)}, source = {_text(self._source)}"
+        if not self._regional:
+            return f"initial = {{ low = {known['']!r}, high = {known['']!r}, {told} }}"
+        where = f'region = "{{region}}", arc = "{self._stock(process)}", year = "{before}"'
+        return f'initial = {{ file = "{self._name}.csv", column = "flow", where = {{ {where} }}, {told} }}'
+
+    def _stock(self, process: str) -> str:
+        """Return what stands for the stock of a process in the column of arcs."""
+        return f"stock of {self._nodes[process]}"
+
+    def _arc_tables(self) -> Iterator[str]:
+        for pair, id_ in self._arcs.items():
+            yield from ("", f"[arcs.{id_}]")
+            if pair.type:
+                yield f"title = {_text(pair.type)}"
+            yield from (f'from = "{self._nodes[pair.source]}"', f'to = "{self._nodes[pair.target]}"')
+            if self._processes.kinds[pair.source] is not Kind.PASSING:
+                yield from ('law = "exogenous"', f"flow = {self._column(id_, 'flow', self._table.unit)}")
+            elif self._rest(pair):
+                yield from ('law = "share"', 'share = "rest"')
+            else:
+                yield from ('law = "share"', f"share = {self._column(id_, 'share', '1')}")
+
+    def _rest(self, pair: Pair) -> bool:
+        """Whether the share of a pair is what the others leave: of the largest flow out of its process."""
+        total = self._processes.flows.sum(axis=(0, 1))
+        of = [k for k, each in enumerate(self._table.pairs) if each.source == pair.source]
+        return self._table.pairs[max(of, key=lambda k: total[k])] == pair
+
+    def _column(self, arc: str, column: str, unit: str) -> str:
+        region = 'region = "{region}", ' if self._regional else ""
+        where = f'file = "{self._name}.csv", column = "{column}", where = {{ {region}arc = "{arc}" }}'
+        return f"{{ {where}, unit = {_text(unit)}, source = {_text(self._source)} }}"
+
+    def _rows(self) -> list[tuple[object, ...]]:
+        """Return the rows of the data file, in the order of regions, arcs and years."""
+        table, flows = self._table, self._processes.flows
+        shares = np.full(flows.shape, np.nan)
+        for process in self._processes.of(Kind.PASSING):
+            own = [k for k, pair in enumerate(table.pairs) if pair.source == process]
+            shares[:, :, own] = shares_of(flows[:, :, own])
+        rows: list[tuple[object, ...]] = []
+        for r, region in enumerate(table.regions):
+            first = (region,) if self._regional else ()
+            for k, pair in enumerate(table.pairs):
+                for y, year in enumerate(table.years):
+                    share = None if np.isnan(shares[r, y, k]) else _short(shares[r, y, k])
+                    rows.append((*first, self._arcs[pair], year, _short(flows[r, y, k]), share))
+            if self._regional:
+                for (where, process, year), stock in sorted(self._stocks.items()):
+                    if where == region:
+                        rows.append((*first, self._stock(process), year, _short(stock), None))
+        return rows
+
+
+def _text(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _short(value: float) -> str:
+    """Write a number as short as it reads back to the same."""
+    return repr(float(value)).removesuffix(".0")
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.2g}") or 1.0

@@ -1,0 +1,378 @@
+"""From tables of flows to networks: what is read, what balances, what comes back."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from openpyxl import Workbook
+from scipy.optimize import minimize
+from typer.testing import CliRunner
+
+from cirl_marl import CirlError, VectorEnv, load_network
+from cirl_marl.cli import app
+from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.importing.assembly import Imported, imported
+from cirl_marl.importing.balances import Kind, Processes
+from cirl_marl.importing.definition import identifiers, shares_of
+from cirl_marl.importing.tables import Pair, read_flows
+from cirl_marl.network.elements import Role
+
+Row = Sequence[object]
+HEADER = ["source", "target", "type", "region", "year", "value", "unit"]
+ROLES = {"nonrenewable_reservoir": ["Ore*"], "landfill": ["Dump*"]}
+
+
+def table(path: Path, rows: Sequence[Row], header: Sequence[str] = HEADER) -> Path:
+    """Write a CSV file."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([header, *rows])
+    return path
+
+
+def cycle(years: int = 3, region: str = "", scale: float = 1.0) -> list[list[object]]:
+    """Return a metal that is dug, made, used, and partly comes back; all but the use balances."""
+    rows: list[list[object]] = []
+    for y in range(years):
+        dug, back = scale * (10.0 + y), scale * (4.0 - y)
+        made = dug + back
+        for source, target, kind, value in (
+            ("Ore body", "Smelter", "", dug),
+            ("Old scrap", "Smelter", "", back),
+            ("Smelter", "Works", "", 0.9 * made),
+            ("Smelter", "Dumps", "slag", 0.1 * made),
+            ("Works", "Use", "", 0.8 * 0.9 * made),
+            ("Works", "Smelter", "", 0.0),
+            ("Works", "Dumps", "dust", 0.05 * 0.9 * made),
+            ("Works", "Dumps", "sludge", 0.15 * 0.9 * made),
+            ("Use", "Old scrap", "", back),
+        ):
+            rows.append([source, target, kind, region, 2000 + y, value, "kt/year"])
+    return rows
+
+
+def simulated(path: Path | str) -> dict[tuple[str, int], float]:
+    """Return the flows of a network without agents, by arc and year."""
+    network = load_network(path)
+    env = VectorEnv(network, num_envs=1)
+    begun = beginning(env)
+    run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    start = network.episode.start
+    assert isinstance(start, int | float)
+    return {
+        (arc.id, int(start) + y): float(run.flow[y, k])
+        for k, arc in enumerate(network.arcs)
+        for y in range(len(run.flow))
+    }
+
+
+def test_a_table_becomes_the_network_that_an_engineer_would_write(tmp_path: Path) -> None:
+    """Sources, sinks, stores and what passes; roles, titles, shares, series; flows come back."""
+    flows = table(tmp_path / "flows.csv", [row for row in cycle() if row[5]])
+    found = imported(flows, tmp_path / "metal.toml", roles=ROLES, title="A metal", source="made up, CC0")
+    assert found.processes.of(Kind.STORE) == ("Use",) == found.processes.assumed
+    assert found.processes.of(Kind.PASSING) == ("Smelter", "Old scrap", "Works")
+    assert found.largest_error < 1e-9
+    network = load_network(tmp_path / "metal.toml")
+    nodes = {node.id: node for node in network.nodes}
+    assert nodes["ore_body"].role is Role.NONRENEWABLE_RESERVOIR and nodes["ore_body"].title == "Ore body"
+    assert nodes["dumps"].role is Role.LANDFILL and not nodes["works"].stores and nodes["use"].stores
+    assert network.title == "A metal" and network.references == ("made up, CC0",)
+    assert (network.episode.start, network.episode.horizon, network.mass_unit) == (2000, 3, "kt")
+    back = simulated(tmp_path / "metal.toml")
+    assert back["works_to_dumps_sludge", 2002] == pytest.approx(0.15 * 0.9 * 14)
+    assert back["smelter_to_works", 2001] == pytest.approx(0.9 * 14)
+    check = CliRunner().invoke(app, ["check", str(tmp_path / "metal.toml")])
+    assert check.exit_code == 0, check.output
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> list[list[object]]:
+    """Draw flows of several years and regions through processes that balance, in loops too, and come and go."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    size, years, regions = (
+        int(rng.integers(1, 6)),
+        int(rng.integers(1, 4)),
+        draw(st.sampled_from([("",), ("A", "B b")])),
+    )
+    rows: list[list[object]] = []
+    for region in regions:
+        for year in range(years):
+            # shares among processes, of which at least a tenth goes to the dump
+            shares = rng.random((size, size + 1)) * (rng.random((size, size + 1)) < 0.6)
+            shares[:, size] += 0.1
+            np.fill_diagonal(shares, 0.0)
+            shares /= shares.sum(axis=1, keepdims=True)
+            entering = rng.random(size) * (rng.random(size) < 0.7) * 10 ** rng.uniform(0, 4)
+            entering[0] += 1.0
+            through = np.linalg.solve(np.eye(size) - shares[:, :size].T, entering)
+            flows = through[:, None] * shares
+            rows += [["Ore", f"P{i}", "", region, 1990 + year, entering[i], "t/year"] for i in range(size)]
+            for i, j in np.argwhere(flows > 0).tolist():
+                rows.append([f"P{i}", "Dump" if j == size else f"P{j}", "", region, 1990 + year, flows[i, j], "t/year"])
+    return [row for row in rows if float(str(row[5])) > 0]
+
+
+@settings(max_examples=15)
+@given(tables())
+def test_every_flow_comes_back(tmp_path_factory: pytest.TempPathFactory, rows: list[list[object]]) -> None:
+    """Of any table that balances, in every region and year."""
+    folder = tmp_path_factory.mktemp("import")
+    found = imported(table(folder / "flows.csv", rows), folder / "net.toml", roles=ROLES)
+    largest = max(float(str(row[5])) for row in rows)
+    assert found.largest_error <= 1e-9 * largest
+    ids = identifiers(found.processes.names)
+    for region, id_ in {"": "", "A": "a", "B b": "b_b"}.items():
+        own = [row for row in rows if row[3] == region]
+        if own:
+            back = simulated(f"{folder / 'net.toml'}:{id_}" if id_ else folder / "net.toml")
+            for source, target, _, _, year, value, _ in own:
+                arc = f"{ids[str(source)]}_to_{ids[str(target)]}"
+                assert back[arc, int(str(year))] == pytest.approx(float(str(value)), rel=1e-6, abs=1e-9 * largest)
+            assert sum(back.values()) == pytest.approx(sum(float(str(row[5])) for row in own))
+
+
+def test_a_workbook_is_the_same(tmp_path: Path) -> None:
+    """As a long table, or as a matrix on a sheet for each year."""
+    rows = [row for row in cycle() if row[2] == "" and row[5]]
+    rows += [["Smelter", "Dumps", "", "", y, 0.1 * 14, "kt/year"] for y in (2000, 2001, 2002)]
+    rows += [["Works", "Dumps", "", "", y, 0.2 * 0.9 * 14, "kt/year"] for y in (2000, 2001, 2002)]
+    long, matrix = Workbook(), Workbook()
+    assert long.active is not None and matrix.active is not None
+    long.active.append(HEADER)
+    for row in rows:
+        long.active.append(list(row))
+    long.save(tmp_path / "long.xlsx")
+    targets = list(dict.fromkeys(str(row[1]) for row in rows))
+    for year in (2000, 2001, 2002):
+        sheet = matrix.create_sheet(str(year))
+        sheet.append(["from \\ to", *targets])
+        for source in dict.fromkeys(str(row[0]) for row in rows):
+            found = {str(row[1]): row[5] for row in rows if row[0] == source and row[4] == year}
+            sheet.append([source, *(found.get(target) for target in targets)])
+    matrix.active.append(["notes"])
+    matrix.save(tmp_path / "matrix.xlsx")
+    expected = read_flows(table(tmp_path / "long.csv", rows)).flows
+    assert dict(read_flows(tmp_path / "long.xlsx").flows) == pytest.approx(dict(expected))
+    assert dict(read_flows(tmp_path / "matrix.xlsx", unit="kt").flows) == pytest.approx(dict(expected))
+    assert read_flows(tmp_path / "matrix.xlsx", unit="kt").unit == "kt/year"
+    one = read_flows(tmp_path / "matrix.xlsx", sheet="2001", unit="kt/year")
+    assert one.years == (2001,)
+
+
+def test_columns_may_be_named_by_their_unit(tmp_path: Path) -> None:
+    """As in published data; other names and cases are understood."""
+    rows = [[row[0], row[1], row[4], row[5]] for row in cycle() if row[2] == ""]
+    found = read_flows(table(tmp_path / "flows.csv", rows, ["From", "To", "Year", "kt_per_year"]))
+    assert found.unit == "kt/year" and found.flows["", 2001, Pair("Smelter", "Works")] == pytest.approx(0.9 * 14)
+
+
+def test_shares_are_held_where_nothing_flows() -> None:
+    """Those of the nearest year, the earlier of two; of a region without any, those of all together."""
+    flows = np.zeros((2, 5, 2))
+    flows[0, 1], flows[0, 3] = (3.0, 1.0), (1.0, 3.0)
+    shares = shares_of(flows)
+    np.testing.assert_allclose(shares[0, :, 0], [0.75, 0.75, 0.75, 0.25, 0.25])
+    np.testing.assert_allclose(shares[1], 0.5)
+
+
+def test_stocks_are_where_a_store_begins(tmp_path: Path) -> None:
+    """At the end of the year before; how far their growth is from the flows is told."""
+    flows = table(tmp_path / "flows.csv", cycle())
+    growth = [0.72 * 14 - (4.0 - y) for y in range(3)]
+    levels = np.cumsum([50.0, *growth])
+    rows = [["Use", 1999 + y, level, "kt"] for y, level in enumerate(levels)]
+    rows[2][2] = float(str(rows[2][2])) + 0.5
+    stocks = table(tmp_path / "stocks.csv", rows, ["process", "year", "value", "unit"])
+    found = imported(flows, tmp_path / "metal.toml", stocks, roles=ROLES)
+    assert found.stock_mistakes == {"Use": pytest.approx(0.5)} and not found.processes.assumed
+    network = load_network(tmp_path / "metal.toml")
+    assert network.initial[:, network.node_index["use"]] == pytest.approx([50.0, 50.0])
+
+
+def noisy(rows: Sequence[Row], seed: int) -> list[list[object]]:
+    """Return flows with errors of some percent, and how uncertain each is."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for row in rows:
+        deviation = float(rng.uniform(0.02, 0.3))
+        value = float(str(row[5])) * float(np.clip(rng.normal(1, deviation), 0.2, 3))
+        found.append([*row[:5], value, row[6], f"{100 * deviation} %"])
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_reconciled_flows_are_the_closest_that_balance(seed: int, tmp_path: Path) -> None:
+    """Weighted least squares, as another solver finds them; what is changed is listed; what balances stays."""
+    rows = noisy([row for row in cycle(years=2) if row[5]], seed)
+    path = table(tmp_path / "flows.csv", rows, [*HEADER, "uncertainty"])
+    with pytest.raises(CirlError, match=r"3 processes do not balance .*\n  '.*enter.*leave\n(.*\n)+.*--reconcile"):
+        imported(path, tmp_path / "metal.toml", roles=ROLES, stores=["Use"])
+    assert [each.name for each in tmp_path.iterdir()] == ["flows.csv"]
+    found = imported(path, tmp_path / "metal.toml", roles=ROLES, stores=["Use"], reconcile=True)
+    assert not Processes(found.table, ["Use"]).residuals
+    given = read_flows(path)
+    for year in given.years:
+        pairs = [pair for pair in given.pairs if ("", year, pair) in given.flows]
+        measured = np.array([given.flows["", year, pair] for pair in pairs])
+        deviation = np.array([given.deviations["", year, pair] for pair in pairs])
+        after = np.array([found.table.flows["", year, pair] for pair in pairs])
+        balances = [{"type": "eq", "fun": balance_of(process, pairs)} for process in found.processes.of(Kind.PASSING)]
+
+        def distance(x: Any, measured: Any = measured, deviation: Any = deviation) -> float:
+            return float((((x - measured) / deviation) ** 2).sum())
+
+        best = minimize(
+            distance, measured, bounds=[(0, None)] * len(pairs), constraints=balances, options={"ftol": 1e-14}
+        )
+        assert distance(after) <= best.fun * (1 + 1e-6)
+        np.testing.assert_allclose(after, best.x, rtol=1e-3, atol=1e-3)
+    changed = {(each.year, each.pair) for each in found.changes}
+    assert len(changed) == len(found.changes) > 0
+    listed = (tmp_path / "metal_changes.csv").read_text(encoding="utf-8").splitlines()[1:]
+    assert len(listed) == len(changed)
+    exact = table(tmp_path / "exact.csv", cycle())
+    assert imported(exact, tmp_path / "exact.toml", roles=ROLES, reconcile=True).changes == ()
+
+
+def balance_of(process: str, pairs: Sequence[Pair]) -> Callable[[Any], float]:
+    """Return what enters a process less what leaves it, as a function of the flows."""
+    signs = np.array([(pair.target == process) * 1.0 - (pair.source == process) for pair in pairs])
+    return lambda x: float(signs @ x)
+
+
+def test_no_flow_is_reconciled_below_none(tmp_path: Path) -> None:
+    """A flow that would have to be negative becomes 0, and the others make up for it."""
+    rows = [["Ore", "Works", 10.0, "1"], ["Works", "Dump", 1.0, "5"], ["Works", "Use", 30.0, "0.1"]]
+    rows = [[a, b, 2000, v, "t/year", d] for a, b, v, d in rows]
+    path = table(tmp_path / "flows.csv", rows, ["source", "target", "year", "value", "unit", "uncertainty"])
+    found = imported(path, tmp_path / "net.toml", roles=ROLES | {"technosphere": ["Use"]}, reconcile=True)
+    flows = {pair.target: value for (_, _, pair), value in found.table.flows.items()}
+    assert flows["Dump"] == 0.0
+    # of 20 that lack, each takes a part in proportion to its variance
+    assert flows["Works"] == flows["Use"] == pytest.approx(10.0 + 20.0 * 1.0 / 1.01)
+
+
+def bad(**changes: object) -> list[list[object]]:
+    """Return the cycle with a cell of its third row changed."""
+    rows = cycle()
+    for column, value in changes.items():
+        rows[2][HEADER.index(column)] = value
+    return rows
+
+
+def two_regions(missing: int) -> list[list[object]]:
+    """Return two regions, of which the second lacks a year."""
+    return [*cycle(region="A"), *[row for row in cycle(region="B") if row[4] != missing]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "said"),
+    [
+        (two_regions(2001), {}, "flows.csv: region 'B' has no flow in 2001: a flow that is not in the table is 0"),
+        ([*cycle(), cycle()[2]], {}, "line 29: 'Smelter' to 'Works' in 2000 stands in line 4 too; leave one out"),
+        (bad(value=-3.0), {}, "flows.csv, line 4, column 'value': -3.0 is negative; a flow runs from source to target"),
+        (
+            bad(unit="t/year"),
+            {},
+            "flows.csv, line 4: unit 't/year', but 'kt/year' in flows.csv, line 2; give all in one",
+        ),
+        (bad(unit=""), {}, "flows.csv, line 4: states no unit, as others do; write 'kt/year'"),
+        (bad(value="n/a"), {}, "flows.csv, line 4, column 'value': 'n/a' is no number"),
+        (bad(value=""), {}, "flows.csv, line 4, column 'value': '' is no number"),
+        (bad(year="2000.5"), {}, "flows.csv, line 4: '2000.5' is no whole year"),
+        (bad(target=""), {}, "flows.csv, line 4: a flow needs a source and a target"),
+        (bad(target="Smelter"), {}, "flows.csv, line 4: 'Smelter' to 'Smelter': a flow needs two processes"),
+        (cycle(region="Japan"), {"regions": ["Japn"]}, "unknown region 'Japn'. Did you mean 'Japan'?"),
+        (cycle(), {"roles": {"landfill": ["Dumps"]}}, "what is 'Ore body' (source)? Say so by --reservoir"),
+        (
+            cycle(),
+            {"roles": ROLES | {"landfill": ["Dumpz"]}},
+            "landfill: unknown process 'Dumpz'. Did you mean 'Dumps'",
+        ),
+        (
+            cycle(),
+            {"roles": ROLES | {"incinerator": ["Dumps"]}},
+            "'Dumps' is given two roles, landfill and incinerator",
+        ),
+        (
+            cycle(),
+            {"roles": ROLES | {"incinerator": ["Works"]}},
+            "'Works' is given the role incinerator, but what enters",
+        ),
+        (cycle(), {"sheet": "2001"}, "flows.csv: is no workbook, so that it has no sheet '2001'"),
+        ([], {}, "flows.csv: has no flows"),
+    ],
+)
+def test_bad_tables_are_refused(rows: list[list[object]], options: dict[str, Any], said: str, tmp_path: Path) -> None:
+    """With file, line, value and what to do; nothing is written."""
+    path = table(tmp_path / "flows.csv", rows)
+    with pytest.raises(CirlError) as refused:
+        imported(path, tmp_path / "metal.toml", **{"roles": ROLES, **options})
+    assert said in str(refused.value)
+    assert [each.name for each in tmp_path.iterdir()] == ["flows.csv"]
+
+
+def test_bad_files_are_refused(tmp_path: Path) -> None:
+    """A sheet that is not there, a matrix of no year, no unit, a definition that exists."""
+    book = Workbook()
+    assert book.active is not None
+    book.active.title = "Flows"
+    book.active.append(["", "Works"])
+    book.active.append(["Ore", 3])
+    book.save(tmp_path / "book.xlsx")
+    for options, said in (
+        ({"sheet": "Flws"}, "unknown sheet 'Flws'. Did you mean 'Flows'"),
+        ({}, "is a matrix of processes, as it has no columns 'source' and 'target'; of which year? Give --year"),
+        ({"year": 2001}, "states no unit; give one with --unit, such as kt/year"),
+        ({"year": 2001, "unit": "kg/m"}, "unit 'kg/m' is inconsistent"),
+    ):
+        with pytest.raises(CirlError) as refused:
+            read_flows(tmp_path / "book.xlsx", **options)
+        assert said in str(refused.value)
+    (tmp_path / "odd.xlsx").write_text("no workbook")
+    with pytest.raises(CirlError, match=r"odd.xlsx: is no workbook that can be read"):
+        read_flows(tmp_path / "odd.xlsx")
+    flows = table(tmp_path / "flows.csv", cycle())
+    (tmp_path / "metal.toml").write_text("mine")
+    with pytest.raises(CirlError, match=r"exists, and may have been changed by hand"):
+        imported(flows, tmp_path / "metal.toml", roles=ROLES)
+    assert (tmp_path / "metal.toml").read_text() == "mine"
+
+
+def test_the_command_imports(tmp_path: Path) -> None:
+    """Says what became what, and how close the network comes; asks for roles only on a terminal."""
+    flows = table(tmp_path / "flows.csv", [*cycle(region="A"), *cycle(region="B", scale=2.5)])
+    out = tmp_path / "sub" / "metal.toml"
+    arguments = ["import", str(flows), "--out", str(out), "--reservoir", "Ore*"]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code != 0 and "what is 'Dumps' (sink)?" in str(refused.exception)
+    assert not out.parent.exists()
+    run = CliRunner().invoke(app, [*arguments, "--landfill", "Dumps"])
+    assert run.exit_code == 0, run.output
+    assert "stores: Use" in run.output and "no flow is further than" in run.output
+    assert sorted(each.name for each in out.parent.iterdir()) == ["metal.csv", "metal.toml", "metal_scales.csv"]
+    networks = [load_network(f"{out}:{region}") for region in ("a", "b")]
+    assert networks[1].compartments["smelter"].scale == pytest.approx(
+        2.5 * networks[0].compartments["smelter"].scale, rel=0.1
+    )
+
+
+def test_roles_can_be_asked_for(tmp_path: Path) -> None:
+    """Of those that nobody named."""
+    asked: list[tuple[str, Kind]] = []
+
+    def ask(name: str, kind: Kind) -> Role:
+        asked.append((name, kind))
+        return Role.LANDFILL if kind is Kind.SINK else Role.NONRENEWABLE_RESERVOIR
+
+    found: Imported = imported(table(tmp_path / "f.csv", cycle()), tmp_path / "m.toml", roles={}, ask=ask)
+    assert asked == [("Ore body", Kind.SOURCE), ("Dumps", Kind.SINK)]
+    assert found.roles == {"Ore body": Role.NONRENEWABLE_RESERVOIR, "Dumps": Role.LANDFILL}
