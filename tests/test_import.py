@@ -47,11 +47,11 @@ def cycle(years: int = 3, region: str = "", scale: float = 1.0) -> list[list[obj
             ("Ore body", "Smelter", "", dug),
             ("Old scrap", "Smelter", "", back),
             ("Smelter", "Works", "", 0.9 * made),
+            ("Works", "Dumps", "sludge", 0.15 * 0.9 * made),
             ("Smelter", "Dumps", "slag", 0.1 * made),
             ("Works", "Use", "", 0.8 * 0.9 * made),
             ("Works", "Smelter", "", 0.0),
             ("Works", "Dumps", "dust", 0.05 * 0.9 * made),
-            ("Works", "Dumps", "sludge", 0.15 * 0.9 * made),
             ("Use", "Old scrap", "", back),
         ):
             rows.append([source, target, kind, region, 2000 + y, value, "kt/year"])
@@ -358,7 +358,7 @@ def test_the_command_imports(tmp_path: Path) -> None:
     run = CliRunner().invoke(app, [*arguments, "--landfill", "Dumps"])
     assert run.exit_code == 0, run.output
     assert "stores: Use" in run.output and "no flow is further than" in run.output
-    assert sorted(each.name for each in out.parent.iterdir()) == ["metal.csv", "metal.toml", "metal_scales.csv"]
+    assert sorted(each.name for each in out.parent.iterdir()) == ["metal.csv", "metal.toml", "metal_regions.csv"]
     networks = [load_network(f"{out}:{region}") for region in ("a", "b")]
     assert networks[1].compartments["smelter"].scale == pytest.approx(
         2.5 * networks[0].compartments["smelter"].scale, rel=0.1

@@ -174,10 +174,10 @@ def _write(folder: Path, file: str, name: str, made: Definition, changes: Sequen
     """Write the files and return their names."""
     files = [file, f"{name}.csv"]
     (folder / file).write_text(made.text, encoding="utf-8")
-    write_table(folder / files[1], made.header, made.rows)
-    if made.scales:
-        files.append(f"{name}_scales.csv")
-        write_table(folder / files[-1], ["region", "flow", "stock"], made.scales)
+    write_table(folder / files[1], list(map(str, made.data[0])), made.data[1:])
+    if made.regions:
+        files.append(f"{name}_regions.csv")
+        write_table(folder / files[-1], list(map(str, made.regions[0])), made.regions[1:])
     if changes:
         files.append(f"{name}_changes.csv")
         header = ["region", "year", "source", "target", "type", "before", "after", "deviation", "in deviations"]

@@ -24,10 +24,11 @@ class Definition:
     """The files of an imported network."""
 
     text: Annotated[str, "the definition"]
-    header: Annotated[tuple[str, ...], "columns of the data file"]
-    rows: Annotated[list[tuple[object, ...]], "its rows: flows, and shares of what leaves processes without stock"]
+    data: Annotated[list[list[object]], "the data file: by region and year flows, or shares of what leaves a process"]
+    regions: Annotated[
+        list[list[object]], "by region reference flow and stock, and first stocks; empty without regions"
+    ]
     arcs: Annotated[Mapping[Pair, str], "id of the arc of each pair"]
-    scales: Annotated[list[tuple[object, ...]], "reference flow and stock of each region; empty without regions"]
 
 
 def written(
@@ -122,20 +123,14 @@ class _Writer:
             for group in between.values()
             for pair in group
         }
-        self._arcs = {pair: id_ for pair, id_ in zip(texts, identifiers(texts.values()).values(), strict=True)}
+        names = identifiers(texts.values())
+        self._arcs = {pair: names[texts[pair]] for pair in table.pairs}
         self._regions = identifiers(table.regions) if self._regional else {}
 
     def definition(self) -> Definition:
         """Write everything."""
         lines = [*self._head(), *self._node_tables(), *self._arc_tables()]
-        regional = ("region",) if self._regional else ()
-        return Definition(
-            "\n".join(lines) + "\n",
-            (*regional, "arc", "year", "flow", "share"),
-            self._rows(),
-            self._arcs,
-            self._scales(),
-        )
+        return Definition("\n".join(lines) + "\n", self._data(), self._of_regions(), self._arcs)
 
     def _head(self) -> Iterator[str]:
         years, unit, source = self._table.years, self._table.unit, _text(self._source)
@@ -167,16 +162,23 @@ class _Writer:
         largest = self._processes.flows.max(axis=(1, 2))
         return [(_rounded(each), _rounded(each * len(self._table.years))) for each in largest.tolist()]
 
-    def _scales(self) -> list[tuple[object, ...]]:
+    def _of_regions(self) -> list[list[object]]:
+        """Return what differs from region to region and not from year to year, a row for each."""
         if not self._regional:
             return []
-        return [(region, *each) for region, each in zip(self._table.regions, self._references(), strict=True)]
+        stored = [process for process in self._processes.of(Kind.STORE) if self._first_stocks(process)]
+        rows: list[list[object]] = [["region", "flow", "stock", *(f"stock of {self._nodes[each]}" for each in stored)]]
+        for region, scales in zip(self._table.regions, self._references(), strict=True):
+            rows.append([region, *scales, *(self._first_stocks(each)[region] for each in stored)])
+        return rows
 
     def _scale(self, what: str, value: float, unit: str, source: str) -> str:
         if not self._regional:
             return f"{{ value = {value:g}, unit = {_text(unit)}, source = {_text(source)} }}"
-        where = f'file = "{self._name}_scales.csv", column = "{what}", where = {{ region = "{{region}}" }}'
-        return f"{{ {where}, unit = {_text(unit)}, source = {_text(source)} }}"
+        return f"{{ {self._of_region(what)}, unit = {_text(unit)}, source = {_text(source)} }}"
+
+    def _of_region(self, column: str) -> str:
+        return f'file = "{self._name}_regions.csv", column = "{column}", where = {{ region = "{{region}}" }}'
 
     def _node_tables(self) -> Iterator[str]:
         for process, id_ in self._nodes.items():
@@ -196,20 +198,23 @@ class _Writer:
                 yield "# no initial stock is known: it starts with what leaves it in all these years"
 
     def _initial(self, process: str) -> str:
-        """Return the initial stock of a store, if it is known: that at the end of the year before the first."""
-        before = self._table.years[0] - 1
-        known = {region: self._stocks.get((region, process, before)) for region in self._table.regions}
-        if any(stock is None for stock in known.values()):
+        """Return the initial stock of a store, if it is known."""
+        if not (known := self._first_stocks(process)):
             return ""
         told = f"unit = {_text(self._mass)}, source = {_text(self._source)}"
         if not self._regional:
             return f"initial = {{ low = {known['']!r}, high = {known['']!r}, {told} }}"
-        where = f'region = "{{region}}", arc = "{self._stock(process)}", year = "{before}"'
-        return f'initial = {{ file = "{self._name}.csv", column = "flow", where = {{ {where} }}, {told} }}'
+        return f"initial = {{ {self._of_region(f'stock of {self._nodes[process]}')}, {told} }}"
 
-    def _stock(self, process: str) -> str:
-        """Return what stands for the stock of a process in the column of arcs."""
-        return f"stock of {self._nodes[process]}"
+    def _first_stocks(self, process: str) -> dict[str, float]:
+        """Return the stock at the end of the year before the first by region; nothing if one is not known."""
+        before = self._table.years[0] - 1
+        known = {region: self._stocks.get((region, process, before)) for region in self._table.regions}
+        return (
+            {region: stock for region, stock in known.items() if stock is not None}
+            if all(stock is not None for stock in known.values())
+            else {}
+        )
 
     def _arc_tables(self) -> Iterator[str]:
         for pair, id_ in self._arcs.items():
@@ -218,11 +223,11 @@ class _Writer:
                 yield f"title = {_text(pair.type)}"
             yield from (f'from = "{self._nodes[pair.source]}"', f'to = "{self._nodes[pair.target]}"')
             if self._processes.kinds[pair.source] is not Kind.PASSING:
-                yield from ('law = "exogenous"', f"flow = {self._column(id_, 'flow', self._table.unit)}")
+                yield from ('law = "exogenous"', f"flow = {self._column(id_, self._table.unit)}")
             elif self._rest(pair):
                 yield from ('law = "share"', 'share = "rest"')
             else:
-                yield from ('law = "share"', f"share = {self._column(id_, 'share', '1')}")
+                yield from ('law = "share"', f"share = {self._column(id_, '1')}")
 
     def _rest(self, pair: Pair) -> bool:
         """Whether the share of a pair is what the others leave: of the largest flow out of its process."""
@@ -230,29 +235,22 @@ class _Writer:
         of = [k for k, each in enumerate(self._table.pairs) if each.source == pair.source]
         return self._table.pairs[max(of, key=lambda k: total[k])] == pair
 
-    def _column(self, arc: str, column: str, unit: str) -> str:
-        region = 'region = "{region}", ' if self._regional else ""
-        where = f'file = "{self._name}.csv", column = "{column}", where = {{ {region}arc = "{arc}" }}'
-        return f"{{ {where}, unit = {_text(unit)}, source = {_text(self._source)} }}"
+    def _column(self, arc: str, unit: str) -> str:
+        region = 'where = { region = "{region}" }, ' if self._regional else ""
+        place = f'file = "{self._name}.csv", column = "{arc}", {region}'
+        return f"{{ {place}unit = {_text(unit)}, source = {_text(self._source)} }}"
 
-    def _rows(self) -> list[tuple[object, ...]]:
-        """Return the rows of the data file, in the order of regions, arcs and years."""
+    def _data(self) -> list[list[object]]:
+        """Return header and rows of the data file, in the order of regions and years."""
         table, flows = self._table, self._processes.flows
-        shares = np.full(flows.shape, np.nan)
+        values = flows.copy()
         for process in self._processes.of(Kind.PASSING):
             own = [k for k, pair in enumerate(table.pairs) if pair.source == process]
-            shares[:, :, own] = shares_of(flows[:, :, own])
-        rows: list[tuple[object, ...]] = []
-        for r, region in enumerate(table.regions):
-            first = (region,) if self._regional else ()
-            for k, pair in enumerate(table.pairs):
-                for y, year in enumerate(table.years):
-                    share = None if np.isnan(shares[r, y, k]) else _short(shares[r, y, k])
-                    rows.append((*first, self._arcs[pair], year, _short(flows[r, y, k]), share))
-            if self._regional:
-                for (where, process, year), stock in sorted(self._stocks.items()):
-                    if where == region:
-                        rows.append((*first, self._stock(process), year, _short(stock), None))
+            values[:, :, own] = shares_of(flows[:, :, own])
+        rows: list[list[object]] = [[*(["region"] if self._regional else []), "year", *self._arcs.values()]]
+        for region, of_region in zip(table.regions, values.tolist(), strict=True):
+            for year, row in zip(table.years, of_region, strict=True):
+                rows.append([*([region] if self._regional else []), year, *map(_short, row)])
         return rows
 
 
