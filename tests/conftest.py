@@ -174,11 +174,14 @@ def random_network(seed: int, nodes: int, arcs: int, *, runge_kutta: bool = Fals
     made = [_node(values, i, sets_flow[i], i not in passing, i in dividing) for i in range(nodes)]
     for i in sorted(living):
         made[i] = _living(further, made[i], interval, horizon)
+    services = _services(values, nodes, len(ends), batched, passing)
+    if lifetimes:
+        services = [_joined(further, each, nodes, len(ends), batched, passing) for each in services]
     network = Network(
         name="random",
         nodes=tuple(made),
         arcs=tuple(drawn),
-        services=tuple(_services(values, nodes, len(ends), batched, passing)),
+        services=tuple(services),
         episode=Episode(control_interval=interval, horizon=horizon),
         objective=Objective(
             reference_interval=float(rng.uniform(0.1, 3)),
@@ -338,6 +341,19 @@ def _services(values: _Values, nodes: int, arcs: int, batched: set[str], passing
             )
         )
     return services
+
+
+def _joined(
+    rng: np.random.Generator, service: Service, nodes: int, arcs: int, batched: set[str], passing: set[int]
+) -> Service:
+    """Return a service that adds up what further compartments deliver, of those that can deliver it."""
+    ids = [f"arc_{k}" for k in range(arcs)] if service.quantity == "flow" else [f"node_{i}" for i in range(nodes)]
+    if service.quantity == "stock":
+        ids = [each for each in ids if int(each.removeprefix("node_")) not in passing]
+    elif service.quantity == "outflow":
+        ids = [each for each in ids if each not in batched]
+    others = [each for each in ids if each != service.provider and rng.random() < 0.3]
+    return replace(service, also=tuple(others))
 
 
 st.register_type_strategy(

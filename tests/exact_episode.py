@@ -199,11 +199,11 @@ def _levels(network: Network, stock: Floats, flow: Floats, step: int) -> Floats:
     levels = []
     for service in network.services:
         if service.quantity == "stock":
-            q = stock[network.node_index[service.provider]]
+            q = sum(stock[network.node_index[each]] for each in service.providers)
         elif service.quantity == "flow":
-            q = flow[network.arc_index[service.provider]]
+            q = sum(flow[network.arc_index[each]] for each in service.providers)
         else:
-            q = sum(f for f, arc in zip(flow, network.arcs, strict=True) if arc.donor == service.provider)
+            q = sum(f for f, arc in zip(flow, network.arcs, strict=True) if arc.donor in service.providers)
         low, high = (mean_of(network, end, step) for end in (service.low, service.high))
         levels.append(max(0.0, min(1.0, q / low if low > 0 else 1.0, high / q if q > high else 1.0)))
     return np.array(levels)

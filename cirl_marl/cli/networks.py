@@ -54,7 +54,7 @@ def show(
         ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
         ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
         changing = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
-        measured = f"{service.measure or service.quantity} of {service.provider}"
+        measured = f"{service.measure or service.quantity} of {' and '.join(service.providers)}"
         console.print(f"service '{service.id}': {measured} {' and '.join(ends)}{changing}")
     circularity = float(found.circularity(flow))
     console.print(f"λ of the start state: {circularity:.5g} {found.mass_unit}")

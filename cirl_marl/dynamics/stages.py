@@ -63,7 +63,7 @@ class StagedNetwork(Network):
         """Return the arcs whose flows add up to what a service measures; an outflow is what leaves the whole node."""
         if service.quantity != "outflow":
             return super().metered(service)
-        leaves = [self.parts.get(arc.donor, arc.donor) == service.provider for arc in self.arcs]
+        leaves = [self.parts.get(arc.donor, arc.donor) in service.providers for arc in self.arcs]
         return np.flatnonzero(np.array(leaves, dtype=bool) & ~self._within)
 
     @property

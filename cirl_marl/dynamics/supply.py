@@ -59,7 +59,7 @@ class Supply:
         stores, rows, columns = len(network.stores), [], []
         for row, service in enumerate(services):
             if service.quantity == "stock":
-                read = [network.node_index[service.provider]]
+                read = [network.node_index[each] for each in service.providers]
             else:
                 read = [stores + int(k) for k in network.metered(service)]
             rows += [row] * len(read)

@@ -128,7 +128,7 @@ def _measurement(network: Network, layout: ObservationLayout) -> RowSum:
         if service.quantity == "outflow":
             read = [layout.signals.flows.start + int(k) for k in network.metered(service)]
         else:
-            read = [layout.row(service.provider, service.quantity, service.measure)]
+            read = [layout.row(each, service.quantity, service.measure) for each in service.providers]
         rows += [row] * len(read)
         columns += read
     return RowSum(rows, columns, 1.0, (len(network.services), layout.signals.quantities))

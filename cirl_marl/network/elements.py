@@ -356,6 +356,9 @@ class Service(Checked):
             of=("stock", "outflow", "flow", "measure"),
         ),
     ]
+    also: Annotated[
+        tuple[str, ...], Declared("further compartments of which the same quantity is measured and added; no measures")
+    ] = ()
     low: Annotated[
         Value, Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True, varies=True)
     ]
@@ -367,6 +370,11 @@ class Service(Checked):
     owed_by: Annotated[
         tuple[str, ...], Declared("compartments whose local reward bears the shortfall; empty means the provider alone")
     ] = ()
+
+    @property
+    def providers(self) -> tuple[str, ...]:
+        """Compartments whose quantities add up to what it measures."""
+        return (self.provider, *self.also)
 
     @property
     def debtors(self) -> tuple[str, ...]:

@@ -288,8 +288,9 @@ class Network(Parts):
     def metered(self, service: Service) -> Integers:
         """Return the arcs whose flows add up to what a service of quantity ``flow`` or ``outflow`` measures."""
         if service.quantity == "outflow":
-            return np.flatnonzero(self.donors == self.node_index[service.provider])
-        return np.array([self.arc_index[service.provider]])
+            nodes = [self.node_index[each] for each in service.providers]
+            return np.flatnonzero(np.isin(self.donors, nodes))
+        return np.array([self.arc_index[each] for each in service.providers])
 
     def _role(self, node: str) -> Role:
         return self.nodes[self.node_index[node]].role

@@ -128,12 +128,16 @@ def _service_problems(
         model = everyone[service.provider].model
         if isinstance(model, Measuring) and service.measure not in model.measure_names:
             yield f"{where}: {unknown('measure', service.measure, model.measure_names)}"
-    provider = everyone.get(service.provider)
-    if isinstance(provider, Node) and not provider.stores and service.quantity == "stock":
-        yield f"{where}: provider: '{provider.id}' stores nothing; ask for its outflow"
-    elif service.provider not in known:
-        kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
-        yield f"{where}: provider: {unknown(kind, service.provider, known)}"
+    for place, each in enumerate(service.providers):
+        key, provider = "also" if place else "provider", everyone.get(each)
+        if isinstance(provider, Node) and not provider.stores and service.quantity == "stock":
+            yield f"{where}: {key}: '{provider.id}' stores nothing; ask for its outflow"
+        elif each not in known:
+            kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
+            yield f"{where}: {key}: {unknown(kind, each, known)}"
+    yield from repeated(f"{where}: also", service.providers)
+    if service.also and service.quantity == "measure":
+        yield f"{where}: also: measures of several compartments do not add up; give each a service"
     if service.measure and service.quantity != "measure":
         yield f"{where}: measure '{service.measure}': quantity '{service.quantity}' takes none"
     yield from repeated(f"{where}: owed_by", service.owed_by)
@@ -152,10 +156,11 @@ def _service_problems(
 
 def _outflow_problems(service: Service, arcs: tuple[Arc, ...]) -> Iterator[str]:
     """Yield batches among the outflows that a service adds up: they count on arrival, not when they leave."""
-    batches = [arc.id for arc in arcs if arc.law is Law.BATCH and arc.donor == service.provider]
+    batches = [arc.id for arc in arcs if arc.law is Law.BATCH and arc.donor in service.providers]
     if service.quantity == "outflow" and batches:
+        donors = ", ".join(service.providers)
         yield (
-            f"service '{service.id}': quantity 'outflow': '{service.provider}' gives batches to {', '.join(batches)}, "
+            f"service '{service.id}': quantity 'outflow': '{donors}' gives batches to {', '.join(batches)}, "
             "which count on arrival; ask for the 'flow' of that arc (what arrives) or its 'stock' (what is on the way)"
         )
 

@@ -56,6 +56,6 @@ def _reach_problems(network: Parts, arc: Arc, service: Service) -> Iterator[str]
             reached |= new
             waiting += sorted(new)
     known = flows if service.quantity == "flow" else reached if service.quantity == "stock" else reached & passing
-    if service.provider not in known:
+    if known.isdisjoint(service.providers):
         between = "only nodes that store nothing may lie between them"
         yield f"{where}: what it carries does not reach '{service.provider}' at once; {between}"

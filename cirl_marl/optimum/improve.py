@@ -218,8 +218,8 @@ def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats]:
     measure = np.zeros((len(network.services), nodes + len(network.arcs)))
     for s, service in enumerate(network.services):
         if service.quantity == "stock":
-            place = network.node_index[service.provider]
-            measure[s, dynamics.rows.stages.get(place, place)] = 1.0
+            for place in (network.node_index[each] for each in service.providers):
+                measure[s, dynamics.rows.stages.get(place, place)] = 1.0
         else:
             measure[s, nodes + network.metered(service)] = 1.0
     return measure, np.concatenate([np.zeros(nodes), -network.circularity_weights[1]])

@@ -21,7 +21,7 @@ def measures(layout: Layout, low: Floats, rows: ProgramRows) -> None:
         rows.put(row, layout.level + s, low[s])  # level ≤ q/low; level ≤ 1 is a box
         if service.quantity == "stock":
             stages = network.stages if isinstance(network, StagedNetwork) else {}
-            for store in stages.get(service.provider, (service.provider,)):
+            for store in (store for each in service.providers for store in stages.get(each, (each,))):
                 rows.put(row, layout.end(-1) + network.node_index[store], -1.0)
         else:
             rows.put(row, layout.flow(layout.moment_column) + network.metered(service), -1.0 / count)
