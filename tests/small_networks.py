@@ -9,7 +9,8 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, Service
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, Service, load_network
+from cirl_marl.definitions.catalogue import families
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network.series import Value
 
@@ -140,3 +141,14 @@ def without_lifetimes(network: Network) -> Network:
 
 
 plain_networks = st.from_type(Network).map(without_lifetimes)
+
+
+ONE_OF_EACH = [names[0] for names in families().values()]
+"""A network of each definition of the catalogue."""
+PLAYED = [
+    (name, scenario)
+    for name in ONE_OF_EACH
+    for scenario in ("default", *load_network(name).scenarios)
+    if load_network(name, scenario=scenario).agents
+]
+"""Their scenarios in which somebody acts."""

@@ -17,11 +17,12 @@ from typing import Any
 import highspy
 import numpy as np
 import pytest
+from small_networks import ONE_OF_EACH
 
 import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, VectorEnv, cli, learners
 from cirl_marl.controllers.rollout import beginning, first_seed
-from cirl_marl.definitions.catalogue import folder, networks
+from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.learners import RunDirectory, train
 from cirl_marl.optimum import search_each
@@ -68,7 +69,7 @@ def test_networks_and_show(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
 
 @pytest.mark.medium
 @pytest.mark.sample(2)
-@pytest.mark.parametrize("name", networks())
+@pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_check_has_nothing_to_say_of_the_catalogue(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from small_networks import constant
+from small_networks import ONE_OF_EACH, constant
 
 from cirl_marl import (
     Arc,
@@ -24,7 +24,6 @@ from cirl_marl import (
     Role,
     VectorEnv,
     load_network,
-    networks,
     parallel_env,
 )
 from cirl_marl.definitions.catalogue import folder
@@ -44,7 +43,7 @@ def scenarios(name: str) -> list[str]:
     return ["default", *load_network(name).scenarios]
 
 
-@pytest.mark.parametrize("name", networks())
+@pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_every_network_reads_in_every_scenario(name: str) -> None:
     """A network is one file, named like it."""
     for scenario in scenarios(name):
@@ -363,7 +362,7 @@ def test_a_compartment_may_be_called_source(tmp_path: Path) -> None:
     assert poor.nodes[poor.node_index["source"]] == replace(first, initial=(1.0, 2.0))
 
 
-@pytest.mark.parametrize(("name", "scenario"), [(name, each) for name in networks() for each in scenarios(name)])
+@pytest.mark.parametrize(("name", "scenario"), [(name, each) for name in ONE_OF_EACH for each in scenarios(name)])
 def test_what_is_written_reads_back(name: str, scenario: str, tmp_path: Path) -> None:
     """Every network of the catalogue, to the last bit, as the default scenario of its own file; without a title too."""
     network = load_network(name, scenario=scenario)
@@ -441,7 +440,7 @@ def test_an_edit_is_noticed(tmp_path: Path) -> None:
     assert load_network(path) is load_network(path)
 
 
-@pytest.mark.parametrize("name", networks())
+@pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_physical_scenario_is_physical(name: str) -> None:
     """Stocks are kept non-negative by the solver, and flows that are set are bounded below by 0."""
     network = load_network(name)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
+from small_networks import ONE_OF_EACH, PLAYED
 
 from cirl_marl import (
     Arc,
@@ -23,7 +24,6 @@ from cirl_marl import (
     VectorEnv,
     aec_env,
     load_network,
-    networks,
     parallel_env,
     single_agent_env,
     vector_env,
@@ -36,11 +36,7 @@ from cirl_marl.network.elements import Episode
 from cirl_marl.testing import check_parallel_env, check_vector_env
 from cirl_marl.testing.nested import same_or_raise
 
-CATALOGUE = [
-    pytest.param(name, scenario, id=f"{name}-{scenario}")
-    for name in networks()
-    for scenario in ("default", *load_network(name).scenarios)
-]
+CATALOGUE = [pytest.param(name, scenario, id=f"{name}-{scenario}") for name, scenario in PLAYED]
 anything = pytest.mark.parametrize(("name", "scenario"), CATALOGUE)
 third_party = [
     # importing pettingzoo.test loads PettingZoo's own games through its deprecated interface
@@ -233,7 +229,7 @@ def test_copies_restart_by_themselves() -> None:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("name", networks())
+@pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_others_hold_their_neutral_control(name: str) -> None:
     """A one-agent environment is the whole network with everyone else neutral."""
     agent = load_network(name).agents[-1]
@@ -251,7 +247,7 @@ def test_others_hold_their_neutral_control(name: str) -> None:
 
 @pytest.mark.medium
 @pytest.mark.sample(2)
-@pytest.mark.parametrize("name", networks())
+@pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_zero_throughput_is_not_best(name: str) -> None:
     """Stopping everything is good for λ, but the service fails and the mixed reward falls.
 

@@ -11,18 +11,15 @@ import pytest
 from conftest import random_network
 from hypothesis import example, given
 from hypothesis import strategies as st
+from small_networks import PLAYED
 
-from cirl_marl import Law, Network, SingleAgentEnv, VectorEnv, load_network, networks, parallel_env
+from cirl_marl import Law, Network, SingleAgentEnv, VectorEnv, load_network, parallel_env
 from cirl_marl.network.elements import REWARDS
 from cirl_marl.testing import check_parallel_env, check_vector_env
 from cirl_marl.testing.nested import same_or_raise
 
 EPS = float(np.finfo(float).eps)
-CATALOGUE = [
-    pytest.param(name, scenario, id=f"{name}-{scenario}")
-    for name in networks()
-    for scenario in ("default", *load_network(name).scenarios)
-]
+CATALOGUE = [pytest.param(name, scenario, id=f"{name}-{scenario}") for name, scenario in PLAYED]
 Actions = dict[str, np.ndarray[Any, Any]]
 anything = pytest.mark.parametrize(("name", "scenario"), CATALOGUE)
 random_networks = given(network=st.from_type(Network), seed=st.integers(0, 2**31))

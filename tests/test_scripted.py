@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from small_networks import PLAYED
 
-from cirl_marl import CirlError, ControlError, VectorEnv, load_network, networks
+from cirl_marl import CirlError, ControlError, VectorEnv, load_network
 from cirl_marl.compartments import model_class, models
 from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.controllers import Neutral, Scripted
@@ -18,7 +19,7 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.controllers.scripted import LOWER_M, SCRIPTS, UPPER_M, _joint_angles, incinerator, truck
 from cirl_marl.network import Floats
 
-CATALOGUE = [(name, scenario) for name in networks() for scenario in ("default", *load_network(name).scenarios)]
+CATALOGUE = PLAYED
 
 
 def script_of(model: Any) -> bool:

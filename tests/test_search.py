@@ -7,8 +7,9 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from small_networks import PLAYED
 
-from cirl_marl import Arc, CirlError, ControlError, Network, Node, Role, VectorEnv, load_network, networks
+from cirl_marl import Arc, CirlError, ControlError, Network, Node, Role, VectorEnv, load_network
 from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.optimum import Incumbent, Plan, bound, search, search_each, standard_candidates
@@ -17,7 +18,7 @@ from cirl_marl.optimum.cross_entropy import SHORTFALL_PRICE
 from cirl_marl.optimum.gaussians import Gaussians, stages
 from cirl_marl.optimum.population import Population, starting_states
 
-EVERYWHERE = [(name, scenario) for name in networks() for scenario in (None, *load_network(name).scenarios)]
+EVERYWHERE = PLAYED
 
 
 @pytest.mark.medium

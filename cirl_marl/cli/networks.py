@@ -10,7 +10,7 @@ import typer
 
 from cirl_marl.cli.common import NetworkName, Scenario, StartSeed, app, console, errors, plain, say, stem
 from cirl_marl.controllers.rollout import beginning
-from cirl_marl.definitions.catalogue import load_network, networks, recipes
+from cirl_marl.definitions.catalogue import families, load_network, recipes
 from cirl_marl.definitions.reading import Definition
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError
@@ -26,7 +26,11 @@ def list_networks() -> None:
     """List the networks and the learner recipes of the catalogue."""
     from cirl_marl.report.tables import networks_table
 
-    console.print(networks_table({name: load_network(name) for name in networks()}))
+    found = {}
+    for family, names in families().items():
+        several = f"{family}_{{{', '.join(each.removeprefix(f'{family}_') for each in names)}}}"
+        found[names[0] if len(names) == 1 else several] = load_network(names[0])
+    console.print(networks_table(found))
     console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
 

@@ -33,7 +33,12 @@ def networks() -> list[str]:
     >>> "copper_net" in networks()
     True
     """
-    return sorted({name for path in folder("envs").glob("*.toml") for name in _regions(path)})
+    return sorted(name for names in families().values() for name in names)
+
+
+def families() -> dict[str, list[str]]:
+    """Return the names of the networks of each definition of the catalogue, by the name of the definition."""
+    return {path.stem: [*_regions(path)] for path in sorted(folder("envs").glob("*.toml"))}
 
 
 def recipes() -> list[str]:

@@ -13,7 +13,7 @@ from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Lifet
 
 
 def networks_table(networks: Mapping[str, Network]) -> Table:
-    """One row a network: compartments, agents, services, scenarios."""
+    """One row a network, or a definition of several: compartments, agents, services, scenarios."""
     table = Table(title="Networks")
     _columns(table, "name", "what it is", "compartments", "agents", "services", "scenarios")
     for name, network in networks.items():

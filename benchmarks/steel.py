@@ -1,0 +1,429 @@
+"""The data of ``envs/steel.toml``, and what was measured with it; ``docs/data.md`` has the sources.
+
+python -m benchmarks.steel             # writes envs/steel.csv, steel_regions.csv and steel_demand.csv anew
+python -m benchmarks.steel --hindcast  # old scrap in 2015-2024, in docs/data.md
+python -m benchmarks.steel --plans     # bounds and plans of every country, in docs/data.md (half an hour)
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.document import write_sections
+from cirl_marl import CirlError, VectorEnv, load_network
+from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.rollout import Rollout, beginning, rollout
+from cirl_marl.importing.definition import identifiers, shares_of
+from cirl_marl.importing.tables import FlowTable, read_flows
+from cirl_marl.network import Floats
+from cirl_marl.optimum import achieved, bound, gap, improved
+from cirl_marl.records.files import write_table
+
+ROOT = Path(__file__).parent.parent
+TABLE = ROOT / "benchmarks" / "data" / "steel_flows_2000_2024.csv"
+POPULATION = ROOT / "benchmarks" / "data" / "population.csv"
+ENVS, DOCUMENT = ROOT / "envs", ROOT / "docs" / "data.md"
+YEARS = range(2000, 2025)
+RECENT = slice(20, 25)
+"""2020 to 2024, whose mean stands for today."""
+FUTURE = (2025, 2050)
+CALIBRATED, TESTED = slice(0, 15), slice(15, 25)
+LAST = slice(12, 15)
+"""2012 to 2014: the rate of collection is what makes old scrap of these years agree."""
+SECTORS = {
+    "vehicles": (0.22, 20.0),
+    "machinery": (0.13, 30.0),
+    "construction": (0.43, 75.0),
+    "other_products": (0.22, 15.0),
+}
+"""Share of what goes into use, and mean life in years."""
+BEST_COLLECTION = 0.88
+"""Recovery of discards in 2050, the four sectors weighted by what goes into use."""
+STEEPEST = 0.05
+"""Largest growth of stock per head that is carried on, 1/a."""
+UNRELIABLE = 0.25
+"""Error of hindcasts within 2000-2014 beyond which a country is called unreliable."""
+ORIGINS = range(8, 15)
+"""Years after 2000 from which hindcasts within 2000-2014 start."""
+
+EXOGENOUS = {
+    "mining": [("Mining", "Market of iron ore")],
+    "ore_imports": [("Imports of iron ore", "Market of iron ore")],
+    "pig_iron_imports": [("Imports of pig iron", "Market of pig iron")],
+    "dri_imports": [("Imports of direct reduced iron", "Market of direct reduced iron")],
+    "scrap_imports": [("Imports of scrap steel", "Market of scrap steel")],
+    "semis_imports": [("Imports of ingots and semis", "Market of ingots and semis")],
+    "long_imports": [("Imports of long products", "Market of long products")],
+    "flat_imports": [("Imports of flat products", "Market of flat products")],
+    "goods_imports": [("Imports of end-use goods", "Market of end-use goods")],
+    "old_scrap": [("Use phase", "Preparation of scrap steel")],
+    "into_use": [("Market of end-use goods", "Use phase")],
+}
+"""Columns of flows, and the pair of processes of each."""
+SPLITS = {
+    "Market of iron ore": {
+        "ore_to_pig_iron": "Production of pig iron",
+        "ore_to_dri": "Production of direct reduced iron",
+        "ore_exports": "Exports of iron ore",
+    },
+    "Production of pig iron": {"pig_iron_made": "Market of pig iron", "pig_iron_losses": "Losses"},
+    "Production of direct reduced iron": {"dri_made": "Market of direct reduced iron", "dri_losses": "Losses"},
+    "Market of pig iron": {
+        "pig_iron_to_bof": "BOF steelmaking",
+        "pig_iron_to_eaf": "EAF steelmaking",
+        "pig_iron_exports": "Exports of pig iron",
+    },
+    "Market of direct reduced iron": {"dri_to_eaf": "EAF steelmaking", "dri_exports": "Exports of direct reduced iron"},
+    "Preparation of scrap steel": {"scrap_prepared": "Market of scrap steel", "scrap_losses": "Losses"},
+    "Market of scrap steel": {
+        "scrap_to_eaf": "EAF steelmaking",
+        "scrap_to_bof": "BOF steelmaking",
+        "scrap_exports": "Exports of scrap steel",
+    },
+    "BOF steelmaking": {"bof_steel": "Production of ingots and semis", "bof_losses": "Losses"},
+    "EAF steelmaking": {"eaf_steel": "Production of ingots and semis", "eaf_losses": "Losses"},
+    "Production of ingots and semis": {"cast": "Market of ingots and semis"},
+    "Market of ingots and semis": {
+        "semis_to_flat": "Production of flat products",
+        "semis_to_long": "Production of long products",
+        "semis_exports": "Exports of ingots and semis",
+    },
+    "Production of long products": {
+        "long_rolled": "Market of long products",
+        "long_scrap": "Preparation of scrap steel",
+    },
+    "Production of flat products": {
+        "flat_rolled": "Market of flat products",
+        "flat_scrap": "Preparation of scrap steel",
+    },
+    "Market of long products": {
+        "long_to_goods": "Production of end-use goods",
+        "long_exports": "Exports of long products",
+    },
+    "Market of flat products": {
+        "flat_to_goods": "Production of end-use goods",
+        "flat_exports": "Exports of flat products",
+    },
+    "Production of end-use goods": {
+        "goods_made": "Market of end-use goods",
+        "goods_scrap": "Preparation of scrap steel",
+    },
+    "Market of end-use goods": {"goods_to_use": "Use phase", "goods_exports": "Exports of end-use goods"},
+}
+"""What shares out what enters each process: columns, and where each leads; the first takes the rest."""
+HALVED = ("scrap_losses", "bof_losses", "eaf_losses", "long_scrap", "flat_scrap", "goods_scrap")
+"""Shares that can be halved."""
+RANGES = {"scrap_to_bof": (0.5, 1.5), "scrap_exports": (0.0, 1.25)} | dict.fromkeys(
+    ("semis_exports", "long_exports", "flat_exports", "goods_exports"), (0.75, 1.5)
+)
+"""Shares that agents set, as factors on those of today."""
+
+
+@dataclass(frozen=True, slots=True)
+class Country:
+    """Flows of a country in 2000-2024, kt/a, by column."""
+
+    name: str
+    flows: Mapping[str, Floats]
+
+    @property
+    def primary(self) -> Floats:
+        """Iron for the country's own furnaces that leaves a reservoir, by arc, mean of today, kt/a.
+
+        Raw iron that is exported is taken from what is mined, then from what is imported.
+        """
+        found = np.array([self.flows[each][RECENT].mean() for each in PRIMARY])
+        exported = sum(self.flows[each][RECENT].mean() for each in RAW_EXPORTS)
+        return np.diff(np.maximum(np.concatenate([[0.0], np.cumsum(found)]) - exported, 0.0))
+
+
+RAW_EXPORTS = ("ore_exports", "pig_iron_exports", "dri_exports")
+"""What leaves a country as raw iron counts where it is made into steel, so that there is none in the future."""
+PRIMARY = ("mining", "ore_imports", "pig_iron_imports", "dri_imports")
+
+
+def countries(table: FlowTable) -> list[Country]:
+    """Return the flows of all countries between processes; what differs in type alone is added."""
+    pairs = dict(EXOGENOUS)
+    pairs |= {arc: [(donor, end)] for donor, arcs in SPLITS.items() for arc, end in arcs.items()}
+    summed: dict[tuple[str, str, str], Floats] = {}
+    for (region, year, pair), value in table.flows.items():
+        series = summed.setdefault((region, pair.source, pair.target), np.zeros(len(YEARS)))
+        series[year - YEARS[0]] += value
+    known = {ends for each in pairs.values() for ends in each}
+    missing = {(source, target) for _, source, target in summed} - known
+    if missing:
+        raise SystemExit(f"no arc stands for {sorted(missing)}")
+    nothing = np.zeros(len(YEARS))
+    return [
+        Country(
+            region,
+            {arc: sum((summed.get((region, *ends), nothing) for ends in each), nothing) for arc, each in pairs.items()},
+        )
+        for region in table.regions
+    ]
+
+
+def shares(country: Country, pooled: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return the share of each arc in what leaves its process, 2000-2024, then that of today."""
+    found: dict[str, Floats] = {}
+    for arcs in SPLITS.values():
+        flows = np.array([country.flows[arc] for arc in arcs]).T
+        today = flows[RECENT].sum(axis=0)
+        everywhere = np.array([pooled[arc].sum() for arc in arcs])
+        staying = np.array([arc not in RAW_EXPORTS for arc in arcs])
+        today = today * staying if (today * staying).sum() > 0 else everywhere * staying
+        own = shares_of(flows[None])[0] if flows.any() else np.tile(everywhere / everywhere.sum(), (len(YEARS), 1))
+        for arc, column in zip(arcs, np.vstack([own, today / today.sum()]).T, strict=True):
+            found[arc] = column
+    return found
+
+
+def today(country: Country, pooled: Mapping[str, Floats]) -> dict[str, float]:
+    """Return what stands for today, by column: shares, and flows of 2020-2024."""
+    found = {arc: float(values[-1]) for arc, values in shares(country, pooled).items()}
+    return found | {arc: float(country.flows[arc][RECENT].mean()) for arc in EXOGENOUS}
+
+
+def write_flows(everyone: Sequence[Country], pooled: Mapping[str, Floats]) -> None:
+    """Write flows and shares, the same for all years from 2025 on."""
+    rests = {next(iter(arcs)) for arcs in SPLITS.values()}
+    columns = [*EXOGENOUS, *(arc for arcs in SPLITS.values() for arc in arcs if arc not in rests)]
+    rows: list[list[object]] = []
+    for country in everyone:
+        values = {arc: column[:-1] for arc, column in shares(country, pooled).items()}
+        values |= {arc: country.flows[arc] for arc in EXOGENOUS}
+        later = today(country, pooled)
+        rows += [[country.name, year, *(_said(values[arc][y]) for arc in columns)] for y, year in enumerate(YEARS)]
+        rows += [[country.name, year, *(_said(later[arc]) for arc in columns)] for year in FUTURE]
+    write_table(ENVS / "steel.csv", ["region", "year", *columns], rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """What the model of lifetimes makes of 2000-2024 in a country."""
+
+    country: Country
+    discards: Floats
+    stock: Floats
+
+    def collection(self, end: int = LAST.stop) -> float:
+        """Return the rate that makes old scrap of the three years before ``end`` agree, at most 1."""
+        last = slice(max(0, end - 3), end)
+        return min(1.0, float(self.country.flows["old_scrap"][last].sum() / self.discards[last].sum()))
+
+    def error(self, end: int, years: slice) -> float:
+        """Return Σ|modelled − reported old scrap|/Σ reported of some years, calibrated before ``end``."""
+        reported = self.country.flows["old_scrap"][years]
+        modelled = self.collection(end) * self.discards[years]
+        return float(np.abs(modelled - reported).sum() / reported.sum()) if reported.sum() > 0 else float("nan")
+
+    @property
+    def persistence(self) -> float:
+        """The error of the value of 2014 in 2015-2024."""
+        reported = self.country.flows["old_scrap"]
+        lasting = np.abs(reported[TESTED] - reported[CALIBRATED][-1]).sum()
+        return float(lasting / reported[TESTED].sum()) if reported[TESTED].sum() > 0 else float("nan")
+
+    @property
+    def earlier(self) -> float:
+        """The error within 2000-2014, of hindcasts from 2008 to 2014."""
+        reported = self.country.flows["old_scrap"]
+        parts = [(self.collection(end) * self.discards[end:15] - reported[end:15], reported[end:15]) for end in ORIGINS]
+        total = sum(float(each.sum()) for _, each in parts)
+        return sum(float(np.abs(off).sum()) for off, _ in parts) / total if total > 0 else float("inf")
+
+    @property
+    def unreliable(self) -> bool:
+        """Whether 2000-2014 say that the model is not to be believed."""
+        return self.earlier > UNRELIABLE or bool((self.country.flows["old_scrap"][CALIBRATED] == 0).any())
+
+
+def write_regions(
+    everyone: Sequence[Country], pooled: Mapping[str, Floats], known: Mapping[str, Mapping[str, float]]
+) -> None:
+    """Write what differs from country to country alone; ``known`` are columns that follow from simulations."""
+    rows: list[list[object]] = []
+    for country in everyone:
+        row: dict[str, float] = {"collection": 0.5, "stock_scale": 1.0, "exports": 1.0}
+        row.update(known.get(country.name, {}))
+        row["flow_scale"] = float(country.flows["into_use"][RECENT].mean())
+        primary = country.primary
+        parts = primary / primary.sum() if primary.sum() > 0 else np.eye(len(PRIMARY))[1]
+        for arc, part in zip(PRIMARY, parts.tolist(), strict=True):
+            row[f"{arc}_weight"] = part
+            row[f"{arc}_most"] = 3 * float(country.flows[arc].max()) + 1.0
+        row |= {
+            f"initial_{sector}": float(country.flows["into_use"][0]) * part * mean
+            for sector, (part, mean) in SECTORS.items()
+        }
+        now = today(country, pooled)
+        for arc in HALVED:
+            row |= _range(arc, now[arc] / 2, now[arc], now[arc])
+        for arc, (least, most) in RANGES.items():
+            row |= _range(arc, least * now[arc], now[arc], min(1.0, most * now[arc]))
+        rows.append([country.name, *(_said(value) for _, value in sorted(row.items()))])
+    header = sorted(row)
+    write_table(ENVS / "steel_regions.csv", ["region", *header], rows)
+
+
+def write_demand(
+    everyone: Sequence[Country], pooled: Mapping[str, Floats], known: Mapping[str, Mapping[str, float]]
+) -> None:
+    """Write population, stock per head, and how much can be collected and saved, from 2025 to 2051."""
+    people = populations()
+    rows: list[list[object]] = []
+    for country in everyone:
+        own, known_ = people[country.name], known.get(country.name, {})
+        years = np.arange(FUTURE[0], FUTURE[1] + 2)
+        population = np.interp(years, [*own], [*own.values()])
+        growth = float(np.clip(known_.get("growth", 0.0), 0.0, STEEPEST))
+        # a rate that fades to none in 2050
+        elapsed = np.minimum(years - FUTURE[0], 25.0)
+        head = known_.get("stock_scale", 1.0) * 1e3 / population[0] * np.exp(growth * (elapsed - elapsed**2 / 50))
+        passed, now, rate = elapsed / 25, today(country, pooled), known_.get("collection", 0.5)
+        best = rate + passed * (max(rate, BEST_COLLECTION) - rate) + WIDTH * (rate >= BEST_COLLECTION)
+        halved = [now[arc] * (1 - passed / 2) for arc in HALVED]
+        for row in zip(years.tolist(), population, head, best, *halved, strict=True):
+            rows.append([country.name, row[0], *map(_said, row[1:])])
+    write_table(
+        ENVS / "steel_demand.csv", ["region", "year", "population", "stock_per_head", "collection_most", *HALVED], rows
+    )
+
+
+def populations() -> dict[str, dict[int, float]]:
+    """Return the people of each country by year, as the United Nations project them."""
+    people: dict[str, dict[int, float]] = {}
+    with POPULATION.open(encoding="utf-8", newline="") as file:
+        for line in csv.DictReader(file):
+            people.setdefault(line["region"], {})[int(line["year"])] = 1e3 * float(line["thousands"])
+    return people
+
+
+WIDTH = 1e-3
+"""Least width of a range: an agent has something to set everywhere."""
+
+
+def _range(arc: str, low: float, neutral: float, high: float) -> dict[str, float]:
+    return {f"{arc}_low": low, f"{arc}_neutral": neutral, f"{arc}_high": max(high, low + WIDTH)}
+
+
+def _said(value: float) -> str:
+    return f"{float(value):.9g}"
+
+
+def simulated(region: str, scenario: str) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Return flows by arc and stocks by node of a scenario in which nobody acts."""
+    network = load_network(f"{ENVS / 'steel.toml'}:{region}", scenario=scenario)
+    env = VectorEnv(network, num_envs=1)
+    begun = beginning(env)
+    run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    flows = {arc.id: run.flow[:, k] for k, arc in enumerate(network.arcs)}
+    return flows, {node.id: run.stock[:, i] for i, node in enumerate(network.stores)}
+
+
+def pasts(everyone: Sequence[Country]) -> list[Past]:
+    """Return the hindcasts of all countries, by the scenario of that name."""
+    found = []
+    for country, region in zip(everyone, identifiers(each.name for each in everyone).values(), strict=True):
+        flows, stocks = simulated(region, "hindcast")
+        stock = np.sum([stocks[sector] for sector in SECTORS], axis=0)
+        found.append(Past(country, flows["old_scrap"] + flows["left"], stock))
+    return found
+
+
+def write_all(everyone: Sequence[Country]) -> None:
+    """Write all data files: flows, then what follows from simulations of them."""
+    pooled = {arc: np.sum([each.flows[arc] for each in everyone], axis=0) for arc in everyone[0].flows}
+    known: dict[str, dict[str, float]] = {}
+    people = populations()
+    write_flows(everyone, pooled)
+    write_regions(everyone, pooled, known)
+    write_demand(everyone, pooled, known)
+    for past in pasts(everyone):
+        own = people[past.country.name]
+        growth = float(np.log(past.stock[-1] / past.stock[-11]) - np.log(own[2025] / own[2015])) / 10
+        known[past.country.name] = {
+            "collection": past.collection(),
+            "stock_scale": float(past.stock[-1]),
+            "growth": growth,
+        }
+    write_regions(everyone, pooled, known)
+    write_demand(everyone, pooled, known)
+    ids = identifiers(each.name for each in everyone)
+    for name, region in ids.items():
+        flows, _ = simulated(region, "default")
+        exported = sum(flows[arc] for arc in RANGES if arc.endswith("exports") and arc != "scrap_exports")
+        known[name]["exports"] = 0.9 * float(np.min(exported))
+    write_regions(everyone, pooled, known)
+
+
+def hindcast_lines(found: Sequence[Past]) -> Iterator[str]:
+    """Yield the table of hindcasts."""
+    yield "| country | collected | error 2015–2024 | holding 2014 | within 2000–2014 | |"
+    yield "|-|-|-|-|-|-|"
+    for past in found:
+        errors = [past.error(15, TESTED), past.persistence, past.earlier]
+        said = " | ".join("–" if not np.isfinite(each) else f"{each:.0%}" for each in errors)
+        yield f"| {past.country.name} | {past.collection():.2f} | {said} | {'unreliable' if past.unreliable else ''} |"
+    every = [(each.error(15, TESTED), each.persistence) for each in found]
+    good = [(each.error(15, TESTED), each.persistence) for each in found if not each.unreliable]
+    for what, pairs in (("median of all", every), (f"median of the {len(good)} others", good)):
+        ours, theirs = (float(np.nanmedian(each)) for each in zip(*pairs, strict=True))
+        yield f"| {what} | | {ours:.1%} | {theirs:.1%} | | |"
+
+
+def plan_lines(names: Sequence[str]) -> Iterator[str]:
+    """Yield the table of bounds and plans at full service."""
+    yield "| country | as usual, Mt | bound, Mt | plan, Mt | gap | bound, s | plan, s |"
+    yield "|-|-|-|-|-|-|-|"
+    for name, region in identifiers(names).items():
+        network = load_network(f"{ENVS / 'steel.toml'}:{region}")
+        env = VectorEnv(network, num_envs=1)
+        begun = beginning(env)
+        usual = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+        begin = time.perf_counter()
+        try:
+            found = bound(network, min_service=1.0)
+        except CirlError as error:
+            yield f"| {name} | {_megatonnes(usual)} | {str(error).partition(': ')[2][:60]} | | | | |"
+            continue
+        solved = time.perf_counter()
+        run = achieved(improved(found))
+        done = time.perf_counter()
+        off = float(gap(found.verify().bound, run.episode_circularity[0]))
+        seconds = f"{solved - begin:.0f} | {done - begin:.0f}"
+        least = "" if float(run.levels[0].mean(axis=1).min()) >= 1 - 1e-6 else " (service short)"
+        said = f"{found.objective / 1e3:.2f} | {_megatonnes(run)}{least} | {off:.2%}"
+        yield f"| {name} | {_megatonnes(usual)} | {said} | {seconds} |"
+
+
+def _megatonnes(run: Rollout) -> str:
+    return f"{run.episode_circularity[0] / 1e3:.2f}"
+
+
+def main() -> None:
+    """Write the data files, or a table of ``docs/data.md``."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--table", type=Path, default=TABLE, help="the published table of flows")
+    parser.add_argument("--hindcast", action="store_true", help="write the table of hindcasts instead")
+    parser.add_argument("--plans", action="store_true", help="write the table of plans instead")
+    asked = parser.parse_args()
+    everyone = sorted(countries(read_flows(asked.table)), key=lambda each: each.name)
+    if asked.hindcast:
+        write_sections(DOCUMENT, {"hindcast": "\n".join(hindcast_lines(pasts(everyone)))})
+    if asked.plans:
+        write_sections(DOCUMENT, {"plans": "\n".join(plan_lines([each.name for each in everyone]))})
+    if not asked.hindcast and not asked.plans:
+        write_all(everyone)
+
+
+if __name__ == "__main__":
+    main()
