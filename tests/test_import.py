@@ -20,9 +20,9 @@ from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.importing.assembly import Imported, imported
-from cirl_marl.importing.balances import Kind, Processes
+from cirl_marl.importing.balances import Processes, ProcessKind
 from cirl_marl.importing.definition import identifiers, shares_of
-from cirl_marl.importing.tables import Pair, read_flows
+from cirl_marl.importing.tables import Connection, read_flows
 from cirl_marl.network.elements import Role
 
 Row = Sequence[object]
@@ -77,8 +77,8 @@ def test_a_table_becomes_the_network_that_an_engineer_would_write(tmp_path: Path
     """Sources, sinks, stores and what passes; roles, titles, shares, series; flows come back."""
     flows = table(tmp_path / "flows.csv", [row for row in cycle() if row[5]])
     found = imported(flows, tmp_path / "metal.toml", roles=ROLES, title="A metal", source="made up, CC0")
-    assert found.processes.of(Kind.STORE) == ("Use",) == found.processes.assumed
-    assert found.processes.of(Kind.PASSING) == ("Smelter", "Old scrap", "Works")
+    assert found.processes.of(ProcessKind.STORE) == ("Use",) == found.processes.assumed
+    assert found.processes.of(ProcessKind.PASSING) == ("Smelter", "Old scrap", "Works")
     assert found.largest_error < 1e-9
     network = load_network(tmp_path / "metal.toml")
     nodes = {node.id: node for node in network.nodes}
@@ -171,7 +171,7 @@ def test_columns_may_be_named_by_their_unit(tmp_path: Path) -> None:
     """As in published data; other names and cases are understood."""
     rows = [[row[0], row[1], row[4], row[5]] for row in cycle() if row[2] == ""]
     found = read_flows(table(tmp_path / "flows.csv", rows, ["From", "To", "Year", "kt_per_year"]))
-    assert found.unit == "kt/year" and found.flows["", 2001, Pair("Smelter", "Works")] == pytest.approx(0.9 * 14)
+    assert found.unit == "kt/year" and found.flows["", 2001, Connection("Smelter", "Works")] == pytest.approx(0.9 * 14)
 
 
 def test_shares_are_held_where_nothing_flows() -> None:
@@ -224,7 +224,9 @@ def test_reconciled_flows_are_the_closest_that_balance(seed: int, tmp_path: Path
         measured = np.array([given.flows["", year, pair] for pair in pairs])
         deviation = np.array([given.deviations["", year, pair] for pair in pairs])
         after = np.array([found.table.flows["", year, pair] for pair in pairs])
-        balances = [{"type": "eq", "fun": balance_of(process, pairs)} for process in found.processes.of(Kind.PASSING)]
+        balances = [
+            {"type": "eq", "fun": balance_of(process, pairs)} for process in found.processes.of(ProcessKind.PASSING)
+        ]
 
         def distance(x: Any, measured: Any = measured, deviation: Any = deviation) -> float:
             return float((((x - measured) / deviation) ** 2).sum())
@@ -242,7 +244,7 @@ def test_reconciled_flows_are_the_closest_that_balance(seed: int, tmp_path: Path
     assert imported(exact, tmp_path / "exact.toml", roles=ROLES, reconcile=True).changes == ()
 
 
-def balance_of(process: str, pairs: Sequence[Pair]) -> Callable[[Any], float]:
+def balance_of(process: str, pairs: Sequence[Connection]) -> Callable[[Any], float]:
     """Return what enters a process less what leaves it, as a function of the flows."""
     signs = np.array([(pair.target == process) * 1.0 - (pair.source == process) for pair in pairs])
     return lambda x: float(signs @ x)
@@ -367,12 +369,12 @@ def test_the_command_imports(tmp_path: Path) -> None:
 
 def test_roles_can_be_asked_for(tmp_path: Path) -> None:
     """Of those that nobody named."""
-    asked: list[tuple[str, Kind]] = []
+    asked: list[tuple[str, ProcessKind]] = []
 
-    def ask(name: str, kind: Kind) -> Role:
+    def ask(name: str, kind: ProcessKind) -> Role:
         asked.append((name, kind))
-        return Role.LANDFILL if kind is Kind.SINK else Role.NONRENEWABLE_RESERVOIR
+        return Role.LANDFILL if kind is ProcessKind.SINK else Role.NONRENEWABLE_RESERVOIR
 
     found: Imported = imported(table(tmp_path / "f.csv", cycle()), tmp_path / "m.toml", roles={}, ask=ask)
-    assert asked == [("Ore body", Kind.SOURCE), ("Dumps", Kind.SINK)]
+    assert asked == [("Ore body", ProcessKind.SOURCE), ("Dumps", ProcessKind.SINK)]
     assert found.roles == {"Ore body": Role.NONRENEWABLE_RESERVOIR, "Dumps": Role.LANDFILL}

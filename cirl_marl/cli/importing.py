@@ -45,7 +45,7 @@ def import_(
     What sources and sinks are is asked for, or given. The neutral simulation of the network gives back the table.
     """
     from cirl_marl.importing.assembly import imported
-    from cirl_marl.importing.balances import Kind
+    from cirl_marl.importing.balances import ProcessKind
 
     given = {
         Role.NONRENEWABLE_RESERVOIR: reservoir,
@@ -72,7 +72,7 @@ def import_(
             progress=progress,
         )
     table = found.table
-    for kind in Kind:
+    for kind in ProcessKind:
         if names := found.processes.of(kind):
             say(f"{KINDS[kind.value]}: {', '.join(names)}")
     for name in found.processes.assumed:

@@ -15,8 +15,8 @@ from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.importing.balances import Change, Kind, Processes, Residual
-from cirl_marl.importing.definition import Definition, identifiers, written
+from cirl_marl.importing.balances import Change, Processes, ProcessKind, Residual
+from cirl_marl.importing.definition import ImportedFiles, identifiers, written
 from cirl_marl.importing.tables import FlowTable, read_flows, read_stocks
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Role
@@ -27,7 +27,7 @@ SHOWN = 10
 WRONG = 1e-5
 """Part of the largest flow of a region by which a simulated flow may miss the table."""
 
-Ask = Callable[[str, Kind], Role]
+Ask = Callable[[str, ProcessKind], Role]
 """Returns the role of a source or a sink."""
 
 
@@ -97,7 +97,7 @@ def imported(
         if not reconcile:
             raise CirlError(_unbalanced(table, residuals))
         table, changes = processes.reconciled()
-        processes = Processes(table, processes.of(Kind.STORE))
+        processes = Processes(table, processes.of(ProcessKind.STORE))
     told = _roles(table, processes, roles, ask)
     name = identifiers([out.stem])[out.stem]
     if name != out.stem:
@@ -147,9 +147,9 @@ def _roles(
         for name in _named(table, patterns, role):
             if told.setdefault(name, Role(role)) is not Role(role):
                 raise CirlError(f"'{name}' is given two roles, {told[name].value} and {role}; leave one out")
-            if processes.kinds[name] is Kind.PASSING and Role(role) is not Role.TECHNOSPHERE:
+            if processes.kinds[name] is ProcessKind.PASSING and Role(role) is not Role.TECHNOSPHERE:
                 raise CirlError(f"'{name}' is given the role {role}, but what enters it leaves it; it has none")
-    missing = [name for name in processes.of(Kind.SOURCE, Kind.SINK) if name not in told]
+    missing = [name for name in processes.of(ProcessKind.SOURCE, ProcessKind.SINK) if name not in told]
     if missing and ask is None:
         said = "; ".join(f"'{name}' ({processes.kinds[name].value})" for name in missing)
         choices = "--reservoir, --landfill, --incinerator, --environment, or --outside (trade, other economies)"
@@ -170,7 +170,7 @@ def _unbalanced(table: FlowTable, residuals: Sequence[Residual]) -> str:
     return "\n".join([said, *lines, *more, f"{remedy}; nothing was written."])
 
 
-def _write(folder: Path, file: str, name: str, made: Definition, changes: Sequence[Change]) -> list[str]:
+def _write(folder: Path, file: str, name: str, made: ImportedFiles, changes: Sequence[Change]) -> list[str]:
     """Write the files and return their names."""
     files = [file, f"{name}.csv"]
     (folder / file).write_text(made.text, encoding="utf-8")
@@ -189,7 +189,7 @@ def _write(folder: Path, file: str, name: str, made: Definition, changes: Sequen
     return files
 
 
-def _largest_error(path: Path, table: FlowTable, made: Definition, progress: Callable[[float], None]) -> float:
+def _largest_error(path: Path, table: FlowTable, made: ImportedFiles, progress: Callable[[float], None]) -> float:
     """Simulate every region without agents, and return how far a flow is from the table.
 
     Raises:

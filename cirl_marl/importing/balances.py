@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.errors import CirlError
-from cirl_marl.importing.tables import FlowTable, Pair
+from cirl_marl.importing.tables import Connection, FlowTable
 from cirl_marl.network import Floats
 from cirl_marl.network.declared import itemised
 
@@ -23,7 +23,7 @@ UNCERTAIN = 0.1
 SWEEPS = 1000
 
 
-class Kind(StrEnum):
+class ProcessKind(StrEnum):
     """What a process does with what enters it."""
 
     SOURCE = "source"
@@ -56,7 +56,7 @@ class Change:
 
     region: Annotated[str, "empty without regions"]
     year: Annotated[int, "the year"]
-    pair: Annotated[Pair, "the flow"]
+    pair: Annotated[Connection, "the flow"]
     before: Annotated[float, "as the table has it"]
     after: Annotated[float, "as it was adjusted"]
     deviation: Annotated[float, "standard deviation that it was weighted by"]
@@ -98,24 +98,24 @@ class Processes:
         beyond = np.abs(stays) > self._tolerance()[:, None, None]
         whole = entered.sum(axis=(0, 1))
         grows = stays.sum(axis=(0, 1)) >= GROWS * whole
-        self.kinds: dict[str, Kind] = {}
+        self.kinds: dict[str, ProcessKind] = {}
         assumed = []
         for i, name in enumerate(self.names):
             if whole[i] == 0:
-                kind = Kind.SOURCE
+                kind = ProcessKind.SOURCE
             elif not left[:, :, i].any():
-                kind = Kind.SINK
+                kind = ProcessKind.SINK
             elif name in stores:
-                kind = Kind.STORE
+                kind = ProcessKind.STORE
             elif not stores and beyond[:, :, i].any() and grows[i]:
-                kind = Kind.STORE
+                kind = ProcessKind.STORE
                 assumed.append(name)
             else:
-                kind = Kind.PASSING
+                kind = ProcessKind.PASSING
             self.kinds[name] = kind
         self.assumed = tuple(assumed)
 
-    def of(self, *kinds: Kind) -> tuple[str, ...]:
+    def of(self, *kinds: ProcessKind) -> tuple[str, ...]:
         """Return the processes of some kinds."""
         return tuple(name for name, kind in self.kinds.items() if kind in kinds)
 
@@ -123,7 +123,7 @@ class Processes:
     def residuals(self) -> list[Residual]:
         """What does not balance beyond rounding, the largest first."""
         entered, left = self._sums(1.0), self._sums(-1.0)
-        passing = np.array([kind is Kind.PASSING for kind in self.kinds.values()])
+        passing = np.array([kind is ProcessKind.PASSING for kind in self.kinds.values()])
         wrong = (np.abs(entered - left) > self._tolerance()[:, None, None]) & passing
         found = [
             Residual(self.names[i], self._table.regions[r], self._table.years[y], entered[r, y, i], left[r, y, i])
@@ -139,7 +139,7 @@ class Processes:
         (Cencic and Rechberger 2008). A flow of 0 stays 0.
         """
         table, flows = self._table, dict(self._table.flows)
-        rows = np.array([kind is Kind.PASSING for kind in self.kinds.values()])
+        rows = np.array([kind is ProcessKind.PASSING for kind in self.kinds.values()])
         balances, changes = self._incidence[rows], []
         for r, region in enumerate(table.regions):
             for y, year in enumerate(table.years):

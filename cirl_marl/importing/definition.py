@@ -11,8 +11,8 @@ from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.importing.balances import Kind, Processes
-from cirl_marl.importing.tables import FlowTable, Pair
+from cirl_marl.importing.balances import Processes, ProcessKind
+from cirl_marl.importing.tables import Connection, FlowTable
 from cirl_marl.network import Floats
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Role
@@ -20,7 +20,7 @@ from cirl_marl.network.elements import Role
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class Definition:
+class ImportedFiles:
     """The files of an imported network."""
 
     text: Annotated[str, "the definition"]
@@ -28,7 +28,7 @@ class Definition:
     regions: Annotated[
         list[list[object]], "by region reference flow and stock, and first stocks; empty without regions"
     ]
-    arcs: Annotated[Mapping[Pair, str], "id of the arc of each pair"]
+    arcs: Annotated[Mapping[Connection, str], "id of the arc of each pair"]
 
 
 def written(
@@ -40,7 +40,7 @@ def written(
     name: str,
     title: str,
     source: str,
-) -> Definition:
+) -> ImportedFiles:
     """Return the definition of a network whose neutral simulation gives back the flows of a table.
 
     Flows from sources and stores are series; what passes through a process without stock is shared out as it was.
@@ -115,7 +115,7 @@ class _Writer:
         self._mass = table.unit.rpartition("/")[0]
         self._regional = table.regions != ("",)
         self._nodes = identifiers(processes.names)
-        between: dict[tuple[str, str], list[Pair]] = {}
+        between: dict[tuple[str, str], list[Connection]] = {}
         for pair in table.pairs:
             between.setdefault((pair.source, pair.target), []).append(pair)
         texts = {
@@ -127,10 +127,10 @@ class _Writer:
         self._arcs = {pair: names[texts[pair]] for pair in table.pairs}
         self._regions = identifiers(table.regions) if self._regional else {}
 
-    def definition(self) -> Definition:
+    def definition(self) -> ImportedFiles:
         """Write everything."""
         lines = [*self._head(), *self._node_tables(), *self._arc_tables()]
-        return Definition("\n".join(lines) + "\n", self._data(), self._of_regions(), self._arcs)
+        return ImportedFiles("\n".join(lines) + "\n", self._data(), self._of_regions(), self._arcs)
 
     def _head(self) -> Iterator[str]:
         years, unit, source = self._table.years, self._table.unit, _text(self._source)
@@ -166,7 +166,7 @@ class _Writer:
         """Return what differs from region to region and not from year to year, a row for each."""
         if not self._regional:
             return []
-        stored = [process for process in self._processes.of(Kind.STORE) if self._first_stocks(process)]
+        stored = [process for process in self._processes.of(ProcessKind.STORE) if self._first_stocks(process)]
         rows: list[list[object]] = [["region", "flow", "stock", *(f"stock of {self._nodes[each]}" for each in stored)]]
         for region, scales in zip(self._table.regions, self._references(), strict=True):
             rows.append([region, *scales, *(self._first_stocks(each)[region] for each in stored)])
@@ -187,14 +187,14 @@ class _Writer:
             if id_ != process:
                 yield f"title = {_text(process)}"
             yield f'role = "{self._roles.get(process, Role.TECHNOSPHERE).value}"'
-            if kind is Kind.PASSING:
+            if kind is ProcessKind.PASSING:
                 yield "stores = false"
-            elif kind is Kind.SINK:
+            elif kind is ProcessKind.SINK:
                 since = _text(f"counted from {self._table.years[0]}")
                 yield f"initial = {{ low = 0, high = 0, unit = {_text(self._mass)}, source = {since} }}"
             elif stock := self._initial(process):
                 yield stock
-            elif kind is Kind.STORE:
+            elif kind is ProcessKind.STORE:
                 yield "# no initial stock is known: it starts with what leaves it in all these years"
 
     def _initial(self, process: str) -> str:
@@ -222,14 +222,14 @@ class _Writer:
             if pair.type:
                 yield f"title = {_text(pair.type)}"
             yield from (f'from = "{self._nodes[pair.source]}"', f'to = "{self._nodes[pair.target]}"')
-            if self._processes.kinds[pair.source] is not Kind.PASSING:
+            if self._processes.kinds[pair.source] is not ProcessKind.PASSING:
                 yield from ('law = "exogenous"', f"flow = {self._column(id_, self._table.unit)}")
             elif self._rest(pair):
                 yield from ('law = "share"', 'share = "rest"')
             else:
                 yield from ('law = "share"', f"share = {self._column(id_, '1')}")
 
-    def _rest(self, pair: Pair) -> bool:
+    def _rest(self, pair: Connection) -> bool:
         """Whether the share of a pair is what the others leave: of the largest flow out of its process."""
         total = self._processes.flows.sum(axis=(0, 1))
         of = [k for k, each in enumerate(self._table.pairs) if each.source == pair.source]
@@ -244,7 +244,7 @@ class _Writer:
         """Return header and rows of the data file, in the order of regions and years."""
         table, flows = self._table, self._processes.flows
         values = flows.copy()
-        for process in self._processes.of(Kind.PASSING):
+        for process in self._processes.of(ProcessKind.PASSING):
             own = [k for k, pair in enumerate(table.pairs) if pair.source == process]
             values[:, :, own] = shares_of(flows[:, :, own])
         rows: list[list[object]] = [[*(["region"] if self._regional else []), "year", *self._arcs.values()]]

@@ -30,7 +30,7 @@ WORKBOOKS = (".xlsx", ".xlsm")
 
 
 @dataclass(frozen=True, order=True, slots=True)
-class Pair:
+class Connection:
     """What a flow is: from which process to which, and of what type if the table says so."""
 
     source: str
@@ -49,8 +49,8 @@ class FlowTable:
 
     name: Annotated[str, "the file"]
     unit: Annotated[str, "mass/time"]
-    flows: Annotated[Mapping[tuple[str, int, Pair], float], "by region (empty without regions), year and pair"]
-    deviations: Annotated[Mapping[tuple[str, int, Pair], float], "standard deviations, of those that state one"]
+    flows: Annotated[Mapping[tuple[str, int, Connection], float], "by region (empty without regions), year and pair"]
+    deviations: Annotated[Mapping[tuple[str, int, Connection], float], "standard deviations, of those that state one"]
 
     @property
     def regions(self) -> tuple[str, ...]:
@@ -64,7 +64,7 @@ class FlowTable:
         return tuple(range(min(years), max(years) + 1))
 
     @property
-    def pairs(self) -> tuple[Pair, ...]:
+    def pairs(self) -> tuple[Connection, ...]:
         """Pairs, in the order of the file."""
         return tuple(dict.fromkeys(pair for _, _, pair in self.flows))
 
@@ -148,9 +148,9 @@ def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None,
         CirlError: naming file, line, column and value, with what to do.
     """
     grids = list(_grids(path, sheet))
-    flows: dict[tuple[str, int, Pair], float] = {}
-    lines: dict[tuple[str, int, Pair], str] = {}
-    deviations: dict[tuple[str, int, Pair], float] = {}
+    flows: dict[tuple[str, int, Connection], float] = {}
+    lines: dict[tuple[str, int, Connection], str] = {}
+    deviations: dict[tuple[str, int, Connection], float] = {}
     units: dict[str, str] = {}
     for grid in grids:
         long = {"source", "target"} <= grid.places.keys()
@@ -192,7 +192,7 @@ def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
     return stocks
 
 
-_Entry = tuple[int, tuple[str, int, Pair], float, str, float | None]
+_Entry = tuple[int, tuple[str, int, Connection], float, str, float | None]
 
 
 def _long(grid: _Grid, given: int | None) -> Iterator[_Entry]:
@@ -210,7 +210,7 @@ def _long(grid: _Grid, given: int | None) -> Iterator[_Entry]:
     if given is None:
         _needs(grid, ("year",))
     for line, row in grid.rows:
-        pair = Pair(grid.at(row, "source"), grid.at(row, "target"), grid.at(row, "type"))
+        pair = Connection(grid.at(row, "source"), grid.at(row, "target"), grid.at(row, "type"))
         if not pair.source or not pair.target:
             raise CirlError(f"{grid.name}, line {line}: a flow needs a source and a target")
         year = given if "year" not in grid.places else grid.year(line, grid.at(row, "year"))
@@ -244,7 +244,7 @@ def _matrix(grid: _Grid, given: int | None) -> Iterator[_Entry]:
             if text.strip():
                 value = grid.number(line, text.strip(), target)
                 if value > 0:
-                    yield line, ("", year, Pair(source, target)), value, "", None
+                    yield line, ("", year, Connection(source, target)), value, "", None
 
 
 def _needs(grid: _Grid, keys: Sequence[str]) -> None:
