@@ -661,8 +661,10 @@ def test_scenarios_write_files_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp
         assert run(monkeypatch, "show", "carbo_net", *scenario) == 0
     names = {path.name for path in tmp_path.iterdir()}
     stems = ("carbo_net_neutral", "carbo_net_paper_neutral")
-    tables = {*(f"{stem}.csv" for stem in stems), *(f"plan_{stem}.csv" for stem in stems)}
-    assert names == tables | {f"{stem}.png" for stem in (*stems, "carbo_net", "carbo_net_paper")}
+    plans = {f"plan_{stem}.{kind}" for stem in stems for kind in ("csv", "xlsx", "png")}
+    assert names == plans | {f"{stem}.csv" for stem in stems} | {
+        f"{stem}.png" for stem in (*stems, "carbo_net", "carbo_net_paper")
+    }
 
 
 @pytest.mark.medium
@@ -699,7 +701,7 @@ def test_show_simulate_and_plan_start_alike(
             assert run(monkeypatch, name, network, *options, *seed) == 0
             printed = capsys.readouterr().out
             assert said in printed.splitlines()
-            figures += re.findall(r"λ̄ = (\S+)", printed)
+            figures += re.findall(r"^λ̄ = (\S+)", printed, re.MULTILINE)
         assert len(figures) == 2 and figures[0] == figures[1]
         with Path(f"{found.name}_neutral.csv").open(newline="") as file:
             first = next(csv.DictReader(file))

@@ -160,13 +160,16 @@ def plan(
     seed: StartSeed = None,
     min_service: MinService = None,
 ) -> None:
-    """Write what a policy or controller does in one episode: its actions in physical units over time, as CSV.
+    """Write what a policy or controller does in one episode, beside business as usual, and what that saves.
 
-    A row is a control interval: when it begins and ends (if the network has a start on the calendar with the year or
-    date on which it begins), the value of every control (a flow ordered, a factor on what a valve lets through, or an
-    input of a model) with its unit, the resulting flows, circularity and service level.
+    The CSV has a row for each control interval: when it begins and ends (if the network has a start on the calendar
+    with the year or date on which it begins), the value of every control (a flow ordered, a share, a factor on a
+    lifetime or on what a valve lets through, or an input of a model) with its unit, flows, circularity and service
+    level. The workbook beside it (.xlsx) has the decisions in words, with stocks and flows, as planned and as usual;
+    the picture (.png) the levers that differ most.
     """
     from cirl_marl.controllers.schedule import schedule
+    from cirl_marl.report.decisions import decisions_table, savings_table, write_decisions
 
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
@@ -178,10 +181,16 @@ def plan(
         found = schedule(env, watched, seed=seed, progress=watched.acted)
     path.parent.mkdir(parents=True, exist_ok=True)
     found.write(path)
+    title = f"{env.network.title or env.network.name}: {'what was learnt' if control is None else control}"
+    beside = write_decisions(path, found, title=title)
+    console.print(decisions_table(found))
+    console.print(savings_table(found))
     _say_figures(found.rollout, env.network, found.begun)
+    usual = float(found.usual.episode_circularity[0])
+    say(f"as usual: λ̄ = {usual:.5g} {env.network.mass_unit}, service level {float(found.usual.episode_service[0]):.4f}")
     if controller.note:
         say(controller.note)
-    say(f"wrote {path}")
+    say(f"wrote {', '.join(map(str, (path, *beside)))}")
 
 
 def _actor(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Arrays, Controller
+from cirl_marl.controllers.basic import Arrays, Controller, Neutral
 from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, interval_ends, rollout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import VectorEnv
@@ -21,13 +21,18 @@ from cirl_marl.records.files import write_atomically, write_table
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """One episode: the network, a header with units, columns of shape (columns, steps), its start, and the rollout."""
+    """One episode: the network, a header with units, columns of shape (columns, steps), its start, and the rollout.
+
+    ``usual`` is what becomes of the same start if nobody acts, ``agents`` are those who do.
+    """
 
     network: Network
     header: tuple[str, ...]
     columns: Floats
     begun: Beginning
     rollout: Rollout
+    usual: Rollout
+    agents: tuple[str, ...]
 
     def write(self, path: Path) -> None:
         """Write a CSV file, whole or not at all; a ``CirlError`` says so if its folder is not there.
@@ -77,6 +82,7 @@ def schedule(
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
     recorded, begun = _Recorded(controller, env), beginning(env, seed)
+    usual = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
     run = rollout(env, recorded, seed=begun.seed, start=begun.given, progress=progress)
     actuators = Actuators(env.dynamics, env.agents, len(recorded.actions))
     values = actuators.controls(np.array(recorded.actions).T, np.arange(len(recorded.actions)))[actuators.acting]
@@ -91,7 +97,7 @@ def schedule(
         ("service level (1)", run.service[0]),
     ]
     header, found = zip(*columns, strict=True)
-    return Schedule(network, header, np.array(found), begun, run)
+    return Schedule(network, header, np.array(found), begun, run, usual, env.agents)
 
 
 def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
@@ -106,6 +112,8 @@ def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
             yield f"{agent}: valve factor (1)"
         elif control.kind is ControlKind.SHARE:
             yield f"{agent}: share (1)"
+        elif control.kind is ControlKind.STRETCH:
+            yield f"{agent}: lifetime factor (1)"
         elif compartment.model is not None:
             yield from (f"{agent}: {name}" for name in compartment.model.input_names)  # they end in their unit
 

@@ -239,13 +239,17 @@ class Converter:
     def _spread(self, quantity: Any, value: Value, unit: float, where: str) -> None:
         """Note how a quantity spreads, if it does."""
         deviation, span = quantity.deviation, quantity.range
+        relative = float(deviation.rstrip("% ")) / 100 if isinstance(deviation, str) else None
         if deviation is None and span is None:
             if quantity.distribution is not None:
                 self.mistakes.append(f"{where}.distribution: '{quantity.distribution}' needs a deviation or a range")
             return
         middle = float(np.mean(value.values)) if isinstance(value, Series) else float(value)
-        if middle <= 0 or (deviation is not None and deviation <= 0):
-            told = f"deviation {deviation:g}" if middle > 0 else f"the number is {middle / unit:g}"
+        if deviation is not None and relative is None:
+            relative = deviation * unit / middle if middle > 0 else 0.0
+        if middle <= 0 or (relative is not None and relative <= 0):
+            shown = deviation if isinstance(deviation, str) else f"{deviation:g}"
+            told = f"deviation {shown}" if middle > 0 else f"the number is {middle / unit:g}"
             self.mistakes.append(f"{where}: {told}: what spreads, and its deviation, must be positive")
             return
         low, high = (0.0, math.inf) if span is None else (float(end * unit / middle) for end in span)
@@ -254,7 +258,6 @@ class Converter:
             self.mistakes.append(f"{where}.range: {list(span or ())} must {wanted}, {middle / unit:g}")
             return
         kind = quantity.distribution or ("uniform" if deviation is None else "normal")
-        relative = None if deviation is None else deviation * unit / middle
         self.uncertain[where] = Spread(deviation=relative, low=low, high=high, distribution=kind)
 
     def _in_time(self, given: float | AmountSeries | AmountColumn, unit: float, where: str) -> Value:

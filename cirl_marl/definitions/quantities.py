@@ -9,6 +9,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Fiel
 from pydantic_core import PydanticCustomError
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Percentage = Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?%$")]
 Source = Annotated[str, Field(min_length=1, description="where the number comes from")]
 
 
@@ -28,8 +29,10 @@ class StatedTable(Table):
     multiplied_by: Factor = Field(
         None, description="another quantity by which it is multiplied, such as a population; the units, too"
     )
-    deviation: Number | None = Field(
-        None, description="standard deviation of what is not known exactly, in the same unit; of a series of its mean"
+    deviation: Number | Percentage | None = Field(
+        None,
+        description="standard deviation of what is not known exactly, in the same unit (of a series of its mean), or "
+        "relative, as ``5 %``",
     )
     range: tuple[Number, Number] | None = Field(None, description="lowest and highest value that it may have, likewise")
     distribution: Literal["normal", "lognormal", "gamma", "uniform"] | None = Field(
