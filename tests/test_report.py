@@ -23,9 +23,10 @@ from cirl_marl import Arc, CirlError, Network, Node, Role
 from cirl_marl.drawing import picture as drawing
 from cirl_marl.drawing.arrangement import arrangement_of
 from cirl_marl.drawing.digraph import Canvas, draw_network, save_before_after, save_network
+from cirl_marl.drawing.picture import legend_of
 from cirl_marl.network import Floats
 from cirl_marl.report import curves
-from cirl_marl.report.curves import save_circularity, save_learning_curves, save_trajectory
+from cirl_marl.report.curves import PointSeries, _by_scale, save_circularity, save_learning_curves, save_trajectory
 
 Picture = NDArray[np.float32]
 
@@ -347,3 +348,36 @@ def test_smoothing_heeds_what_there_is() -> None:
     smoothed = curves._smoothed(values, 3)
     np.testing.assert_allclose(smoothed[:3], [1.5, 1.5, 3.0])
     np.testing.assert_allclose(smoothed[6:], 3.0)
+
+
+def test_stocks_stand_beside_such_as_them() -> None:
+    """Ten times smaller ones have a panel of their own; there are three at most."""
+    assert _by_scale(np.array([1e6, 5.0, 3e5, 7.0, 2e3, 0.0])) == [[0, 2], [4], [1, 3, 5]]
+    assert _by_scale(np.array([3.0, 2.0])) == [[0, 1]]
+    assert _by_scale(np.zeros(0)) == [[]]
+
+
+def test_what_lies_close_together_does_not_fill_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two points of service and 5 % of λ̄ are shown at the least, and numbers on the axes are whole."""
+    figures: list[Figure] = []
+
+    def kept(figure: Figure, path: Path) -> Path:
+        figures.append(figure)
+        return path
+
+    monkeypatch.setattr(curves, "save", kept)
+    network = cirl_marl.load_network("copper_net")
+    points = PointSeries("one", np.array([0.99, 0.99]), np.array([-15.0, -15.0000001]))
+    curves.save_fronts(tmp_path / "x.png", network, [points], np.empty((0, 2)), title="")
+    (axes,) = figures[0].axes
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    assert right - left >= 0.02 - 1e-9 and high - low >= 0.7
+    figures[0].canvas.draw()
+    assert not axes.yaxis.get_major_formatter().get_offset()
+
+
+def test_the_legend_says_what_width_and_fill_mean() -> None:
+    """The widest arrow's flow, and the reference that fills half a box."""
+    network = cirl_marl.load_network("copper_net")
+    labels = [handle.get_label() for handle in legend_of(network, 86.8)["handles"]]
+    assert labels[-2:] == ["widest arrow: 86.8 kt/day", "half full: the reference stock or flow"]

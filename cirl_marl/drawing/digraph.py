@@ -131,5 +131,5 @@ def save_before_after(
     for column, ((stock, flow), label, value) in enumerate(zip((before, after), labels, circularity, strict=True)):
         axes = figure.add_axes((0.005 + 0.5 * column, 0.1, 0.49, 0.78))
         draw_network(axes, network, stock, flow, title=label, circularity=value, reference_flow=reference, legend=False)
-    figure.legend(**legend_of(network), loc="lower center", ncols=3)
+    figure.legend(**legend_of(network, reference), loc="lower center", ncols=3)
     return save(figure, path)

@@ -7,7 +7,9 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.lines import Line2D
 from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
@@ -23,6 +25,8 @@ LARGEST_EM = 14.0
 """Largest font of a digraph, points."""
 WIDEST = 1.0
 """Width of the arrow that carries the reference flow, em."""
+SPARSE = 30
+"""Arcs beyond which flows of nothing have no label."""
 BROADEST = 1.25
 """Largest width of an arrow, relative to that."""
 
@@ -79,7 +83,7 @@ def draw_network(
             circularity = float(network.circularity(flow))
     _write_title(axes, network, circularity, title)
     if legend:
-        axes.legend(**legend_of(network), loc="lower center", ncols=3)
+        axes.legend(**legend_of(network, reference), loc="lower center", ncols=3)
 
 
 def largest_flow(flow: Floats) -> float:
@@ -87,8 +91,8 @@ def largest_flow(flow: Floats) -> float:
     return float(np.abs(flow, where=np.isfinite(flow), out=np.zeros(flow.shape)).max(initial=0.0))
 
 
-def legend_of(network: Network) -> dict[str, Any]:
-    """Return handles and look of the legend that explains the colours that ``network`` uses."""
+def legend_of(network: Network, reference: float) -> dict[str, Any]:
+    """Return handles and look of the legend that explains colours, fill and width, that of the flow ``reference``."""
     roles = dict.fromkeys(node.role for node in sorted(network.nodes, key=lambda n: list(Role).index(n.role)))
     patches: dict[str, str] = {}
     for role in roles:
@@ -98,7 +102,10 @@ def legend_of(network: Network) -> dict[str, Any]:
     arrows = {WARNING: "flow that lowers λ", GOOD: "flow that raises λ", NEUTRAL: "other flow"}
     used = {WARNING: (sign > 0).any(), GOOD: (sign < 0).any(), NEUTRAL: (sign == 0).any()}
     patches |= {colour: label for colour, label in arrows.items() if used[colour]}
-    handles = [Patch(facecolor=colour, label=label) for colour, label in patches.items()]
+    handles: list[Artist] = [Patch(facecolor=colour, label=label) for colour, label in patches.items()]
+    width = f"widest arrow: {number(reference)} {network.mass_unit}/{network.time_unit}"
+    handles.append(Line2D([], [], color=NEUTRAL, linewidth=4, label=width))
+    handles.append(Patch(facecolor="none", edgecolor=MUTED, label="half full: the reference stock or flow"))
     return {"handles": handles, "frameon": False, "fontsize": 8, "labelcolor": MUTED, "handlelength": 1.2}
 
 
@@ -106,7 +113,7 @@ def _frame(axes: Axes, layout: Arrangement, legend: bool) -> float:
     """Set limits in em around the digraph and return the size of one em in points."""
     low, high = layout.extent()
     width, height = (72 * pixels / axes.figure.dpi for pixels in axes.bbox.size)
-    strip = 30.0 if legend else 4.0
+    strip = 42.0 if legend else 4.0
     em = min(width / (high[0] - low[0] + 1), (height - strip) / (high[1] - low[1] + 1))
     em = float(min(em, LARGEST_EM) if layout.routes is not None else em)
     middle = (low + high) / 2
@@ -130,6 +137,8 @@ def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, sha
     ends = Counter((arc.donor, arc.recipient) for arc in network.arcs)
     for arc, (x, y), value, colour in zip(network.arcs, routes.labels, flow, colours, strict=True):
         ink = MUTED if colour is NEUTRAL else colour
+        if value == 0 and len(network.arcs) > SPARSE:
+            continue  # so many labels of nothing would hide the others
         parallel = ends[arc.donor, arc.recipient] > 1
         label = f"{arc.label}\n{number(value)}" if parallel else number(value)
         axes.text(x, y, label, color=ink, fontsize=(0.8 if parallel else 0.95) * em, ha="center", va="center",

@@ -25,7 +25,11 @@ WIDTH = 9.0
 AGENT_PANELS = 20
 SHOWN = 10
 """Largest number of compartments in one panel of a trajectory."""
+SCALE, SCALES = 10.0, 3
+"""Ratio of stocks from which on they stand in panels of their own, and the most panels of stocks."""
 MARKERS = "osD^vP*X"
+LEAST_SERVICE, LEAST_CIRCULARITY = 0.02, 0.05
+"""Least range of service levels, and of λ̄ relative to itself, in pictures of both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +113,8 @@ def save_trajectory(
 ) -> Path:
     """Save stocks, flows, λ and service level over time as a PNG and return its path.
 
-    Of more than 10 compartments in a panel, those that change most are shown.
+    Stocks that are ten times smaller than others have a panel of their own. Of more than 10 compartments in a panel,
+    those that change most are shown.
 
     Args:
         path: file to write; its folder is made.
@@ -130,30 +135,32 @@ def save_trajectory(
     stock = shaped("stock", stock, (len(network.stores), *steps))
     flow = shaped("flow", flow, (len(network.arcs), *steps))
     circularity = shaped("circularity", circularity, steps)
-    held = [node.id for node in network.stores]
+    held = [node.label for node in network.stores]
     if load is not None:
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
-        held += [f"on {arc}" for arc in on_the_way]
+        held += [f"on {network.compartments[arc].label}" for arc in on_the_way]
         stock = np.concatenate([stock, shaped("load", load, (len(on_the_way), *steps))])
     # what is a mean over an interval stands in its middle, a stock at its end
     middle, held_at = (dated(each, network) for each in (time - network.episode.control_interval / 2, time))
     if start is not None:
         stock = np.column_stack([shaped("start", start, (len(stock),)), stock])
         held_at = np.concatenate([dated(np.zeros(1), network), held_at])
-    heights = (1.25, 1.25, 0.8) if service is None else (1.25, 1.25, 0.8, 0.5)
+    groups = _by_scale(np.abs(np.nan_to_num(stock)).max(axis=1, initial=0.0))
+    heights = [1.25 if len(groups) == 1 else 0.9] * len(groups) + [1.25, 0.8, *([] if service is None else [0.5])]
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
     figure.suptitle(title, fontsize=11, fontweight="bold")
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-    _draw_largest(panels[0], held_at, stock, held, "Stocks", mass)
-    _draw_largest(
-        panels[1], middle, flow, [arc.id for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}"
-    )
-    _draw_mean(panels[2], middle, circularity, "", 0)
-    dressed(panels[2], title="Mean circularity", ylabel=f"λ / {mass}")
+    for place, (axes, rows) in enumerate(zip(panels, groups, strict=False)):
+        name = "Stocks" if place == 0 else "Smaller stocks" if place == 1 else "The smallest stocks"
+        _draw_largest(axes, held_at, stock[rows], [held[row] for row in rows], name, mass)
+    flows, lambdas = panels[len(groups) : len(groups) + 2]
+    _draw_largest(flows, middle, flow, [arc.label for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}")
+    _draw_mean(lambdas, middle, circularity, "", 0)
+    dressed(lambdas, title="Mean circularity", ylabel=f"λ / {mass}")
     if service is not None:
-        _draw_mean(panels[3], middle, shaped("service", service, steps), "", 0)
-        dressed(panels[3], title="Service level", ylabel="service level")
-        panels[3].set_ylim(-0.03, 1.06)
+        _draw_mean(panels[-1], middle, shaped("service", service, steps), "", 0)
+        dressed(panels[-1], title="Service level", ylabel="service level")
+        panels[-1].set_ylim(-0.03, 1.06)
     time_axis(panels[-1], held_at, network)
     return save(figure, path)
 
@@ -181,13 +188,27 @@ def save_fronts(
             alpha=0.9,
             label=spoken(each.name),
         )
+    _widen(axes)
     if len(bound):
         _draw_bound(axes, bound)
     dressed(axes, title=title, ylabel=f"λ̄ / {network.mass_unit}")
+    axes.ticklabel_format(useOffset=False)
     of = "" if len(network.services) < 2 else " of the service that lacks most"
     axes.set_xlabel(f"mean service level{of}", fontsize=9)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
     return save(figure, path)
+
+
+def _widen(axes: Axes) -> None:
+    """Show at least 2 points of service and 5 % of λ̄: what lies closer together is much the same."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    for limits, least, widen in (
+        ((left, right), LEAST_SERVICE, axes.set_xlim),
+        ((low, high), LEAST_CIRCULARITY * max(abs(low), abs(high)), axes.set_ylim),
+    ):
+        missing = least - (limits[1] - limits[0])
+        if missing > 0:
+            widen(limits[0] - missing / 2, limits[1] + missing / 2)
 
 
 def _matching(name: str, values: Floats, time: Floats) -> Floats:
@@ -239,18 +260,29 @@ def _draw_largest(axes: Axes, time: Floats, values: Floats, names: Sequence[str]
     """Draw the rows that change most, with a legend beside the panel."""
     change = np.ptp(values, axis=1) if values.size else np.zeros(len(values))
     kept = np.sort(np.argsort(-change, kind="stable")[:SHOWN])
-    # A reserve that dwarfs the rest would flatten it: show such rows by their change from the start.
-    largest = np.abs(values).max(axis=1, initial=0.0)
     for place, row in enumerate(kept.tolist()):
-        shifted = largest[row] > 20 * max(float(np.median(largest)), float(change[row]), 1e-12)
-        line = values[row] - values[row, :1] if shifted else values[row]
-        label = f"{spoken(names[row])} (change)" if shifted else spoken(names[row])
-        axes.plot(time, line, color=SERIES[place % len(SERIES)], linestyle=DASHES[place // len(SERIES)],
-                  linewidth=1.5, label=label, marker=_dots(time))  # fmt: skip
+        axes.plot(time, values[row], color=SERIES[place % len(SERIES)], linestyle=DASHES[place // len(SERIES)],
+                  linewidth=1.5, label=names[row], marker=_dots(time))  # fmt: skip
+    axes.ticklabel_format(axis="y", useOffset=False)
     more = f": {SHOWN} of {len(names)}, the largest changes" if len(names) > SHOWN else ""
     dressed(axes, title=title + more, ylabel=unit)
     if len(kept):
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
+
+
+def _by_scale(largest: Floats) -> list[list[int]]:
+    """Return rows in groups, each in its order, so that none is ten times smaller than another of its group.
+
+    There are at most three groups; the last takes all that is left.
+    """
+    groups: list[list[int]] = []
+    top = np.inf
+    for row in np.argsort(-largest, kind="stable").tolist():
+        if not groups or (largest[row] < top / SCALE and len(groups) < SCALES):
+            groups.append([])
+            top = largest[row]
+        groups[-1].append(row)
+    return [sorted(group) for group in groups] or [[]]
 
 
 def _draw_bound(axes: Axes, bound: Floats) -> None:
