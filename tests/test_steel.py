@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from benchmarks import steel
 from benchmarks.steel import PRIMARY, RAW_EXPORTS, SECTORS, SPLITS, TABLE, YEARS, Country, countries, pasts, simulated
-from cirl_marl import VectorEnv, load_network
+from cirl_marl import NetworkError, VectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.definitions.catalogue import families
@@ -146,6 +146,37 @@ def test_nothing_that_is_imported_is_free() -> None:
         assert roles[network.arcs[network.arc_index[arc]].donor] is Role.NONRENEWABLE_RESERVOIR
     assert roles[network.arcs[network.arc_index["scrap_imports"]].donor] is Role.TECHNOSPHERE
     assert {each for arcs in SPLITS.values() for each in arcs} <= set(network.arc_index)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('also = ["vehicles",', 'also = ["vehicle",', "service 'steel_in_use': also: unknown node 'vehicle'. Did you"),
+        ('also = ["vehicles",', 'also = ["in_use",', "service 'steel_in_use': also: 'in_use' stores nothing; ask for"),
+        ('also = ["vehicles",', 'also = ["construction",', "service 'steel_in_use': also: names 'construction' twice"),
+        ('column = "stock_scale"', 'column = "stock_scal"', "unknown column 'stock_scal'. Did you mean 'stock_scale'"),
+        (
+            'stock = { file = "steel_regions.csv", column = "stock_scale"',
+            'stock = { file = "steel.csv", column = "into_use"',
+            "scales.stock: cannot change in time; fix the time, too, in 'where'",
+        ),
+        (
+            'deviation = "15 %"',
+            'deviation = "15"',
+            "stretch.deviation: must be a number in the unit of the quantity, or relative, as '5 %', got '15'",
+        ),
+    ],
+)
+def test_mistakes_are_named(old: str, new: str, said: str, tmp_path: Path) -> None:
+    """In services of several compartments, in numbers that stand in files, in relative deviations."""
+    for name in ("steel.csv", "steel_regions.csv", "steel_demand.csv"):
+        (tmp_path / name).write_bytes((steel.ENVS / name).read_bytes())
+    text = (steel.ENVS / "steel.toml").read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / "steel.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(NetworkError) as refused:
+        load_network(f"{tmp_path / 'steel.toml'}:japan")
+    assert said in str(refused.value)
 
 
 @pytest.mark.slow

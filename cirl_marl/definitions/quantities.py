@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from datetime import date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, Union, get_args
 
@@ -9,8 +11,25 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Fiel
 from pydantic_core import PydanticCustomError
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Percentage = Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?%$")]
 Source = Annotated[str, Field(min_length=1, description="where the number comes from")]
+
+
+PERCENT = r"^\d+(\.\d+)? ?%$"
+
+
+def _deviation(given: object) -> object:
+    if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
+        return given
+    if isinstance(given, str) and re.match(PERCENT, given):
+        return given
+    raise PydanticCustomError("deviation", "must be a number in the unit of the quantity, or relative, as '5 %'")
+
+
+Deviation = Annotated[
+    Any,
+    BeforeValidator(_deviation),
+    WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "string", "pattern": PERCENT}]}),
+]
 
 
 class Table(BaseModel):
@@ -29,7 +48,7 @@ class StatedTable(Table):
     multiplied_by: Factor = Field(
         None, description="another quantity by which it is multiplied, such as a population; the units, too"
     )
-    deviation: Number | Percentage | None = Field(
+    deviation: Deviation | None = Field(
         None,
         description="standard deviation of what is not known exactly, in the same unit (of a series of its mean), or "
         "relative, as ``5 %``",
