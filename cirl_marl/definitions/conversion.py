@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -239,7 +240,7 @@ class Converter:
     def _spread(self, quantity: Any, value: Value, unit: float, where: str) -> None:
         """Note how a quantity spreads, if it does."""
         deviation, span = quantity.deviation, quantity.range
-        relative = float(deviation.rstrip("% ")) / 100 if isinstance(deviation, str) else None
+        relative = float(Decimal(deviation.rstrip("% ")) / 100) if isinstance(deviation, str) else None
         if deviation is None and span is None:
             if quantity.distribution is not None:
                 self.mistakes.append(f"{where}.distribution: '{quantity.distribution}' needs a deviation or a range")

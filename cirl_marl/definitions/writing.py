@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 from datetime import date
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -189,10 +190,15 @@ def _told(spread: Spread | None, value: Value) -> dict[str, Any]:
     middle = float(np.mean(value.values)) if isinstance(value, Series) else value
     told: dict[str, Any] = {"distribution": spread.distribution}
     if spread.deviation is not None:
-        told["deviation"] = spread.deviation * middle
+        told["deviation"] = _percent(spread.deviation)
     if math.isfinite(spread.high):
         told["range"] = [spread.low * middle, spread.high * middle]
     return told
+
+
+def _percent(part: float) -> str:
+    """Write a part of 1 in percent, so that it reads back to the last bit."""
+    return f"{Decimal(repr(float(part))) * 100:f} %"
 
 
 def _needed(part: Any) -> str:
