@@ -54,6 +54,20 @@ def test_savings_are_what_circularity_is_made_of(network: str) -> None:
         assert total == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
+def test_what_is_saved_is_told_apart() -> None:
+    """What leaves reservoirs, and what is put into landfills."""
+    found = planned("steel_japan", {"old_scrap": 1.0})
+    told = {what: (plan, usual) for what, plan, usual in savings(found.network, found.rollout, found.usual)}
+    arcs = found.network.arcs
+    for what, ends in (
+        ("taken from reservoirs", [arc.donor in ("mine", "mine_abroad") for arc in arcs]),
+        ("put into landfills", [arc.recipient in ("losses", "uncollected") for arc in arcs]),
+    ):
+        masses = [float(run.flow[:, np.array(ends)].sum()) for run in (found.rollout, found.usual)]
+        assert told.pop(what) == pytest.approx(masses) and masses[0] < masses[1]
+    assert not told
+
+
 def test_the_workbook_has_everything(tmp_path: Path) -> None:
     """Decisions with years, stocks, flows and savings; the numbers are those of the episode."""
     found = planned(str(EXAMPLE), {"old_scrap": 1.0})

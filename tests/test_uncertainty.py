@@ -415,6 +415,17 @@ def test_an_episode_is_held_against_what_it_drew(tmp_path: Path) -> None:
         np.testing.assert_array_equal(neutral.circularity, same.episode_circularity)
 
 
+def test_bands_stay_bands() -> None:
+    """Whatever is drawn of their ends."""
+    network = load_network(EXAMPLE)
+    service = replace(network.services[0], low=900.0, high=1000.0)
+    near = {"services.supply.low": Spread(low=0.9, high=1.12, distribution="uniform")}
+    with pytest.raises(NetworkError, match=r"services.supply.low: some draws turn the band upside down"):
+        replace(network, services=(service,), uncertain=near, scenarios={})
+    apart = {"services.supply.low": Spread(low=0.9, high=1.1, distribution="uniform")}
+    assert replace(network, services=(service,), uncertain=apart, scenarios={}).uncertain == apart
+
+
 def test_the_command_writes_bands_and_causes(tmp_path: Path) -> None:
     """Quantiles in order, those of the draws; nothing is written of what is refused."""
     run = CliRunner().invoke(app, ["simulate", str(EXAMPLE), "--samples", "80", "--steps", "3", "--out", str(tmp_path)])
