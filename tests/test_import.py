@@ -197,7 +197,8 @@ def test_stocks_are_where_a_store_begins(tmp_path: Path) -> None:
     assert network.initial[:, network.node_index["use"]] == pytest.approx([50.0, 50.0])
     rows[0][2] = 0.5
     stocks = table(tmp_path / "few.csv", rows, ["process", "year", "value", "unit"])
-    with pytest.raises(CirlError, match=r"does not give back 'Old scrap' to 'Smelter' in 2000: .* a store may run empty"):
+    message = r"does not give back 'Old scrap' to 'Smelter' in 2000: .* a store may run empty"
+    with pytest.raises(CirlError, match=message):
         imported(flows, tmp_path / "few.toml", stocks, roles=ROLES)
 
 
