@@ -27,6 +27,8 @@ from cirl_marl.report.decisions import savings
 DOCUMENT = Path(__file__).parent.parent / "docs" / "japan.md"
 NAME = "steel_japan"
 SAMPLES, EPISODES = 500, 8
+TOGETHER = {"what is exported, steel or goods": ("semis_exports", "long_exports", "flat_exports", "goods_exports")}
+"""Agents that owe a service together: one of them alone cannot do as is planned and still provide it."""
 
 
 class Levers:
@@ -36,7 +38,9 @@ class Levers:
         """Take the actions of ``plan``, and those while nobody acts."""
         self.plan, self.network = plan, plan.network
         env = VectorEnv(self.network, num_envs=1)
-        self.names = {agent: self.network.compartments[agent].label for agent in env.agents}
+        named = {self.network.compartments[agent].label: (agent,) for agent in env.agents}
+        together = {agent for agents in TOGETHER.values() for agent in agents}
+        self.agents = {name: agents for name, agents in named.items() if not together & {*agents}} | TOGETHER
         beginning(env).reset(env)
         usual = np.empty_like(plan.actions)
         for step in range(len(plan.actions)):
@@ -44,18 +48,18 @@ class Levers:
             env.advance(usual[step][:, None])
         self._usual, self._entries = usual, {agent: k for k, agent in enumerate(env.agents)}
 
-    def pulled(self, agents: set[str]) -> Rollout:
-        """Return the episode in which these agents do what is planned, and the others nothing."""
+    def pulled(self, levers: set[str]) -> Rollout:
+        """Return the episode in which the agents of these levers do what is planned, and the others nothing."""
         actions = self._usual.copy()
-        for agent in agents:
-            actions[:, self._entries[agent]] = self.plan.actions[:, self._entries[agent]]
+        entries = [self._entries[agent] for lever in levers for agent in self.agents[lever]]
+        actions[:, entries] = self.plan.actions[:, entries]
         return achieved(replace(self.plan, actions=actions))
 
 
 def question(plan: Bound) -> Iterator[str]:
     """Yield what is taken and lost, as usual and as planned."""
     levers = Levers(plan)
-    usual, planned = levers.pulled(set()), levers.pulled(set(levers.names))
+    usual, planned = levers.pulled(set()), levers.pulled(set(levers.agents))
     yield "| 2025–2050, Mt | as usual | plan | saved |"
     yield "|-|-|-|-|"
     for what, with_plan, without in savings(plan.network, planned, usual):
@@ -68,21 +72,22 @@ def question(plan: Bound) -> Iterator[str]:
 def order(plan: Bound) -> Iterator[str]:
     """Yield the levers in the order in which each adds most to those before it."""
     levers = Levers(plan)
-    everyone, pulled = set(levers.names), set[str]()
-    before = levers.pulled(pulled).episode_circularity[0]
-    first, whole = before, levers.pulled(everyone).episode_circularity[0]
-    yield "| lever | alone, Mt/a | with those above, Mt/a | without it, Mt/a | all so far |"
-    yield "|-|-|-|-|-|"
-    alone = {agent: _value(levers.pulled({agent}), first) for agent in everyone}
-    last = {agent: whole - levers.pulled(everyone - {agent}).episode_circularity[0] for agent in everyone}
+    everyone, pulled = set(levers.agents), set[str]()
+    first, whole = (levers.pulled(each).episode_circularity[0] for each in (pulled, everyone))
+    yield "| lever | alone, Mt/a | with those above, Mt/a | without it, Mt/a | all so far | lowest service |"
+    yield "|-|-|-|-|-|-|"
+    alone = {lever: _value(levers.pulled({lever}), first) for lever in everyone}
+    last = {lever: whole - levers.pulled(everyone - {lever}).episode_circularity[0] for lever in everyone}
+    before = first
     while pulled != everyone:
-        gains = {agent: levers.pulled(pulled | {agent}).episode_circularity[0] for agent in sorted(everyone - pulled)}
-        best = max(gains, key=lambda agent: gains[agent])
+        runs = {lever: levers.pulled(pulled | {lever}) for lever in sorted(everyone - pulled)}
+        best = max(runs, key=lambda lever: runs[lever].episode_circularity[0])
         pulled.add(best)
-        figures = [alone[best], gains[best] - before, last[best]]
-        said = " | ".join(f"{each / 1e3:+.2f}" for each in figures)
-        before = gains[best]
-        yield f"| {levers.names[best]} | {said} | {(before - first) / (whole - first):.0%} |"
+        reached = float(runs[best].episode_circularity[0])
+        said = " | ".join(f"{each / 1e3:+.2f}" for each in (alone[best], reached - before, last[best]))
+        before = reached
+        least = float(runs[best].levels[0].mean(axis=1).min())
+        yield f"| {best} | {said} | {(before - first) / (whole - first):.0%} | {least:.3f} |"
 
 
 def _value(run: Rollout, usual: float) -> float:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cirl_marl import (
@@ -33,6 +35,10 @@ from cirl_marl.definitions.reading import write_network
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import achieved, bound, improved
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.reach import Reach
+from cirl_marl.optimum.supplies import supplies
 
 Floats = NDArray[np.floating]
 EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
@@ -270,16 +276,70 @@ def test_copies_are_lone_environments(network: Network) -> None:
 
 
 def test_bounds_allow_all_that_may_be_supplied() -> None:
-    """An idle supply may be anything in the program; its plan is carried out with what is supplied then."""
+    """An idle supply may be any amount in the program; its plan is carried out with what is supplied then."""
     network = replace(cycle("lifetimes"), acting=("old_scrap",))
     found = bound(network, min_service=0.999)
-    assert str(found).endswith("smelting may supply anything within bounds in it")
+    assert str(found).endswith("smelting may supply any amount within bounds in it")
     assert "may supply" not in str(bound(cycle(), min_service=0.9, horizon=3))
     run = achieved(improved(found))
     assert float(run.episode_circularity[0]) <= found.objective
     neutral = rollout(VectorEnv(network, num_envs=1), Neutral())
     assert float(run.episode_circularity[0]) > float(neutral.episode_circularity[0])
     assert run.episode_levels[0].min() > 0.999 - 1e-6
+
+
+@given(
+    weight=st.sampled_from([0.0, 0.25, 0.5]),
+    high=st.tuples(st.sampled_from([1.5, 2.5, 99.0]), st.sampled_from([1.5, 4.0, 99.0])),
+    ore=st.sampled_from([3.0, 1e6]),
+    merged=st.booleans(),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=20)
+def test_supplies_keep_the_proportions_that_the_program_knows(
+    weight: float, high: tuple[float, float], ore: float, merged: bool, seed: int
+) -> None:
+    """Its rows hold for what is simulated, at bounds and with a source that runs empty; they leave nothing else open.
+
+    Flows are means over the interval, which satisfy rows that are the same in each of its pieces.
+    """
+    network = replace(town((weight, 1 - weight), high), acting=("import",))
+    nodes = tuple(replace(node, initial=(ore, ore)) if node.id == "ore_a" else node for node in network.nodes)
+    network = replace(network, nodes=nodes)
+    programs = Programs(Admissible.of(network, ("import",)), 2, None, merged=merged)
+    layout, planned, steps = programs.layout, programs.admissible.network, network.episode.horizon
+    mines = [planned.arc_index[each] for each in ("mine_a", "mine_b")]
+    uncut = np.ones((steps, len(planned.arcs)), dtype=bool)
+    uncut[:, mines[0]] = ore > 1e3
+    reached = Reach(np.zeros((steps, len(planned.nodes))), uncut, np.zeros(steps))
+    rows, limits = supplies(programs.admissible, reached, layout, range(steps))
+    played = np.random.default_rng(seed).uniform(-1, 1, (steps, 1, 1))
+    env = VectorEnv(network, num_envs=1)
+    env.reset(seed)
+    values = np.zeros((steps, layout.size))
+    starts = [layout.flow(j) for j in layout.moments]
+    starts += [layout.end_flow(piece) for piece in range(layout.pieces)] if layout.merged else []
+    for t in range(steps):
+        flow = env.advance(played[t]).flow[:, 0]
+        for start in starts:
+            values[t, [start + k for k in mines]] = flow[:2]
+    left = limits - rows @ values.ravel()
+    assert rows.shape[0] == 2 * 2 * steps * (layout.pieces * (2 if layout.merged else 1))
+    assert left.min() > -1e-9
+    if ore > 1e3 and min(high) == 99.0:  # the chord is the tangent if both come to their bounds together
+        sides = slice(1) if weight == 0.25 else slice(2)
+        np.testing.assert_allclose(left.reshape(-1, 2)[:, sides], 0.0, atol=1e-9)
+
+
+def test_no_bound_chooses_among_sources_that_nobody_chooses_among() -> None:
+    """One source counts in λ, one does not: both are drawn on alike in the plan of the bound, as in the simulator."""
+    network = replace(town((0.5, 0.5)), acting=("import",))
+    nodes = tuple(replace(node, role=Role.ENVIRONMENT) if node.id == "ore_b" else node for node in network.nodes)
+    network = replace(network, nodes=nodes)
+    found = bound(network, min_service=0.999)
+    mined = found.flow[:, :2] - 1.0
+    np.testing.assert_allclose(mined[:, 0], mined[:, 1], atol=1e-6)
+    assert mined.max() > 0.5
 
 
 def test_demand_is_what_each_needs_times_how_many_there_are(tmp_path: Path) -> None:

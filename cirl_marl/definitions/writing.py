@@ -39,6 +39,9 @@ def fingerprint(network: Network) -> str:
     """Return a hash of the network under its scenario: of its definition, but for what changes no result."""
     document = _Writer(network).document() | {"title": network.name, "material": Network.material}
     document.pop("references", None)
+    for kind in ("nodes", "arcs", "services"):
+        for part in document[kind].values():
+            part.pop("title", None)
     return hashlib.sha256(json.dumps(document, default=str).encode()).hexdigest()
 
 

@@ -97,7 +97,7 @@ class Bound:
         """Say which supplies nobody acts on, of which the program knows the bounds alone."""
         acting = self.agents or self.network.agents
         idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in acting]
-        return f"; {', '.join(idle)} may supply anything within bounds in it" if idle else ""
+        return f"; {', '.join(idle)} may supply any amount within bounds in it" if idle else ""
 
     def verify(self) -> Verification:
         """Compute the bound again from the program's matrices and the multipliers, without the solver."""

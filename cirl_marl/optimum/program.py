@@ -23,6 +23,7 @@ from cirl_marl.optimum.rows import Chained, ProgramRows
 from cirl_marl.optimum.scheduled import deliveries, openings, orders
 from cirl_marl.optimum.settled import ends, settled
 from cirl_marl.optimum.shared import followers, passing
+from cirl_marl.optimum.supplies import supplies
 from cirl_marl.optimum.vintages import Lifetimes
 
 LARGE = 30_000
@@ -144,8 +145,9 @@ class Programs:
         equal, equal_to = self._equal.over(kinds, start, cut)
         under, under_to = self._under.over(kinds, start, cut)
         opened, opened_to = openings(self.admissible, reached, layout, when)
+        supplied, supplied_to = supplies(self.admissible, reached, layout, when)
         lived, lived_to = lifetimes.rows(layout, initial, when)
-        blocks, limits = [under, opened, lived], [under_to, opened_to, lived_to]
+        blocks, limits = [under, opened, supplied, lived], [under_to, opened_to, supplied_to, lived_to]
         if min_service is not None:
             services = len(network.services)
             levels = sparse.eye_array(services, layout.size, k=layout.level)
