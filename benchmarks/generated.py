@@ -19,7 +19,7 @@ from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.lockstep import Lockstep, Participant, World
 from cirl_marl.learners.recipe import Recipe
-from cirl_marl.learners.seat import JointStep, Seat
+from cirl_marl.learners.seat import Handed, Seat
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Arc, Control, ControlKind, Episode, Law, Node, Role
@@ -216,13 +216,13 @@ def lone_seat(env: FreeEnv, agent: str) -> Seat:
     def wait() -> None:
         nonlocal step
         step += 1
-        seat.latest, nothing = env.observation(agent, step), np.zeros(env.num_envs)
-        infos: Infos = {agent: {"final_observation": seat.latest}}
-        paid = {agent: env.reward(agent, step)}
-        seat.last = JointStep(paid, env.ended(step), {agent: nothing}, nothing.astype(int), infos)
+        seen, nothing = env.observation(agent, step), np.zeros(env.num_envs)
+        paid = env.reward(agent, step).astype(np.float32)
+        seat.handed = Handed(seen, paid, env.ended(step), seen, nothing, nothing.astype(int))
 
     seat = Seat(env, agent, OneAgent(env, agent), wait)
-    seat.latest = env.observation(agent, 0)
+    ready = np.zeros(env.num_envs, dtype=np.float32), np.ones(env.num_envs, dtype=bool)
+    seat.handed = Handed(env.observation(agent, 0), *ready)
     return seat
 
 
@@ -231,7 +231,7 @@ def learn_together(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Wei
     world = World(env, range(env.num_envs))
     learners = {agent: _built(seat, recipe, env) for agent, seat in world.seats.items()}
     everyone = [
-        Participant(agent, _learning(learner, steps), learner.act, learner.streams, learner.budget(steps))
+        Participant(agent, _learning(learner, steps), learner.act, learner.streams, budget=learner.budget(steps))
         for agent, learner in learners.items()
     ]
     began = time.perf_counter()

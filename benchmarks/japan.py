@@ -133,8 +133,7 @@ def under_uncertainty(run: Path | None) -> Iterator[str]:
     drawn = compare(
         runs, ("neutral", "optimum", "mpc"), network=NAME, episodes=EPISODES, min_service=1.0, uncertain=True
     )
-    yield f"| who | numbers known | | {EPISODES} draws | | | |"
-    yield "| | λ̄, Mt/a | gap | λ̄, Mt/a | service | bound | gap |"
+    yield f"| who | λ̄, Mt/a, numbers known | gap | λ̄, {EPISODES} draws | lowest service | bound | gap |"
     yield "|-|-|-|-|-|-|-|"
     exact = _figures(certain)
     for name, (circularity, service, best, off) in _figures(drawn).items():

@@ -15,13 +15,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.controllers.scripted import Scripted
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.evaluation.statistics import over_episodes, over_seeds
-from cirl_marl.learners.learner import load_model, load_normaliser
-from cirl_marl.learners.recipe import LearnerSettings
+from cirl_marl.learners.learner import Learner, learnt
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats
 
@@ -108,15 +108,13 @@ def _waiting(waits: tuple[int, int], env: VectorEnv, t: int, _seen: Actions, scr
 def _learnt(run: Path) -> Act:
     """Return what the learners of a run do, each for its own agent."""
     directory = RunDirectory(run)
-    policies = {group.name: _policy(directory, group.name, group.spec) for group in directory.groups()}
+    env = directory.make_env(1)
+    policies = {group.name: _policy(learnt(directory.chosen, group, env)) for group in directory.groups()}
     return lambda _env, _t, seen, _script: {agent: act(seen[agent]) for agent, act in policies.items()}
 
 
-def _policy(
-    directory: RunDirectory, agent: str, spec: LearnerSettings
-) -> Callable[[NDArray[np.floating]], NDArray[np.floating]]:
-    model = load_model(directory.chosen, agent, spec.algorithm)
-    normaliser = load_normaliser(directory.chosen, agent, spec)
+def _policy(learner: Learner) -> Callable[[NDArray[np.floating]], NDArray[np.floating]]:
+    model, normaliser = learner.model, learner.env if isinstance(learner.env, VecNormalize) else None
 
     def act(seen: NDArray[np.floating]) -> NDArray[np.floating]:
         shown: Any = seen if normaliser is None else normaliser.normalize_obs(seen)

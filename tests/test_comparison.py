@@ -208,7 +208,7 @@ def test_unfinished_runs_are_rows_of_their_own(
     found = compare([*runs, tmp_path / "run"], ["neutral"], episodes=2, bounds=False)
     assert [(row.name, len(row.seeds)) for row in found.rows] == [
         ("independent_a2c", 3),
-        ("independent_a2c, interrupted after 80 of 320 steps", 1),
+        ("independent_a2c, interrupted after 88 of 320 steps", 1),
         ("neutral", 0),
     ]
 

@@ -64,7 +64,7 @@ def participants(world: World, learn: dict[str, Callable[[], None]]) -> list[Par
 def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
     """Every seat sees exactly what ``VectorEnv`` gives its agent, and the true last observation at a time limit."""
     world = make_world()
-    first = {agent: seat.latest for agent, seat in world.seats.items()}
+    first = {agent: seat.handed.seen for agent, seat in world.seats.items()}
     seen = run_scripted(world, dict.fromkeys(world.seats, HORIZON + 2))
     env = VectorEnv("copper_net", num_envs=COPIES, horizon=HORIZON)
     by_hand = env.reset(seed=[11, 12, 13])
@@ -88,18 +88,18 @@ def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
 def test_copies_have_their_own_seeds() -> None:
     """SuperSuit's bridge gives all copies one stream; here no two copies start alike."""
     world = make_world()
-    starts = np.asarray(world.seats["use"].latest)
+    starts = np.asarray(world.seats["use"].handed.seen)
     assert len(np.unique(starts[:, 0])) == COPIES
 
 
 def test_seeded_algorithm_can_be_built_on_a_seat() -> None:
     """With SuperSuit's bridge ``PPO(seed=…)`` raises; here it works and does not reseed the environment."""
     world = make_world()
-    before = np.asarray(world.seats["use"].latest).copy()
+    before = np.asarray(world.seats["use"].handed.seen).copy()
     with Streams(0).active():
         model = PPO("MlpPolicy", world.seats["use"], seed=3, device="cpu")
     assert model.seed == 3
-    assert np.array_equal(np.asarray(world.seats["use"].latest), before)
+    assert np.array_equal(np.asarray(world.seats["use"].handed.seen), before)
 
 
 def test_truncation_bootstraps() -> None:
@@ -170,8 +170,13 @@ def test_failing_learner_is_named() -> None:
 def test_everything_can_be_stopped() -> None:
     """``Interrupted`` ends all learners cleanly."""
     world = make_world(["mine", "use"])
+
+    def stop() -> None:
+        if world.joint_steps == 4:
+            raise Interrupted
+
     with pytest.raises(Interrupted):
-        run_scripted(world, {"mine": 100, "use": 100}, interrupted=lambda: world.joint_steps == 4)
+        run_scripted(world, {"mine": 100, "use": 100}, after=stop)
     assert world.joint_steps == 4
 
 

@@ -67,10 +67,10 @@ def test_half_written_runs_are_refused(tmp_path: Path, ppo_recipe: Recipe, own_c
         with pytest.raises(RunError, match=name):
             Trained(broken)
     checkpoint = RunDirectory(directory).checkpoint
-    (checkpoint / "use.zip").write_bytes(b"PK half a file")
-    with pytest.raises(RunError, match=r"use\.zip"):
+    (checkpoint / "use.json").write_bytes(b"{half a file")
+    with pytest.raises(RunError, match=r"use\.json"):
         Trained(directory)
-    (checkpoint / "mine.zip").unlink()
+    (checkpoint / "mine.json").unlink()
     with pytest.raises(RunError, match="lacks the policies of mine"):
         Trained(directory)
     (directory / "status.json").write_text('{"state": "run')
@@ -112,15 +112,21 @@ def test_run_directory_describes_what_was_trained(tmp_path: Path, ppo_recipe: Re
 
 
 def test_missing_or_damaged_normaliser_is_an_error(own_copper_run: Path) -> None:
-    """A policy without its normaliser would act on the wrong numbers."""
-    directory = own_copper_run
-    normaliser = RunDirectory(directory).checkpoint / "use.normaliser.pkl"
-    normaliser.write_bytes(normaliser.read_bytes()[:50])
-    with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
-        Trained(directory)
-    normaliser.unlink()
-    with pytest.raises(RunError, match=r"use\.normaliser\.pkl: cannot be read"):
-        Trained(directory)
+    """A policy without its normaliser would act on the wrong numbers; weights without their names on nothing."""
+    path = RunDirectory(own_copper_run).checkpoint / "use.json"
+    told = json.loads(path.read_text())
+    assert told["normaliser"]["observations"]
+    path.write_text(json.dumps(told | {"normaliser": None}))
+    with pytest.raises(RunError, match=r"use\.json: cannot be read"):
+        Trained(own_copper_run)
+    path.write_text(json.dumps(told))
+    weights = path.with_suffix(".safetensors")
+    weights.write_bytes(weights.read_bytes()[:50])
+    with pytest.raises(RunError, match=r"use\.safetensors: cannot be read"):
+        Trained(own_copper_run)
+    weights.unlink()
+    with pytest.raises(RunError, match=r"use\.safetensors: cannot be read"):
+        Trained(own_copper_run)
 
 
 @pytest.mark.parametrize(
@@ -179,12 +185,19 @@ def test_recurrent_policies_remember_within_an_episode_and_forget_after_it(tmp_p
 def test_policies_of_others_are_refused(own_copper_run: Path) -> None:
     """A policy for other observations, or its normaliser, does not act."""
     folder = RunDirectory(own_copper_run).checkpoint
-    for file in ("{}.zip", "{}.normaliser.pkl"):
-        own = (folder / file.format("mine")).read_bytes()
-        shutil.copyfile(folder / file.format("use"), folder / file.format("mine"))
-        with pytest.raises(RunError, match="'mine' is for other observations"):
-            Trained(own_copper_run)
-        (folder / file.format("mine")).write_bytes(own)
+    kept = {each: (folder / each).read_bytes() for each in ("mine.json", "mine.safetensors")}
+    for name in kept:
+        shutil.copyfile(folder / name.replace("mine", "use"), folder / name)
+    with pytest.raises(RunError, match="'mine' is for other observations"):
+        Trained(own_copper_run)
+    for name, content in kept.items():
+        (folder / name).write_bytes(content)
+    theirs = json.loads((folder / "use.json").read_text())["normaliser"]
+    own = json.loads(kept["mine.json"])
+    (folder / "mine.json").write_text(json.dumps(own | {"normaliser": theirs}))
+    with pytest.raises(RunError, match="'mine' is for other observations"):
+        Trained(own_copper_run)
+    (folder / "mine.json").write_bytes(kept["mine.json"])
     Trained(own_copper_run)
 
 
@@ -226,8 +239,9 @@ def test_checkpoints_are_on_the_disk_before_they_count(
         monkeypatch.setattr(module, "sync", recorded)
     train("copper_net", ppo_recipe, directory=tmp_path, agents=["mine"])
     names = [path.name for path in synced]
-    end = names.index("000000040-complete.partial")
-    assert set(names[end - 2 : end]) == {"mine.zip", "mine.normaliser.pkl"}
+    end = [place for place, name in enumerate(names) if name == "next.partial"][-1]
+    kept = {"mine.json", "mine.safetensors", "mine.state.json", "mine.state.safetensors"}
+    assert set(names[end - 4 : end]) == kept
     assert names[end + 1 : end + 3] == ["checkpoints", ".status.partial.json"]
 
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from cirl_marl import CirlError, RecipeError, VectorEnv
-from cirl_marl.learners import RunDirectory, Training, resume, train
+from cirl_marl.learners import RunDirectory, Training, export, resume, train
 from cirl_marl.learners.launch import train_seeds
 from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run
@@ -246,19 +246,21 @@ def test_what_is_kept_is_an_ordinary_model(tmp_path: Path) -> None:
     given = recipe(parameters=PPO_SMALL)
     run = tmp_path / "run"
     training = train("copper_net", given, directory=run, agents=AGENTS, horizon=7)
-    loaded = PPO.load(RunDirectory(run).checkpoint / "use.zip", device="cpu")
+    assert {path.name for path in export(run, tmp_path / "zips")} == {f"{agent}.zip" for agent in AGENTS} | {
+        path.name for path in (tmp_path / "zips").glob("*.pkl")
+    }
+    loaded = PPO.load(tmp_path / "zips" / "use.zip", device="cpu")
     seen = np.random.default_rng(0).normal(size=(5, *loaded.observation_space.shape)).astype(np.float32)  # type: ignore[misc]
     assert np.array_equal(
         loaded.predict(seen, deterministic=True)[0], training.learners["use"].model.predict(seen, deterministic=True)[0]
     )
-    assert loaded.num_timesteps == 40
     logs = list((run / "tensorboard" / "use").iterdir())
     assert logs and logs[0].stat().st_size > 500
     further = resume(run, steps=80)
     assert further.learners["use"].model.num_timesteps == 80
     config = RunDirectory(run).config
     changed = config.recipe.model_copy(update={"run": config.recipe.run.model_copy(update={"engine": "lockstep"})})
-    RunDirectory(run).go_on(config.model_copy(update={"recipe": changed}))
+    RunDirectory(run).go_on(config.model_copy(update={"recipe": changed}), RunDirectory(run).checkpoint)
     RunDirectory(run).set_status("complete", 40, RunDirectory(run).status["checkpoint"])
     assert resume(run, steps=120).learners["use"].model.num_timesteps == 120
 

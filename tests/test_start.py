@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from cirl_marl import CirlError, DefinitionError, LearnerError, RecipeError
 from cirl_marl.learners import Recipe, RunDirectory, Training, load_recipe, resume, train
 from cirl_marl.learners.launch import prepared
-from cirl_marl.learners.learner import Learner, load_model
+from cirl_marl.learners.learner import Learner, learnt
 from cirl_marl.learners.trained import Trained
 
 AGENTS = ["mine", "use"]
@@ -134,7 +134,9 @@ def test_start_is_the_best_checkpoint(tmp_path: Path) -> None:
     found = prepared("copper_net", recipe(**from_run(tmp_path / "first")), **OPTIONS)
     folder = RunDirectory(tmp_path / "first").chosen
     assert folder.name.endswith("-best") and found.config.origins["use"].checkpoint == folder.name
-    expected = load_model(folder, "use", "PPO").policy.state_dict()
+    source = RunDirectory(tmp_path / "first")
+    group = next(each for each in source.groups() if each.name == "use")
+    expected = learnt(folder, group, source.make_env(1)).model.policy.state_dict()
     assert same(weights(found.learners["use"]), expected)
 
 
@@ -179,10 +181,10 @@ def test_run_goes_on_without_the_one_it_started_from(first: tuple[Training, Path
             steps=80,
             **OPTIONS,
         )
-    assert run.status["checkpoint"] == "000000000-running"
+    assert run.status["checkpoint"] == "000000000-start"
     origin = run.config.origins["mine"]
     assert (origin.run, origin.agent, origin.checkpoint) == (str(source), "mine", "000000012-complete")
-    assert set(origin.sha256) == {"mine.zip", "mine.normaliser.pkl"} and set(run.config.origins) == set(AGENTS)
+    assert set(origin.sha256) == {"mine.json", "mine.safetensors"} and set(run.config.origins) == set(AGENTS)
     shutil.rmtree(source)
     found = resume(run.path)
     assert run.status["state"] == "complete" and run.config.origins["mine"] == origin
@@ -219,9 +221,9 @@ MISTAKES: list[tuple[Callable[[Path], object], str | None, dict[str, Any], str]]
     (lambda p: (p / "config.json").write_text("{"), None, {}, "{run}/config.json: cannot be read"),
     (lambda p: (p / "status.json").unlink(), None, {}, "{run}/status.json: missing; the run directory is incomplete"),
     (nothing_saved, None, {}, "{run}: nothing was saved in this run yet (state: running)"),
-    (lambda p: spoilt(p, lambda c: (c / "mine.zip").unlink()), None, {}, "the checkpoint lacks the policies of mine"),
-    (lambda p: spoilt(p, lambda c: cut(c / "mine.zip")), None, {}, "/mine.zip: cannot be read"),
-    (lambda p: spoilt(p, lambda c: (c / "mine.normaliser.pkl").unlink()), None, {}, "mine.normaliser.pkl: cannot be"),
+    (lambda p: spoilt(p, lambda c: (c / "mine.json").unlink()), None, {}, "the checkpoint lacks the policies of mine"),
+    (lambda p: spoilt(p, lambda c: cut(c / "mine.json")), None, {}, "/mine.json: cannot be read"),
+    (lambda p: spoilt(p, lambda c: (c / "mine.safetensors").unlink()), None, {}, "mine.safetensors: cannot be"),
     (lambda p: None, "mnie", {}, "{run}: unknown agent 'mnie'. Did you mean 'mine'? Known: mine, use."),
     (lambda p: None, "use", {}, "'use' sees other things, 7 entries there and 4 here: only there 'stock "),
     (lambda p: None, None, {"observe": "full"}, "{run}: 'mine' sees other things, "),

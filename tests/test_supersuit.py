@@ -60,7 +60,7 @@ def test_three_defects_of_the_vector_bridge_are_not_ours() -> None:
 
     ours = World(VectorEnv("copper_net", num_envs=2, agents=AGENTS, horizon=4), seeds=[1, 2])
     seat = ours.seats["refinery"]
-    mine = np.asarray(seat.latest)
+    mine = np.asarray(seat.handed.seen)
     assert not np.array_equal(mine[0], mine[1])
     with Streams(0).active():
         assert PPO("MlpPolicy", seat, seed=1, device="cpu").seed == 1

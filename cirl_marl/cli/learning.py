@@ -68,9 +68,15 @@ def train(
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run; with --steps, to so many.")
     ] = None,
+    checkpoint_every: Annotated[
+        float | None, typer.Option(min=0, help="Seconds between checkpoints; 0: none by time.", show_default="60")
+    ] = None,
     episodes: EpisodeCount = 64,
 ) -> None:
-    """Train one learner per compartment, all at once, then evaluate them and draw what changed."""
+    """Train one learner per compartment, all at once, then evaluate them and draw what changed.
+
+    Ctrl-C, SIGTERM and SIGHUP save the run and end with code 130: it is interrupted, and --resume goes on with it.
+    """
     from cirl_marl import learners
 
     if network is None and resume is None:
@@ -80,14 +86,15 @@ def train(
     if resume is not None:
         _only_resume(context)
     options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
-    options |= {"min_service": min_service, "uncertain": uncertain}
+    options |= {"min_service": min_service, "uncertain": uncertain, "checkpoint_every": checkpoint_every}
     options |= {"observe": observe, "agents": None if agents is None else listed(agents), "device": device}
     directories = [resume] if resume is not None else _directories(out, str(network), recipe, range(seed, seed + seeds))
     with training_bar() as report:
         options["report"] = report
         try:
             if resume is not None:
-                learners.resume(resume, steps=steps, report=report, device=device)
+                how: dict[str, Any] = {"device": device, "checkpoint_every": checkpoint_every}
+                learners.resume(resume, steps=steps, report=report, **how)
             elif seeds > 1:
                 parent = str(directories[0]).removesuffix(f"-seed{seed}")
                 learners.train_seeds(str(network), recipe, seeds=range(seed, seed + seeds), directory=parent, **options)
@@ -125,6 +132,17 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     _say_shortages(rollouts, env.network)
     if "no_bound" in figures:
         say(f"gap to bound: {figures['no_bound']}")
+
+
+@app.command()
+def export(
+    run: RunPath, out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
+) -> None:
+    """Write the trained policies as files that Stable-Baselines3 loads; this library itself never reads such files."""
+    from cirl_marl import learners
+
+    for path in learners.export(run, out):
+        say(f"{path}")
 
 
 @app.command()
@@ -203,7 +221,7 @@ def _only_resume(context: typer.Context) -> None:
     given = [
         f"--{name}"
         for name in context.params
-        if name not in ("resume", "network", "episodes", "steps", "device")
+        if name not in ("resume", "network", "episodes", "steps", "device", "checkpoint_every")
         and getattr(context.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT"
     ]
     if given:

@@ -10,12 +10,17 @@ from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.run import RunDirectory
 
 if TYPE_CHECKING:
+    from cirl_marl.learners.exporting import export
     from cirl_marl.learners.launch import resume, train, train_seeds
     from cirl_marl.learners.training import Progress, Training
 
-__all__ = ["Progress", "Recipe", "RunDirectory", "Training", "load_recipe", "resume", "train", "train_seeds"]
+__all__ = ["Progress", "Recipe", "RunDirectory", "Training", "export", "load_recipe", "resume", "train", "train_seeds"]
 
-_HOME = {"Progress": "training", "Training": "training", "resume": "launch", "train": "launch", "train_seeds": "launch"}
+_HOME = {
+    **dict.fromkeys(("Progress", "Training"), "training"),
+    **dict.fromkeys(("resume", "train", "train_seeds"), "launch"),
+    "export": "exporting",
+}
 
 
 def __getattr__(name: str) -> Any:

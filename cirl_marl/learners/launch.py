@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import tempfile
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -38,6 +39,7 @@ def train(
     callbacks: Mapping[str, BaseCallback] | None = None,
     report: Callable[[Progress], None] | None = None,
     device: str = "cpu",
+    checkpoint_every: float | None = None,
     **options: Any,
 ) -> Training:
     """Train the learners of all agents, all at once, in the same coupled environment.
@@ -57,6 +59,7 @@ def train(
         callbacks: Stable-Baselines3 callbacks by name of the learner; learners that have one run in lockstep.
         report: called after every joint step.
         device: where stacked learners compute, as torch names it.
+        checkpoint_every: seconds after which a checkpoint is written; None is a minute, 0 never.
         **options: ``scenario``, ``reward``, ``observe``, ``circularity``, ``circularity_weight``, ``horizon``,
             ``uncertain``; they override the recipe's.
 
@@ -65,11 +68,13 @@ def train(
 
     Raises:
         CirlError: for input that cannot be used, before anything is written.
-        LearnerError: if a learner fails; what was learnt is saved first.
+        LearnerError: if a learner fails; the last checkpoint stays.
+        KeyboardInterrupt: after Ctrl-C, SIGTERM or SIGHUP; the run is saved first and can be resumed.
     """
     _check(options, train)
     kept = None if directory is None else [Path(directory)]
-    asked = {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents, **options}
+    asked = {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents}
+    asked |= {"checkpoint_every": checkpoint_every, **options}
     (training,) = _train(network, recipe, [seed], kept, callbacks=callbacks, report=report, device=device, **asked)
     return training
 
@@ -129,6 +134,7 @@ def prepared(
     min_service: float | None = None,
     seed: int = 0,
     agents: Sequence[str] | None = None,
+    checkpoint_every: float | None = None,
     **options: Any,
 ) -> Training:
     """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
@@ -159,7 +165,9 @@ def prepared(
         envs=copies,
         options=settings,
     )
-    training = Training(config, env)
+    if checkpoint_every is not None and not checkpoint_every >= 0:
+        raise CirlError(f"checkpoint_every must be seconds of at least 0, got {checkpoint_every!r}")
+    training = Training(config, env, checkpoint_every=checkpoint_every)
     if not any(learner.spec.share_of_steps for learner in training.learners.values()):
         raise RecipeError(f"recipe '{found.name}': nobody learns: share_of_steps is 0 for all of {list(env.agents)}")
     return training
@@ -172,12 +180,13 @@ def resume(
     callbacks: Mapping[str, BaseCallback] | None = None,
     report: Callable[[Progress], None] | None = None,
     device: str = "cpu",
+    checkpoint_every: float | None = None,
 ) -> Training:
     """Go on with an interrupted run from its last checkpoint, or with a complete one to more steps than it has.
 
-    Episodes and random streams are fresh, and a rollout that was under way is begun anew. Checkpoints of unfinished
-    runs hold the replay buffers, so that demonstrations are not lost; a learner that was in the middle of them gets the
-    rest. Schedules of learning rates go on as if the run had been meant to have ``steps`` from the beginning.
+    An interrupted run ends with the same bits as if it had not been interrupted, as long as ``steps`` are the same:
+    from where it was saved, or from its beginning if it was not. A complete one begins fresh episodes and random
+    streams. Schedules of learning rates go on as if the run had been meant to have ``steps`` from the beginning.
 
     Args:
         directory: the run.
@@ -185,6 +194,7 @@ def resume(
         callbacks: Stable-Baselines3 callbacks by name of the learner; a run does not keep those that it began with.
         report: called after every joint step.
         device: where stacked learners compute, as torch names it.
+        checkpoint_every: seconds after which a checkpoint is written; None is a minute, 0 never.
 
     Raises:
         CirlError: if the run has ``steps`` behind it.
@@ -195,12 +205,29 @@ def resume(
     config = run.config
     with global_streams_claimed(), run.claimed():
         config = _extended(run, config, steps)
-        training = Training(config, run.make_env(config.envs), run)
+        training, checkpoint = _gone_on(run, config, checkpoint_every)
         training.check_callbacks(callbacks or {})
-        run.go_on(config)
+        run.go_on(config, checkpoint)
         training.keep_in(run)
         run_together([training], callbacks=callbacks, report=report, device=device)
     return training
+
+
+def _gone_on(run: RunDirectory, config: RunConfig, every: float | None) -> tuple[Training, Path | None]:
+    """Return the training from the newest checkpoint that is whole, and this; one that is damaged is named."""
+    damaged: list[RunError] = []
+    for checkpoint in run.resumable():
+        try:
+            training = Training(config, run.make_env(config.envs), checkpoint, every)
+        except RunError as error:
+            damaged.append(error)
+            continue
+        for each in damaged:
+            warnings.warn(f"{each}; going on from {checkpoint.name} instead", stacklevel=3)
+        return training, checkpoint
+    if damaged:
+        raise damaged[0]
+    return Training(config, run.make_env(config.envs), None, every), None
 
 
 def _extended(run: RunDirectory, config: RunConfig, steps: int | None) -> RunConfig:

@@ -2,39 +2,44 @@
 
 from __future__ import annotations
 
-import gzip
-import io
 import math
-import pickle
-import warnings
 import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sb3_contrib import ARS
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RecipeError, RunError
-from cirl_marl.learners.algorithms import algorithm_class, build
-from cirl_marl.learners.demonstrations import Demonstrator, demonstrate, steps_counted
-from cirl_marl.learners.lockstep import BudgetSpent
-from cirl_marl.learners.recipe import LearnerSettings
-from cirl_marl.learners.seat import Seat
-from cirl_marl.learners.streams import Streams, global_streams_kept
+from cirl_marl.learners.algorithms import algorithm_class, build, has_replay_buffer
+from cirl_marl.learners.boundary import Boundary
+from cirl_marl.learners.demonstrations import Demonstrator, demonstrate, keep_parameters, steps_counted
+from cirl_marl.learners.lockstep import BudgetSpent, wait
+from cirl_marl.learners.recipe import Group, LearnerSettings
+from cirl_marl.learners.seat import Handed, Seat
+from cirl_marl.learners.states import (
+    buffer_state,
+    model_state,
+    normaliser_state,
+    set_buffer_state,
+    set_model_state,
+    set_normaliser_state,
+    set_variables,
+    settle,
+    variables,
+)
+from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.trees import UNREADABLE, read_tree, write_tree
 
-UNREADABLE = (
-    OSError, EOFError, zlib.error, pickle.UnpicklingError, ImportError,
-    AssertionError, AttributeError, IndexError, TypeError, ValueError,
-)  # fmt: skip
-"""What a damaged file, or one of something else, raises when it is unpickled."""
+ACTING = ("policy_kwargs", "use_sde", "ent_coef", "gamma")
+"""Parameters on which it depends what acts."""
 
 
 def derived_seed(seed: int, *names: str | int) -> int:
@@ -58,6 +63,9 @@ class Learner:
         env: the seat, behind ``VecNormalize`` if the recipe normalises.
         model: the algorithm, as Stable-Baselines3 made it.
         demonstrator: whom it follows before it acts itself; None if it needs nobody.
+        boundary: where it can be saved.
+        was_stacked: of one that goes on: whether it was one of a stack; None of others.
+        shown: whether it follows its demonstrator now.
     """
 
     model: BaseAlgorithm
@@ -74,6 +82,10 @@ class Learner:
         self.seat = seat
         seat.bootstrap = spec.bootstrap
         self._seed = derived_seed(seed, seat.name, done)
+        self.boundary = Boundary(seat)
+        self._begun = 0
+        self.was_stacked: bool | None = None
+        self.shown = False
         noisy = spec.parameters.get("action_noise") is not None
         self.streams = Streams(self._seed, keep_gaussian=noisy)
 
@@ -98,37 +110,89 @@ class Learner:
         return self
 
     def load(self, folder: Path) -> Learner:
-        """Go on with the algorithm saved in ``folder``, and what it has seen.
-
-        A rollout that was under way is lost, so its steps are not behind the learner but before it.
+        """Make the algorithm, and go on with what it knew when it had learnt enough.
 
         Raises:
             RunError: if a file is missing, cannot be read, or is of another learner.
         """
-        with self.streams.active():
-            self.env = load_normaliser(folder, self.name, self.spec, self.seat) or self.seat
-            self.model = load_model(folder, self.name, self.spec.algorithm, env=self.env)
-            self.model.action_space.seed(self._seed)  # loading seeds it as at the beginning of the run
-            if isinstance(self.model, OnPolicyAlgorithm):
-                self.model.num_timesteps -= self.model.num_timesteps % (self.model.n_steps * self.seat.num_envs)
-            if isinstance(self.model, OffPolicyAlgorithm):
-                self._load_replay_buffer(self.model, folder / f"{self.name}.replay.pkl.gz")
+        self.build()
+        told = read_tree(folder, f"{self.name}.state")
+        with self._naming(folder):
+            self._set(told)
+        self.model._last_obs = None  # the episode that was under way is over
+        self._begun = self.model.num_timesteps
         return self
 
-    def _load_replay_buffer(self, model: OffPolicyAlgorithm, path: Path) -> None:
+    def go_on(self, folder: Path) -> Learner:
+        """Make the algorithm, and go on to the bit from where it was saved in the middle of a training.
+
+        One of a stack is brought into its state at once, one that learns by itself at its first boundary.
+
+        Raises:
+            RunError: if a file is missing, cannot be read, or is of another learner.
+        """
+        self.build()
+        told, noted = read_tree(folder, f"{self.name}.state"), read_tree(folder, f"{self.name}.journal")
+
+        def read() -> None:
+            with self._naming(folder):
+                self._set(told)
+                self.streams.go_on(told["streams"], active=not self.was_stacked)
+
+        with self._naming(folder):
+            self.was_stacked = told["stacked"]
+            self._begun = told["model"]["values"]["_num_timesteps_at_start"]
+            self.model.num_timesteps = self._begun
+            self.boundary.again = [(action, Handed(**handed)) for action, handed in noted]
+            self.boundary.begins_at(read, Handed(**told["handed"]), told["acting"])
+            if self.was_stacked:
+                read()
+                self.boundary.begins_at(lambda: None, Handed(**told["handed"]), told["acting"])
+        return self
+
+    @contextmanager
+    def _naming(self, folder: Path) -> Iterator[None]:
+        """Say of what cannot be read which file it is."""
         try:
-            with gzip.open(path, "rb") as packed, io.BufferedReader(packed) as file:
-                model.load_replay_buffer(file)
-        except UNREADABLE as error:
-            raise RunError(f"{path}: cannot be read: {error}; it holds what '{self.name}' saw") from error
-        buffer = model.replay_buffer
-        assert buffer is not None
-        found = (buffer.observation_space, buffer.action_space.shape, buffer.n_envs)
-        if found != (self.env.observation_space, self.env.action_space.shape, self.seat.num_envs):
-            raise RunError(f"{path}: holds what another learner saw: {buffer.observation_space}, {buffer.n_envs} rows")
-        if isinstance(buffer, NStepReplayBuffer) and buffer.size():
-            # episodes are fresh after loading, so that no return of n steps may go on from the last one kept
-            buffer.timeouts[buffer.pos - 1] = np.logical_not(buffer.dones[buffer.pos - 1])
+            yield
+        except (*UNREADABLE, RuntimeError, AssertionError) as error:
+            path = folder / f"{self.name}.state.json"
+            raise RunError(f"{path}: cannot be read: {error}; it holds what {self.seat.title} knew") from error
+
+    def _set(self, told: Mapping[str, Any]) -> None:
+        set_model_state(self.model, told["model"])
+        if isinstance(self.env, VecNormalize):
+            if self.spec.start is not None and self.env.norm_obs:
+                settle(self.env)
+            set_normaliser_state(self.env, told["normaliser"])
+        buffer = getattr(self.model, "replay_buffer", None)
+        if buffer is not None and told["buffer"] is not None:
+            set_buffer_state(buffer, told["buffer"])
+
+    def write_state(self, folder: Path, more: Mapping[str, Any], *, stacked: bool = False, last: bool = False) -> None:
+        """Write all that the learner goes on from, with its policy, between two rollouts.
+
+        Args:
+            folder: of the checkpoint.
+            more: what else belongs to the state.
+            stacked: whether it is one of a stack, whose streams are put away, as they are at the end.
+            last: whether the training is over, of which no replay buffer is kept.
+        """
+        self.save(folder)
+        kept = None if last else getattr(self.model, "replay_buffer", None)
+        told = {
+            "model": model_state(self.model),
+            "normaliser": normaliser_state(self.env) if isinstance(self.env, VecNormalize) else None,
+            "buffer": None if kept is None else buffer_state(kept),
+            "streams": self.streams.told(active=not stacked and not last),
+            "stacked": stacked,
+        }
+        write_tree(folder, f"{self.name}.state", {**told, **more})
+
+    def write_journal(self, folder: Path) -> None:
+        """Write what came after the state that it wrote."""
+        noted = self.boundary.noted or []
+        write_tree(folder, f"{self.name}.journal", [(action, handed.told()) for action, handed in noted])
 
     def budget(self, steps: int) -> int:
         """Joint steps after which it is stopped; only ARS, which may be in mid-update then, does not stop by itself."""
@@ -149,42 +213,127 @@ class Learner:
 
         A shared policy makes one step of its own for each of its agents. Demonstrations come first, and count.
         """
-        if self.demonstrator is not None:
+        if self.boundary.acting is not None:
+            return
+        if self.demonstrator is not None and not self.boundary.resuming:
             leader, view = self.demonstrator, self.seat.view
+            self.shown = True
             demonstrate(self.model, self.demonstrations, lambda: view.join(leader.act()))
-        done = self.model.num_timesteps
+            self.shown, self._begun = False, self.model.num_timesteps
         rows = self.seat.num_envs // self.seat.copies
-        total = self.spec.steps_of(steps) * rows - done
+        total = self.spec.steps_of(steps) * rows - self._begun
         if isinstance(self.model, ARS):
             # It counts each step of its copies once for every copy, and schedules by this number, done before or not.
             total = self.budget(steps) * steps_counted(self.model, self.seat.num_envs)
         if total > 0:
+            callbacks = [each for each in (AtRollouts(self.boundary), callback) if each is not None]
             try:
-                self.model.learn(total, callback=callback, reset_num_timesteps=done == 0)
+                with at_updates(self.model, self.boundary):
+                    self.model.learn(total, callback=callbacks, reset_num_timesteps=self._begun == 0)
             except BudgetSpent:
                 if callback is not None:
                     callback.on_training_end()
 
     def act(self) -> None:
         """Act for ever by the learnt policy, learning nothing."""
-        state: tuple[NDArray[Any], ...] | None = None
-        done = np.ones(self.seat.num_envs, dtype=bool)
+        known = self.boundary.acting or {"memory": None, "starts": np.ones(self.seat.num_envs, dtype=bool)}
+        state, done = known["memory"], known["starts"]
         while True:
+            self.boundary.reached({"memory": state, "starts": done})
             observation = self.seat.reset()
             if isinstance(self.env, VecNormalize):
                 observation = self.env.normalize_obs(observation)  # type: ignore[arg-type]
             action, state = self.model.predict(observation, state, done, deterministic=True)  # type: ignore[arg-type]
             _, _, done, _ = self.seat.step(action)
 
-    def save(self, folder: Path, *, replay: bool) -> None:
-        """Save policy, optimiser and normaliser, and the replay buffer if learning may go on."""
-        self.model.save(folder / f"{self.name}.zip")
-        if isinstance(self.env, VecNormalize):
-            self.env.save(str(folder / f"{self.name}.normaliser.pkl"))
-        if replay and isinstance(self.model, OffPolicyAlgorithm) and self.model.replay_buffer is not None:
-            path = folder / f"{self.name}.replay.pkl.gz"  # packed, as a buffer has room for much more than it holds
-            with gzip.open(path, "wb", compresslevel=1) as packed, io.BufferedWriter(packed) as file:
-                self.model.save_replay_buffer(file)
+    def save(self, folder: Path) -> None:
+        """Write what acts: policy and normaliser, and a learnt entropy coefficient for who starts from it."""
+        told = {
+            "algorithm": self.spec.algorithm,
+            "policy": dict(self.model.policy.state_dict()),
+            "variables": variables(self.model),
+            "normaliser": normaliser_state(self.env) if isinstance(self.env, VecNormalize) else None,
+        }
+        write_tree(folder, self.name, told)
+
+    def take(self, folder: Path) -> Learner:
+        """Take over what ``save`` wrote.
+
+        Raises:
+            RunError: if a file is missing, cannot be read, or is of another learner.
+        """
+        told, path = read_tree(folder, self.name), folder / f"{self.name}.json"
+        try:
+            if told["algorithm"] != self.spec.algorithm:
+                raise RunError(f"it is of {told['algorithm']}, not {self.spec.algorithm}")
+            self.model.policy.load_state_dict(told["policy"])
+            set_variables(self.model, told["variables"])
+            keep_parameters(self.model)
+            if isinstance(self.env, VecNormalize):
+                set_normaliser_state(self.env, told["normaliser"], returns=False)
+        except (RunError, RuntimeError) as error:
+            message = f"{path}: '{self.name}' is for other observations or actions: {error}"
+            raise RunError(message) from error
+        except UNREADABLE as error:
+            raise RunError(f"{path}: cannot be read: {error!r}") from error
+        return self
+
+
+def learnt(folder: Path, group: Group, env: VectorEnv) -> Learner:
+    """Return a learner that acts by what a checkpoint holds of ``group``, and is not made to learn."""
+    parameters = {key: value for key, value in group.spec.parameters.items() if key in ACTING}
+    if has_replay_buffer(group.spec.algorithm):
+        parameters["buffer_size"] = 1
+    spec = group.spec.model_copy(update={"parameters": parameters})
+    return Learner(Seat(env, group.name, group.view(env), wait), spec, 0).build().take(folder)
+
+
+class AtRollouts(BaseCallback):
+    """Tells of the beginning of every rollout of an algorithm that collects them."""
+
+    def __init__(self, boundary: Boundary) -> None:
+        """Tell ``boundary``."""
+        super().__init__()
+        self._boundary = boundary
+
+    def _on_rollout_start(self) -> None:
+        if not isinstance(self.model, ARS):
+            self._boundary.reached()
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class _Watched:
+    """A schedule that ARS asks for at the beginning of every update, before it draws; it is saved as it was."""
+
+    def __init__(self, schedule: Schedule, model: ARS, boundary: Boundary) -> None:
+        self._schedule, self._model, self._boundary = schedule, model, boundary
+
+    def __call__(self, _remaining: float) -> float:
+        self._boundary.reached()
+        return self._schedule(self._model._current_progress_remaining)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _itself, (self._schedule,)
+
+
+def _itself(value: Any) -> Any:
+    return value
+
+
+@contextmanager
+def at_updates(model: BaseAlgorithm, boundary: Boundary) -> Iterator[None]:
+    """Tell ``boundary`` of the beginning of every update of ARS, which draws its candidates before its rollouts."""
+    if not isinstance(model, ARS):
+        yield
+        return
+    schedule = model.delta_std_schedule
+    model.delta_std_schedule = _Watched(schedule, model, boundary)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        model.delta_std_schedule = schedule
 
 
 def normalised(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:
@@ -201,29 +350,3 @@ def normalised(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None
         gamma=spec.parameters.get("gamma", 0.99),
         norm_obs_keys=keys,
     )
-
-
-def load_model(folder: Path, name: str, algorithm: str, env: VecEnv | None = None) -> BaseAlgorithm:
-    """Load the policy that the learner ``name`` learnt; the global random streams are left as they were."""
-    path = folder / f"{name}.zip"
-    with global_streams_kept(), warnings.catch_warnings():
-        # of learners with returns of n steps: the library saved the buffer's class, and takes it for one of the user's
-        warnings.filterwarnings("ignore", message=r"`n_steps=\d+` is ignored because a custom")
-        try:
-            return algorithm_class(algorithm).load(path, env=env, device="cpu")
-        except (*UNREADABLE, KeyError, RuntimeError) as error:
-            raise RunError(f"{path}: cannot be read: {error}") from error
-
-
-def load_normaliser(folder: Path, name: str, spec: LearnerSettings, seat: Seat | None = None) -> VecNormalize | None:
-    """Load the normaliser saved with a policy; None if its recipe does not normalise."""
-    if not spec.normalise.any:
-        return None
-    path = folder / f"{name}.normaliser.pkl"
-    try:
-        if seat is not None:
-            return VecNormalize.load(str(path), seat)
-        with path.open("rb") as file:
-            return cast(VecNormalize, pickle.load(file))
-    except UNREADABLE as error:
-        raise RunError(f"{path}: cannot be read: {error}; without it the policy of '{name}' is useless") from error

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import copy_context
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from greenlet import GreenletExit, getcurrent, greenlet
 from numpy.typing import NDArray
 
-from cirl_marl.controllers.basic import Arrays
+from cirl_marl.environments.state import Snapshot, State
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import ControlError, LearnerError
+from cirl_marl.learners.boundary import Boundary
 from cirl_marl.learners.seat import JointStep, Seat
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.views import OneAgent, View
@@ -56,7 +58,9 @@ class World:
         self.joint_steps = done
         views = views if views is not None else {agent: OneAgent(env, agent) for agent in env.agents}
         self.seats = {name: Seat(env, name, view, wait) for name, view in views.items()}
-        self._show(env.reset(seed=list(seeds)))
+        observations = env.reset(seed=list(seeds))
+        for seat in self.seats.values():
+            seat.show(observations, env.state)
         self._returns = np.zeros((len(env.agents), env.num_envs))
         self._lengths = np.zeros(env.num_envs, dtype=int)
 
@@ -79,10 +83,9 @@ class World:
         self._returns = self._returns + list(rewards.values())
         self._lengths = self._lengths + 1
         returns = dict(zip(self.env.agents, self._returns, strict=True))
-        step = JointStep(rewards, done, returns, self._lengths, infos)
+        step = JointStep(observations, self.env.state, rewards, done, returns, self._lengths, infos)
         for seat in self.seats.values():
-            seat.last = step
-        self._show(observations)
+            seat.hand(step)
         if hook is not None:
             if done.any():
                 for agent, total in returns.items():
@@ -90,10 +93,19 @@ class World:
             hook(infos, done)
         self._returns, self._lengths = np.where(done, 0.0, self._returns), np.where(done, 0, self._lengths)
 
-    def _show(self, observations: Arrays) -> None:
-        """Show every learner the current observations."""
-        for seat in self.seats.values():
-            seat.latest = seat.view.observe(observations, self.env.state)
+    def told(self) -> dict[str, Any]:
+        """Return all that a world goes on from, but for its learners."""
+        now = self.env.snapshot()
+        state = {each.name: getattr(now.state, each.name) for each in fields(State)}
+        own = {"returns": self._returns, "lengths": self._lengths, "weight": self.env.circularity_weight}
+        return {"state": state, "streams": list(now.streams), "joint_steps": self.joint_steps, **own}
+
+    def go_on(self, told: Mapping[str, Any]) -> None:
+        """Go on from what a world of the same environment told; seats are handed what came last by others."""
+        streams = tuple(told["streams"])
+        self.env.restore(Snapshot(State(**told["state"]), streams, self.env.agents, self.env.network))
+        self.env.circularity_weight = told["weight"]
+        self.joint_steps, self._returns, self._lengths = told["joint_steps"], told["returns"], told["lengths"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +117,8 @@ class Participant:
         learn: learns, waiting for each joint step; returns when it has learnt enough.
         act: acts for ever, once ``learn`` is done, so that the others' world goes on.
         streams: its random streams.
+        boundaries: of each learner that it is.
+        busy: whether it will come to no boundary before something is over.
         budget: joint steps after which it is stopped by ``BudgetSpent``, if it has not returned.
     """
 
@@ -112,6 +126,8 @@ class Participant:
     learn: Callable[[], None]
     act: Callable[[], None]
     streams: Streams
+    boundaries: Sequence[Boundary] = ()
+    busy: Callable[[], bool] = lambda: False
     budget: int = 2**62
 
 
@@ -125,12 +141,22 @@ class Lockstep:
         self._coroutines: list[greenlet] = []
         self._learning: set[int] = set()
 
-    def run(self, hooks: Sequence[StepHook] | None = None, interrupted: Callable[[], bool] = lambda: False) -> None:
+    @property
+    def saved(self) -> bool:
+        """Whether every learner has written the state that was asked for."""
+        return all(each.noted is not None for some in self._participants for each in some.boundaries)
+
+    @property
+    def busy(self) -> bool:
+        """Whether somebody will come to no boundary soon."""
+        return any(each.busy() for each in self._participants)
+
+    def run(self, hooks: Sequence[StepHook] | None = None, after: Callable[[], None] = lambda: None) -> None:
         """Run every learner to its end.
 
         Args:
-            hooks: of each world, called after each joint step, in the caller's random streams.
-            interrupted: asked after each joint step whether this is enough.
+            hooks: of each world, called within each joint step, in the caller's random streams.
+            after: called after each joint step of all worlds; it ends the run by ``Interrupted``.
 
         Raises:
             LearnerError: if a learner raises; names it and the joint step.
@@ -142,17 +168,35 @@ class Lockstep:
                 self._coroutines.append(greenlet(self._task(i, participant)))
                 self._coroutines[i].gr_context = copy_context()
                 self._resume(i)
+                self._again(i)
             while self._learning:
                 for place, world in enumerate(self._worlds):
                     world.step(hooks[place] if hooks is not None else None)
-                if interrupted():
-                    raise Interrupted
-                for i, participant in enumerate(self._participants):
-                    self._resume(i)
-                    if i in self._learning and self._joint_steps >= participant.budget:
-                        self._stop_learning(i)
+                for participant in self._participants:
+                    for boundary in participant.boundaries:
+                        boundary.note()
+                after()
+                for i in range(len(self._participants)):
+                    self._turn(i, self._joint_steps)
         finally:
             self._end()
+
+    def _turn(self, i: int, step: int) -> None:
+        """Let a participant go on after a joint step, and stop it if it has used up its steps."""
+        self._resume(i)
+        if i in self._learning and step >= self._participants[i].budget:
+            self._stop_learning(i)
+
+    def _again(self, i: int) -> None:
+        """Hand a participant that goes on again what it was handed before."""
+        boundaries = self._participants[i].boundaries
+        count = max((len(each.again) for each in boundaries), default=0)
+        for place in range(count):
+            for each in boundaries:
+                each.repeat(place)
+            self._turn(i, self._joint_steps - count + place + 1)
+        for each in boundaries:
+            each.again = []
 
     @property
     def _joint_steps(self) -> int:

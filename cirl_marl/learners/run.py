@@ -8,9 +8,10 @@
                            below it, if it has such
       versions.json        of Python and of every package that matters
       status.json          state, joint steps, the newest checkpoint and the best; rewritten last, atomically
-      checkpoints/NNN/     LEARNER.zip (policy and optimiser), LEARNER.normaliser.pkl,
-                           LEARNER.replay.pkl.gz; an independent learner has the name of its agent;
-                           price.json, if the price of service moves
+      checkpoints/NNN/     LEARNER.json, LEARNER.safetensors: policy and normaliser, which act; an independent
+                           learner has the name of its agent. LEARNER.state.*: all else that it goes on from,
+                           LEARNER.journal.*: what came after that, training.*: the environment; price.json, if the
+                           price of service moves
       evaluations.csv      one row an evaluation during training: λ̄, service, whether it was the best so far
       metrics.csv          one row an episode: λ̄, service level, return of each agent
       tensorboard/LEARNER/ learning curves of each learner
@@ -24,10 +25,12 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
+import re
 import shutil
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -43,6 +46,15 @@ from cirl_marl.records.files import sync, write_atomically, write_json
 from cirl_marl.records.machine import versions
 
 STATES = ("running", "complete", "interrupted", "failed")
+CHECKPOINT = re.compile(r"\d{9,}-(start|running|interrupted|complete|best|failed)")
+"""Names of checkpoints."""
+BEGUN = {"network", "network.toml", "versions.json", ".versions.partial.json", "status.json", ".status.partial.json"}
+BEGUN |= {".config.partial.json", ".lock"}
+"""What is in the directory of a run before its description is."""
+PARTIAL = "next.partial"
+"""Folder of a checkpoint that is being written."""
+KEPT = 3
+"""Checkpoints that are kept, should the newest be damaged."""
 
 
 class Origin(Settings):
@@ -59,7 +71,8 @@ class RunConfig(Settings):
 
     ``steps`` are environment steps, summed over the copies, of which there are ``envs``. Every random stream derives
     from ``seed``; ``options`` are those of ``VectorEnv``. Of a definition with regions, ``region`` is the one that was
-    trained on; ``data_sha256`` are the hashes of the data files by the names that the definition gives them.
+    trained on; ``definition_sha256`` is the hash of the definition, ``data_sha256`` are those of the data files by the
+    names that it gives them.
     ``origins`` say for each learner that had a start where that came from; going on with the run does not need it.
     """
 
@@ -72,6 +85,7 @@ class RunConfig(Settings):
     envs: StrictInt
     options: dict[str, Any]
     region: str = ""
+    definition_sha256: str = ""
     data_sha256: dict[str, str] = Field(default_factory=dict)
     origins: dict[str, Origin] = Field(default_factory=dict)
 
@@ -99,8 +113,11 @@ class RunDirectory:
             RunError: if the directory already holds something, or the configuration cannot be written to a file.
         """
         run = cls(path)
+        if run._begun_only():
+            shutil.rmtree(run.path)
         if run.path.exists() and (not run.path.is_dir() or any(run.path.iterdir())):
             raise RunError(f"{run.path}: already exists and is not empty; choose another directory, or resume it")
+        config = config.model_copy(update={"definition_sha256": hashlib.sha256(definition.read_bytes()).hexdigest()})
         try:
             plain = config.model_dump(mode="json")
             json.dumps(plain)
@@ -113,9 +130,16 @@ class RunDirectory:
             (kept / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, kept / name)
         write_json(run.path / "versions.json", versions())
-        write_json(run.path / "config.json", plain)
         run.set_status("running", 0, None)
+        write_json(run.path / "config.json", plain)  # the last: with it the directory is a run
         return run
+
+    def _begun_only(self) -> bool:
+        """Return whether the directory is what a crash left when it was made: parts of a run, no description."""
+        if self.path.is_symlink() or not self.path.is_dir():
+            return False
+        names = {each.name for each in self.path.iterdir()}
+        return "versions.json" in names and names <= BEGUN
 
     @contextmanager
     def claimed(self) -> Iterator[None]:
@@ -132,7 +156,9 @@ class RunDirectory:
 
     @property
     def config(self) -> RunConfig:
-        """The resolved configuration; a ``RunError`` if the directory holds no complete run description."""
+        """The resolved configuration; a ``RunError`` if there is none, or a link that could lead out of the run."""
+        for link in _links(self.path):
+            raise RunError(f"{link}: is a link; nothing outside of a run is read or written, so put a copy there")
         plain = self._json("config.json")
         try:
             return RunConfig.model_validate(plain)
@@ -145,7 +171,7 @@ class RunDirectory:
         """State, joint steps and checkpoint; a ``RunError`` if the file is missing or says something else."""
         status = self._json("status.json")
         fits = isinstance(status, dict) and {"state", "joint_steps", "checkpoint"} <= set(status)
-        fits = fits and status["state"] in STATES and type(status["joint_steps"]) is int
+        fits = fits and status["state"] in STATES and type(status["joint_steps"]) is int and status["joint_steps"] >= 0
         fits = fits and isinstance(status["checkpoint"], str | None) and _is_best(status.setdefault("best", None))
         if not fits:
             raise RunError(f"{self.path / 'status.json'}: is not the status of a run: {status!r}")
@@ -158,11 +184,22 @@ class RunDirectory:
         status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "best": best, "reason": reason}
         write_json(self.path / "status.json", status)
 
-    def go_on(self, config: RunConfig) -> None:
-        """Say that the run goes on, to the steps of ``config``, which is the run's but for these."""
+    def go_on(self, config: RunConfig, checkpoint: Path | None) -> None:
+        """Say that the run goes on from ``checkpoint``, to the steps of ``config``, which is its own but for these."""
         write_json(self.path / "config.json", config.model_dump(mode="json"))
+        done, name = (0, None) if checkpoint is None else (steps_of(checkpoint), checkpoint.name)
+        best: dict[str, Any] | None = None
+        if checkpoint is not None and checkpoint.name.endswith("-complete"):
+            best = self.status["best"]
+        elif checkpoint is not None:
+            best = _best_at(checkpoint)
+        self.set_status("running", done, name, best)
+
+    def stop(self, state: str, reason: str) -> None:
+        """Say that the run ended early, with what was saved last."""
+        shutil.rmtree(self.path / "checkpoints" / PARTIAL, ignore_errors=True)
         status = self.status
-        self.set_status("running", status["joint_steps"], status["checkpoint"], status["best"])
+        self.set_status(state, status["joint_steps"], status["checkpoint"], status["best"], reason)
 
     @property
     def checkpoint(self) -> Path:
@@ -173,13 +210,30 @@ class RunDirectory:
     def chosen(self) -> Path:
         """The checkpoint that acts: the best by evaluation, or the newest if none was evaluated; errors likewise."""
         status = self.status
-        return self._checkpoint(status["best"]["checkpoint"] if status["best"] is not None else status["checkpoint"])
+        name = status["best"]["checkpoint"] if status["best"] is not None else status["checkpoint"]
+        failed = [each.name for each in self._saved() if each.name.endswith("-failed")]
+        return self._checkpoint(failed[-1] if name is None and failed else name)
+
+    def resumable(self) -> list[Path]:
+        """Return the checkpoints from which the run can go on, the newest first."""
+        newest = self.status["checkpoint"]
+        if newest is None:
+            return []
+        _check_name(newest, self.path)
+        older = [each for each in self._saved() if each.name < newest and not _acts_only(each)]
+        return [self.path / "checkpoints" / newest, *reversed(older)]
+
+    def _saved(self) -> list[Path]:
+        """Return the folders of checkpoints in the order of their steps; strangers among them are left alone."""
+        folder = self.path / "checkpoints"
+        return sorted(each for each in folder.glob("*") if CHECKPOINT.fullmatch(each.name) and each.is_dir())
 
     def _checkpoint(self, name: str | None) -> Path:
         if name is None:
             raise RunError(f"{self.path}: nothing was saved in this run yet (state: {self.status['state']})")
+        _check_name(name, self.path)
         folder: Path = self.path / "checkpoints" / name
-        missing = [group.name for group in self.groups() if not (folder / f"{group.name}.zip").is_file()]
+        missing = [group.name for group in self.groups() if not (folder / f"{group.name}.json").is_file()]
         if missing:
             raise RunError(f"{folder}: the checkpoint lacks the policies of {', '.join(missing)}")
         return folder
@@ -196,8 +250,10 @@ class RunDirectory:
             RunError: if a file of it is missing, or is not the one that it was trained with.
         """
         config = self.config
-        for name, sha256 in config.data_sha256.items():
-            file = self._file(f"network/{name}")
+        files = {self._file(f"network/{_inside(name)}"): sha256 for name, sha256 in config.data_sha256.items()}
+        if config.definition_sha256:
+            files[self.definition] = config.definition_sha256
+        for file, sha256 in files.items():
             if (given := hashlib.sha256(file.read_bytes()).hexdigest()) != sha256:
                 raise RunError(f"{file}: is not the file of this training, whose SHA-256 was {sha256}; it is {given}")
         address = f"{self.definition}:{config.region}" if config.region else self.definition
@@ -217,44 +273,60 @@ class RunDirectory:
         options = config.options if uncertain is None else {**config.options, "uncertain": uncertain}
         return VectorEnv(self.network(), num_envs=num_envs, agents=config.agents, **options)
 
-    def save_checkpoint(self, joint_steps: int, write: Callable[[Path], None], state: str, reason: str = "") -> None:
-        """Let ``write`` fill a new checkpoint folder, then make it the one that counts and drop the older ones.
+    def begin_checkpoint(self) -> Path:
+        """Return an empty folder for a checkpoint, which counts when ``end_checkpoint`` is called."""
+        partial = self.path / "checkpoints" / PARTIAL
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        return partial
 
-        What a failed learner leaves behind may be of no use: if there is an older checkpoint, that goes on to count.
-        """
-        name = self._filled(f"{joint_steps:09d}-{state}", write)
-        status = self.status
-        before = status["checkpoint"] if state == "failed" else None
-        counts = before or name
-        self.set_status(state, int(counts.partition("-")[0]), counts, status["best"], reason)
-        self._drop_all_but({name, before, (status["best"] or {}).get("checkpoint")})
+    def end_checkpoint(self, partial: Path, joint_steps: int, state: str, reason: str = "") -> None:
+        """Let the checkpoint in the folder ``partial`` be the newest, and drop those that nobody needs any more."""
+        name = f"{joint_steps:09d}-{state}"
+        self._publish(partial, name)
+        self.set_status("running" if state == "start" else state, joint_steps, name, self.status["best"], reason)
+        self._drop()
 
     def save_best(self, joint_steps: int, write: Callable[[Path], None], figures: dict[str, float]) -> None:
         """Let ``write`` fill the checkpoint that acts from now on, and note the ``figures`` that it was chosen by."""
-        name = self._filled(f"{joint_steps:09d}-best", write)
+        name = self.save_policies(f"{joint_steps:09d}-best", write)
         status = self.status
         best = {"checkpoint": name, "joint_steps": joint_steps, "figures": figures}
         self.set_status(status["state"], status["joint_steps"], status["checkpoint"], best, status.get("reason", ""))
-        self._drop_all_but({name, status["checkpoint"]})
+        self._drop()
 
-    def _filled(self, name: str, write: Callable[[Path], None]) -> str:
-        """Let ``write`` fill the checkpoint ``name``, which is there when all of it is on the disk."""
-        folder = self.path / "checkpoints" / name
-        partial = folder.with_name(folder.name + ".partial")
+    def save_policies(self, name: str, write: Callable[[Path], None]) -> str:
+        """Let ``write`` fill a checkpoint that acts, and from which no training goes on."""
+        partial = self.path / "checkpoints" / f"{name}.partial"
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         write(partial)
+        self._publish(partial, name)
+        return name
+
+    def _publish(self, partial: Path, name: str) -> None:
+        """Give a folder its name when all of it is on the disk."""
         for path in (*partial.iterdir(), partial):
             sync(path)
+        folder = partial.with_name(name)
         shutil.rmtree(folder, ignore_errors=True)
         partial.replace(folder)
         sync(folder.parent)
-        return name
 
-    def _drop_all_but(self, names: Collection[str | None]) -> None:
-        for other in (self.path / "checkpoints").iterdir():
-            if other.name not in names:
-                shutil.rmtree(other)
+    def _drop(self) -> None:
+        """Remove all checkpoints but the newest few, and the best ones to which they would go back."""
+        status = self.status
+        newest, saved = status["checkpoint"], self._saved()
+        counted = [each for each in saved if newest is not None and each.name <= newest and not _acts_only(each)]
+        counted = counted[-1 if status["state"] == "complete" else -KEPT :]
+        kept = {each.name for each in counted} | {newest, (status["best"] or {}).get("checkpoint")}
+        kept |= {(_best_at(each) or {}).get("checkpoint") for each in counted}
+        for each in saved:
+            if each.name not in kept:
+                shutil.rmtree(each)
+        for each in (self.path / "checkpoints").glob("*.partial"):
+            if CHECKPOINT.fullmatch(each.stem):  # a crash left it
+                shutil.rmtree(each)
 
     def metrics(self) -> dict[str, list[float]]:
         """Return the columns of ``metrics.csv``."""
@@ -283,7 +355,7 @@ class RunDirectory:
         path = self._file(name)
         try:
             value: dict[str, Any] = json.loads(path.read_text())
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise RunError(f"{path}: cannot be read: {error}") from error
         return value
 
@@ -292,6 +364,46 @@ def _complete_rows(path: Path) -> list[list[str]]:
     """Return the rows of a CSV file that end in a newline; a crash may have cut the last one short."""
     text = path.read_text()
     return list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
+
+
+def steps_of(checkpoint: Path) -> int:
+    """Return the joint steps that are behind a checkpoint, which its name tells."""
+    return int(checkpoint.name.partition("-")[0])
+
+
+def _best_at(checkpoint: Path) -> dict[str, Any] | None:
+    """Return which checkpoint was the best when one was written from which the run can go on."""
+    path = checkpoint / "training.json"
+    try:
+        best: dict[str, Any] | None = json.loads(path.read_text())["best"] if path.is_file() else None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise RunError(f"{path}: cannot be read: {error!r}") from error
+    if not _is_best(best):
+        raise RunError(f"{path}: is not what a training wrote: best = {best!r}")
+    return best
+
+
+def _inside(name: str) -> str:
+    """Return the name of a file below the run; a ``RunError`` if it leads out."""
+    parts = PurePath(name).parts
+    if not parts or ".." in parts or PurePath(name).is_absolute():
+        raise RunError(f"data_sha256: {name!r} leads out of the run")
+    return name
+
+
+def _check_name(name: str, run: Path) -> None:
+    if not CHECKPOINT.fullmatch(name):
+        raise RunError(f"{run / 'status.json'}: {name!r} is no name of a checkpoint, such as 000000100-running")
+
+
+def _links(folder: Path) -> Iterator[Path]:
+    """Yield what is a link in a folder or below, which is never followed."""
+    for found, folders, files in os.walk(folder):
+        yield from (Path(found) / name for name in (*folders, *files) if (Path(found) / name).is_symlink())
+
+
+def _acts_only(checkpoint: Path) -> bool:
+    return checkpoint.name.endswith(("-best", "-failed"))
 
 
 def _is_best(best: object) -> bool:

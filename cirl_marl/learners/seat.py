@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn
 
+from cirl_marl.controllers.basic import Arrays
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.views import ObservedRows, View
@@ -18,10 +19,41 @@ from cirl_marl.network.elements import Compartment
 
 
 @dataclass(frozen=True, slots=True)
+class Handed:
+    """What a learner is handed after a joint step, one row for each row of its view.
+
+    Attributes:
+        seen: the observation that it acts on next.
+        rewards: of the step.
+        ended: rows whose episode ended with it; all of them at a reset, after which episodes begin as well.
+        final: what was seen last in these, anything in others; None if none ended.
+        returns: sum of the rewards of the episodes that ended, anything in others.
+        lengths: steps of these.
+    """
+
+    seen: ObservedRows
+    rewards: NDArray[np.float32]
+    ended: NDArray[np.bool_]
+    final: ObservedRows | None = None
+    returns: Floats | None = None
+    lengths: NDArray[np.integer] | None = None
+
+    def told(self) -> dict[str, Any]:
+        """Return the parts by name."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+
+_NOTHING = Handed(np.zeros(0), np.zeros(0, dtype=np.float32), np.zeros(0, dtype=bool))
+"""Before the joint environment is reset."""
+
+
+@dataclass(frozen=True, slots=True)
 class JointStep:
     """What a joint step brought.
 
     Attributes:
+        observations: of each agent, of the episodes that begin where one ended.
+        state: returns the state of the environment for critics.
         rewards: of this step by agent, shape (B,).
         done: the copies whose episode ended, shape (B,).
         returns: of the episodes so far by agent, shape (B,).
@@ -29,6 +61,8 @@ class JointStep:
         infos: of the environment.
     """
 
+    observations: Arrays
+    state: Callable[[], Floats]
     rewards: Mapping[str, Floats]
     done: NDArray[np.bool_]
     returns: Mapping[str, Floats]
@@ -71,8 +105,7 @@ class Seat(VecEnv):
 
     Attributes:
         name: of the learner; an independent learner has its agent's.
-        latest: the observation that it acts on next, one row for each row of its view.
-        last: the joint step that is behind it.
+        handed: what it was handed last.
         action: what it last did.
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
     """
@@ -80,8 +113,7 @@ class Seat(VecEnv):
     def __init__(self, env: VectorEnv, name: str, view: View, wait: Callable[[], object]) -> None:
         """Seat the learner ``name``; ``wait`` returns when every learner has acted and the environment has moved."""
         self.name, self.view, self.copies = name, view, env.num_envs
-        self.latest: ObservedRows | None = None
-        self.last: JointStep | None = None
+        self.handed: Handed = _NOTHING
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
         self.views = [CopyView(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
@@ -93,32 +125,35 @@ class Seat(VecEnv):
         """What messages call the learner."""
         return f"agent '{self.name}'" if self.view.agents == (self.name,) else f"learner '{self.name}'"
 
+    def show(self, observations: Arrays, state: Callable[[], Floats]) -> None:
+        """Show the first observation after a reset of the joint environment."""
+        rows = self.num_envs
+        seen = _rows_in_order(self.view.observe(observations, state))
+        self.handed = Handed(seen, np.zeros(rows, dtype=np.float32), np.ones(rows, dtype=bool))
+
+    def hand(self, step: JointStep) -> None:
+        """Hand over what the joint step brought."""
+        agents, times = self.view.agents, self.num_envs // self.copies
+        seen = _rows_in_order(self.view.observe(step.observations, step.state))
+        rewards = self.view.score(step.rewards).astype(np.float32)
+        ended = np.tile(step.done, times)
+        if not step.done.any():
+            self.handed = Handed(seen, rewards, ended)
+            return
+        last = {agent: step.infos[agent]["final_observation"] for agent in agents}
+        final = _rows_in_order(self.view.observe(last, lambda: step.infos[agents[0]]["final_state"]))
+        returns, lengths = self.view.score(step.returns), np.tile(step.lengths, times)
+        self.handed = Handed(seen, rewards, ended, final, returns, lengths)
+
     def paid(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Return the reward of each row, and whether its episode ended; arrays of its own, which PPO adds to."""
-        last = self._past
-        return self.view.score(last.rewards).astype(np.float32), np.tile(last.done, self.num_envs // self.copies)
-
-    def final_observation(self) -> ObservedRows:
-        """Return what was seen last in the episodes that ended; other rows hold what is seen now."""
-        infos = self._past.infos
-        seen = {agent: infos[agent]["final_observation"] for agent in self.view.agents}
-        return self.view.observe(seen, lambda: infos[self.view.agents[0]]["final_state"])
-
-    def episode_returns(self) -> Floats:
-        """Return the sum of the rewards of each row in its episode so far."""
-        return self.view.score(self._past.returns)
-
-    @property
-    def _past(self) -> JointStep:
-        if self.last is None:
-            raise CirlError(f"the seat of {self.title} has no step behind it")
-        return self.last
+        return self.handed.rewards.copy(), self.handed.ended.copy()
 
     def reset(self) -> VecEnvObs:
         """Return the current observation of every copy."""
-        if self.latest is None:
+        if self.handed is _NOTHING:
             raise CirlError(f"the seat of {self.title} has no observation: the joint environment is not reset")
-        return self.latest
+        return self.handed.seen
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Keep the actions, one row for each row of the view, for the next joint step."""
@@ -129,13 +164,13 @@ class Seat(VecEnv):
         self._wait()
         rewards, ended = self.paid()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if ended.any():
-            final, scores, lengths = self.final_observation(), self.episode_returns(), self._past.lengths
+        now = self.handed
+        if now.final is not None and now.returns is not None and now.lengths is not None:
             for row in np.flatnonzero(ended):
                 infos[row] = {
                     "TimeLimit.truncated": self.bootstrap,
-                    "terminal_observation": _row(final, int(row)),
-                    "episode": {"r": float(scores[row]), "l": int(lengths[row % self.copies]), "t": 0.0},
+                    "terminal_observation": _row(now.final, int(row)),
+                    "episode": {"r": float(now.returns[row]), "l": int(now.lengths[row]), "t": 0.0},
                 }
         return self.reset(), rewards, ended, infos
 
@@ -167,6 +202,13 @@ class Seat(VecEnv):
 
     def _chosen(self, indices: int | Iterable[int] | None) -> list[CopyView]:
         return [self.views[i] for i in self._get_indices(indices)]
+
+
+def _rows_in_order(observation: ObservedRows) -> ObservedRows:
+    """Return it row after row in memory, as it is when it has been kept; products of others round differently."""
+    if isinstance(observation, dict):
+        return {key: np.ascontiguousarray(value) for key, value in observation.items()}
+    return np.ascontiguousarray(observation)
 
 
 def _row(observation: ObservedRows, row: int) -> ObservedRows:

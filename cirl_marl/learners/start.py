@@ -7,38 +7,28 @@ were: another environment shows other states more often, and a policy that sees 
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RecipeError, unknown
 from cirl_marl.learners.demonstrations import keep_parameters
-from cirl_marl.learners.learner import Learner, load_model, load_normaliser
+from cirl_marl.learners.learner import Learner, learnt
 from cirl_marl.learners.recipe import LearnerSettings, Start
 from cirl_marl.learners.run import Origin, RunDirectory
+from cirl_marl.learners.states import set_variables, settle, variables
 from cirl_marl.learners.views import CENTRAL_CRITIC
 
 SHOWN = 3
 """Entries that a message lists of those that differ."""
 
 Bounds = tuple[float, float]
-
-
-class Settled(RunningMeanStd):
-    """Statistics that no longer follow what is seen."""
-
-    def __init__(self, known: RunningMeanStd) -> None:
-        """Stay with what is ``known``."""
-        super().__init__(shape=known.mean.shape)
-        self.mean, self.var, self.count = known.mean.copy(), known.var.copy(), known.count
-
-    def update_from_moments(self, batch_mean: Any, batch_var: Any, batch_count: float) -> None:
-        """Do nothing."""
 
 
 def begin_from(start: Start, learner: Learner, env: VectorEnv, seed: int) -> Origin:
@@ -64,14 +54,19 @@ def _begin_from(run: RunDirectory, name: str, learner: Learner, env: VectorEnv) 
     _refuse(f"{run.path}: '{name}'", [*_other_settings(there.spec, learner.spec)])
     seen = [_entries(*pair, learner.spec) for pair in ((source, there.agents), (env, learner.seat.view.agents))]
     _refuse(f"{run.path}: '{name}'", [*_other_entries(*seen), *_other_actions(there.view(source), learner.seat.view)])
-    model = load_model(folder, name, there.spec.algorithm)
-    normaliser = load_normaliser(folder, name, there.spec)
-    path = folder / f"{name}.zip"
-    _refuse(f"{path}:", [*_other_shapes(model, learner.model)])
-    _take_over(model, normaliser, learner)
-    files = (path, folder / f"{name}.normaliser.pkl")
-    hashes = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files if file.is_file()}
+    theirs = learnt(folder, there, source)
+    _refuse(f"{folder / name}.json:", [*_other_shapes(theirs.model, learner.model)])
+    _take_over(theirs, learner)
+    files = [folder / f"{name}.{kind}" for kind in ("json", "safetensors")]
+    hashes = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
     return Origin(run=str(run.path.resolve()), agent=name, checkpoint=folder.name, sha256=hashes)
+
+
+def begin_again(folder: Path, learner: Learner) -> None:
+    """Give a fresh ``learner`` what it had from another run, as a checkpoint of its own keeps it."""
+    learner.take(folder)
+    if isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
+        settle(learner.env)
 
 
 def _refuse(what: str, mistakes: Sequence[str]) -> None:
@@ -79,18 +74,16 @@ def _refuse(what: str, mistakes: Sequence[str]) -> None:
         raise RecipeError(f"{what} {'; '.join(mistakes)}")
 
 
-def _take_over(model: BaseAlgorithm, normaliser: VecNormalize | None, learner: Learner) -> None:
+def _take_over(theirs: Learner, learner: Learner) -> None:
     """Copy the policy, a learnt entropy coefficient and the statistics of observations."""
-    mine = learner.model
-    mine.policy.load_state_dict(model.policy.state_dict())
+    mine, there = learner.model, theirs.model
+    mine.policy.load_state_dict(there.policy.state_dict())
     keep_parameters(mine)
-    theirs, own = (getattr(each, "log_ent_coef", None) for each in (model, mine))
-    if theirs is not None and own is not None:
-        own.data.copy_(theirs.data)
-    if normaliser is not None and isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
-        known = normaliser.obs_rms
-        settled = {key: Settled(each) for key, each in known.items()} if isinstance(known, dict) else Settled(known)
-        learner.env.obs_rms = settled  # type: ignore[assignment]
+    known = variables(there)
+    set_variables(mine, {name: known.get(name, own) for name, own in variables(mine).items()})
+    if isinstance(theirs.env, VecNormalize) and isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
+        learner.env.obs_rms = copy.deepcopy(theirs.env.obs_rms)
+        settle(learner.env)
 
 
 def _other_settings(there: LearnerSettings, here: LearnerSettings) -> Iterator[str]:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,6 +55,21 @@ class Streams:
     @torch_state.setter
     def torch_state(self, state: torch.Tensor) -> None:
         self._torch = state
+
+    def told(self, *, active: bool) -> dict[str, Any]:
+        """Return the state of the streams, which are the ``active`` ones or put away."""
+        if active:
+            self._leave()
+        numpy = self._numpy.state if self._numpy_state is None else self._numpy_state
+        return {"torch": self._torch, "numpy": numpy, "gaussian": self._numpy_state is not None}
+
+    def go_on(self, told: Mapping[str, Any], *, active: bool) -> None:
+        """Bring the streams into a state."""
+        self._torch, state = told["torch"], told["numpy"]
+        self._numpy.state = {"bit_generator": state["bit_generator"], "state": state["state"]}
+        self._numpy_state = state if told["gaussian"] else None
+        if active:
+            self._enter()
 
     @contextmanager
     def active(self) -> Iterator[None]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from stable_baselines3.common.vec_env import VecNormalize
+
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
-from cirl_marl.learners.learner import load_model, load_normaliser
+from cirl_marl.learners.learner import learnt
 from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.run import RunDirectory
 
@@ -25,15 +27,9 @@ class Trained(Policies):
         self._seen = env.layout.names
         policies: dict[str, Policy] = {}
         for group in self.run.groups():
-            name, view = group.name, group.view(env)
-            model = load_model(folder, name, group.spec.algorithm)
-            normaliser = load_normaliser(folder, name, group.spec)
-            for loaded in (model, normaliser):
-                shapes = getattr(loaded, "observation_space", None), getattr(loaded, "action_space", None)
-                if loaded is not None and shapes != (view.observation_space, view.action_space):
-                    what = f"the policy or normaliser of '{name}'"
-                    raise RunError(f"{folder}: {what} is for other observations or actions")
-            policies[name] = Policy(model, normaliser, view)
+            learner = learnt(folder, group, env)
+            normaliser = learner.env if isinstance(learner.env, VecNormalize) else None
+            policies[group.name] = Policy(learner.model, normaliser, learner.seat.view)
         super().__init__(policies)
 
     def start(self, env: VectorEnv, seed: int) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,21 +22,28 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.environments.rewards import WEIGHED
 from cirl_marl.environments.vector import Infos, VectorEnv
-from cirl_marl.errors import CirlError, RecipeError, unknown
+from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
 from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, World, wait
 from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.price import FIRST, ServicePrice
-from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory
+from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory, steps_of
 from cirl_marl.learners.selection import Score, Selection, score_of
 from cirl_marl.learners.stacked.conditions import first_obstacle, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
-from cirl_marl.learners.start import begin_from
+from cirl_marl.learners.start import begin_again, begin_from
 from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.trees import read_tree, write_tree
 
 CHECKPOINTS = 10
-"""Checkpoints of a run, evenly spaced; a crash loses at most what came after the last."""
+"""Checkpoints of a run, evenly spaced."""
+CHECKPOINT_EVERY = 60.0
+"""Seconds after which there is one more; a crash loses at most what came after the last."""
+STOPS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+"""Signals at which a training is saved and stopped; some systems lack the last."""
+COST = 0.02
+"""Part of the time that checkpoints may take; they come less often if the last one took more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +72,13 @@ TrainingReport = Callable[[Progress], None]
 class Training:
     """A run in progress: what it was asked to do, the joint environment, its learners by name, and where it is kept."""
 
-    def __init__(self, config: RunConfig, env: VectorEnv, resumed: RunDirectory | None = None) -> None:
-        """Seat the learners and make their algorithms, or load those of a run that is resumed."""
+    def __init__(
+        self, config: RunConfig, env: VectorEnv, checkpoint: Path | None = None, checkpoint_every: float | None = None
+    ) -> None:
+        """Seat the learners and make their algorithms, or load those of a ``checkpoint`` from which a run goes on.
+
+        ``checkpoint_every`` are seconds, 0 for no checkpoints by time and None for a minute.
+        """
         self.config = config
         self.env = env
         self.run: RunDirectory | None = None
@@ -73,22 +86,34 @@ class Training:
         self._evaluations: EvaluationsFile | None = None
         self._best: Score | None = None
         self._bring_up_to_date: Callable[[], None] = lambda: None
-        checkpoint = None
-        self.done = 0
-        if resumed is not None and resumed.status["checkpoint"] is not None:
-            checkpoint, self.done = resumed.checkpoint, int(resumed.status["joint_steps"])
+        self._told = None
+        self.done = 0 if checkpoint is None else steps_of(checkpoint)
+        if checkpoint is not None and (checkpoint / "training.json").is_file():
+            self._told = read_tree(checkpoint, "training")
+        self.begun = self.done if self._told is None else int(self._told["begun"])
         alike = config.recipe.run.common_random_numbers
-        seeds = [derived_seed(config.seed, "copies", 0 if alike else i, self.done) for i in range(config.envs)]
+        seeds = [derived_seed(config.seed, "copies", 0 if alike else i, self.begun) for i in range(config.envs)]
         self.groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
         views = {name: group.view(env) for name, group in self.groups.items()}
-        self.world = World(env, seeds, views, done=self.done)
+        self.world = World(env, seeds, views, done=self.begun)
         self.learners: dict[str, Learner] = {}
         with one_torch_thread():
             for name, seat in self.world.seats.items():
-                learner = Learner(seat, self.groups[name].spec, config.seed, done=self.done)
-                self.learners[name] = learner.load(checkpoint) if checkpoint else learner.build()
+                learner = Learner(seat, self.groups[name].spec, config.seed, done=self.begun)
+                if checkpoint is None or checkpoint.name.endswith("-start"):
+                    self.learners[name] = learner.build()
+                elif self._told is None:
+                    self.learners[name] = learner.load(checkpoint)
+                else:
+                    self.learners[name] = learner.go_on(checkpoint)
         if checkpoint is None:
             self._begin_from_others()
+        elif checkpoint.name.endswith("-start"):
+            for learner in self.learners.values():
+                if learner.spec.start is not None:
+                    begin_again(checkpoint, learner)
+        if self._told is not None:
+            self.world.go_on(self._told["world"])
         self._price = self._priced(checkpoint)
         asked = config.recipe.run
         self._evaluation: Selection | None = None
@@ -96,6 +121,11 @@ class Training:
             own = VectorEnv(env.network, num_envs=asked.episodes, agents=env.agents, **config.options)
             self._evaluation = Selection(own)
         self._evaluated = -1
+        self._saving: Path | None = None
+        self._stacked: Container[str] = ()
+        self._due, self._saved_at, self._spent = False, time.monotonic(), 0.0
+        self._asked_every = CHECKPOINT_EVERY if checkpoint_every is None else checkpoint_every
+        self._every = self._asked_every or None
         self._appoint_demonstrators()
 
     def _priced(self, checkpoint: Path | None) -> ServicePrice | None:
@@ -125,15 +155,19 @@ class Training:
 
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs, checkpoints and the best of them in ``run`` from now on."""
-        self.run = run
+        self.run, self.config = run, run.config
         self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
+        self._saved_at = time.monotonic()
         for name, learner in self.learners.items():
+            learner.boundary.keeps(partial(self._written, learner))
             learner.model.set_logger(configure(str(run.path / "tensorboard" / name), ["tensorboard"]))
         best = run.status["best"]
         self._best = score_of(best["figures"]) if best is not None else None
         self._evaluations = EvaluationsFile(run.path / "evaluations.csv", self.done)
-        if self.config.origins and self.joint_steps == 0:
-            self.save("running")  # so that the run does not need those from which it started any more
+        if self.config.origins and self.joint_steps == 0:  # the run shall not need those from which it started
+            folder = run.begin_checkpoint()
+            self._write_policies(folder)
+            run.end_checkpoint(folder, 0, "start")
 
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
@@ -195,19 +229,70 @@ class Training:
             if steps % apart == 0:
                 self._evaluate(self._evaluation)
         if steps % max(1, planned // CHECKPOINTS) == 0:
-            self.save("running")
+            self._due = True
 
     def finish(self) -> None:
         """Evaluate what was learnt in the end, and keep it."""
         if self._evaluation is not None and self._evaluated != self.joint_steps:
             self._evaluate(self._evaluation)
-        self.save("complete")
-
-    def save(self, state: str, reason: str = "") -> None:
-        """Bring the models up to date, and write a checkpoint from which the run can go on, if it is kept."""
         self._bring_up_to_date()
         if self.run is not None:
-            self.run.save_checkpoint(self.joint_steps, partial(self._write, replay=state != "complete"), state, reason)
+            partial_folder = self.run.begin_checkpoint()
+            for learner in self.learners.values():
+                learner.write_state(partial_folder, {}, last=True)
+            self._end_checkpoint(partial_folder, "complete")
+
+    def stop(self, state: str, reason: str) -> None:
+        """Say that the training ended early; it goes on from the last checkpoint. What failed can be looked at."""
+        if self.run is None:
+            return
+        if state == "failed":
+            self._bring_up_to_date()
+            self.run.save_policies(f"{self.joint_steps:09d}-failed", self._write_policies)
+        self.run.stop(state, reason)
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        passed = time.monotonic() - self._saved_at
+        late = self._every is not None and passed >= self._every
+        return self.run is not None and self._saving is None and (late or (self._due and passed * COST >= self._spent))
+
+    def ask(self) -> None:
+        """Ask every learner for its state."""
+        if self.run is not None and self._saving is None:
+            began = time.perf_counter()
+            self._saving = self.run.begin_checkpoint()
+            self._spent = time.perf_counter() - began
+            for learner in self.learners.values():
+                learner.boundary.folder = self._saving
+
+    def keep(self, state: str = "running", reason: str = "") -> None:
+        """Write the checkpoint for which every learner has written its state."""
+        if self.run is None or self._saving is None:
+            return
+        began = time.perf_counter()
+        for learner in self.learners.values():
+            learner.write_journal(self._saving)
+            learner.boundary.forget()
+        write_tree(self._saving, "training", {"begun": self.begun, "world": self.world.told(), "best": self._kept_best})
+        self._end_checkpoint(self._saving, state, reason)
+        self._saving, self._due, self._saved_at = None, False, time.monotonic()
+        self._spent += time.perf_counter() - began
+        if self._every is not None:
+            self._every = max(self._asked_every, self._spent / COST)
+
+    def _end_checkpoint(self, folder: Path, state: str, reason: str = "") -> None:
+        assert self.run is not None
+        if self._price is not None:
+            self._price.save(folder)
+        self.run.end_checkpoint(folder, self.joint_steps, state, reason)
+
+    def _written(self, learner: Learner, folder: Path, more: dict[str, Any]) -> None:
+        """Write the state of a learner, and note how long it took."""
+        began = time.perf_counter()
+        learner.write_state(folder, more, stacked=learner.name in self._stacked)
+        self._spent += time.perf_counter() - began
 
     def _evaluate(self, evaluation: Selection) -> None:
         """Play its episodes by the policies of now, keep these if they are the best so far, and move the price."""
@@ -222,22 +307,35 @@ class Training:
         if better:
             self._best = score
             if self.run is not None:
-                self.run.save_best(self.joint_steps, partial(self._write, replay=False), score.said())
+                self.run.save_best(self.joint_steps, self._write_policies, score.said())
         if self._evaluations is not None:
             figures = score.said() | {"circularity_weight": self.env.circularity_weight}
             self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
         if self._price is not None and self.joint_steps * self.config.envs >= FIRST * self.config.steps:
             self._price.heed(score.assured)
 
-    def _write(self, folder: Path, *, replay: bool) -> None:
+    @property
+    def _kept_best(self) -> dict[str, Any] | None:
+        best: dict[str, Any] | None = self.run.status["best"] if self.run is not None else None
+        return best
+
+    def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():
-            learner.save(folder, replay=replay)
+            learner.save(folder)
         if self._price is not None:
             self._price.save(folder)
 
-    def runs_stacked(self, bring_up_to_date: Callable[[], None]) -> None:
-        """Have models brought up to date before they are saved or act."""
-        self._bring_up_to_date = bring_up_to_date
+    def runs_stacked(self, bring_up_to_date: Callable[[], None], stacked: Container[str]) -> None:
+        """Have models of the ``stacked`` learners brought up to date before they are saved or act.
+
+        Raises:
+            RunError: if a learner goes on that ran by itself, and now would not, or the other way round.
+        """
+        self._bring_up_to_date, self._stacked = bring_up_to_date, stacked
+        for name, learner in self.learners.items():
+            if learner.was_stacked is not None and learner.was_stacked != (name in stacked):
+                before, now = ("stacked", "by itself") if learner.was_stacked else ("by itself", "stacked")
+                raise RunError(f"{learner.seat.title} learnt {before} and would go on {now}: give the same callbacks")
 
 
 def run_together(
@@ -267,28 +365,48 @@ def run_together(
         for stack in stacked:
             stack.give()
 
+    names = {id(each): each.name for stack in stacked for each in stack.members}
     for training in trainings:
-        training.runs_stacked(bring_up_to_date)
+        training.runs_stacked(bring_up_to_date, {each.name for each in training.learners.values() if id(each) in names})
     reports: list[TrainingReport | None] = [report] + [None] * (len(trainings) - 1)
     try:
         with one_torch_thread(), _interruption() as interrupted:
             hooks = [partial(t.after_step, began, told) for t, told in zip(trainings, reports, strict=True)]
             lockstep = Lockstep([t.world for t in trainings], list(_participants(trainings, stacked, callbacks)))
-            lockstep.run(hooks, interrupted)
+            lockstep.run(hooks, partial(_keep, trainings, lockstep, interrupted))
             for training in trainings:
                 training.finish()
     except Interrupted:
         for training in trainings:
-            training.save("interrupted", "stopped by the user")
+            training.stop("interrupted", "stopped by the user")
         raise KeyboardInterrupt from None
     except Exception as error:
         for training in trainings:
-            training.save("failed", str(error).partition("\n")[0] or repr(error))
+            training.stop("failed", str(error).partition("\n")[0] or repr(error))
         raise
     finally:
         for training in trainings:
             for learner in training.learners.values():
                 learner.model.logger.close()
+
+
+def _keep(trainings: Sequence[Training], lockstep: Lockstep, interrupted: Callable[[], bool]) -> None:
+    """Ask for checkpoints when it is time, or when somebody wants to stop, and write those that are complete.
+
+    Raises:
+        Interrupted: when everything is written, or if somebody who is shown what to do cannot be saved.
+    """
+    stopping = interrupted()
+    if stopping and (lockstep.busy or all(training.run is None for training in trainings)):
+        raise Interrupted
+    if stopping or (any(training.due for training in trainings) and not lockstep.busy):
+        for training in trainings:
+            training.ask()
+    if lockstep.saved:
+        for training in trainings:
+            training.keep("interrupted" if stopping else "running")
+        if stopping:
+            raise Interrupted
 
 
 def _participants(
@@ -299,34 +417,50 @@ def _participants(
     for stack in stacks:
         title = ", ".join(each.seat.title for each in stack.members[:3]) + (", …" if len(stack.members) > 3 else "")
         yield Participant(
-            f"the stack of {title}", partial(stack.learn, steps, wait), partial(stack.act, wait), Streams()
+            f"the stack of {title}",
+            partial(stack.learn, steps, wait),
+            partial(stack.act, wait),
+            Streams(),
+            [each.boundary for each in stack.members],
         )
     stacked = {id(each) for stack in stacks for each in stack.members}
     for training in trainings:
         for name, learner in training.learners.items():
             if id(learner) not in stacked:
-                learn = partial(learner.learn, steps, callbacks.get(name))
-                yield Participant(learner.seat.title, learn, learner.act, learner.streams, learner.budget(steps))
+                yield Participant(
+                    learner.seat.title,
+                    partial(learner.learn, steps, callbacks.get(name)),
+                    learner.act,
+                    learner.streams,
+                    [learner.boundary],
+                    partial(getattr, learner, "shown"),
+                    learner.budget(steps),
+                )
 
 
 @contextmanager
 def _interruption() -> Iterator[Callable[[], bool]]:
-    """Yield what says whether Ctrl-C was pressed; the second time it acts as usual."""
-    pressed = threading.Event()
+    """Yield what says whether somebody wants to stop: Ctrl-C, SIGTERM or SIGHUP; the second time they act as usual."""
+    asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield pressed.is_set
+        yield asked.is_set
         return
-    before = signal.getsignal(signal.SIGINT)
+    before = {each: signal.getsignal(each) for each in STOPS}
 
     def note(_signal: int, _frame: FrameType | None) -> None:
-        pressed.set()
-        signal.signal(signal.SIGINT, before)
+        asked.set()
+        back()
 
-    signal.signal(signal.SIGINT, note)
+    def back() -> None:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+    for each in STOPS:
+        signal.signal(each, note)
     try:
-        yield pressed.is_set
+        yield asked.is_set
     finally:
-        signal.signal(signal.SIGINT, before)
+        back()
 
 
 @contextmanager

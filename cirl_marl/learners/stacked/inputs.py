@@ -55,6 +55,9 @@ class Inputs:
         self._follows = spec.normalise.observation and spec.start is None  # statistics stay as they are after a start
         for i, columns, ours, kept in self._kept():
             ours.mean[i, columns], ours.var[i, columns], ours.count = kept.mean, kept.var, kept.count
+        for returns, learner in zip(self._returns, members, strict=True):
+            if isinstance(learner.env, VecNormalize):
+                returns[:] = learner.env.returns
 
     def begin(self) -> Tensor:
         """Return what is seen, as at a reset: it counts in the moments, and discounted returns begin anew."""
@@ -74,7 +77,7 @@ class Inputs:
         """Return what was seen last in the rows that ``ended``, shape (N, B, entries); in others, anything."""
         for i, learner in enumerate(self._members):
             if ended[i].any():
-                self._enter(i, learner.seat.final_observation())
+                self._enter(i, learner.seat.handed.final)
         return self._normalised()
 
     def paid(self) -> tuple[Tensor, NDArray[np.bool_]]:
@@ -101,6 +104,9 @@ class Inputs:
             shape = np.shape(kept.mean)
             kept.mean, kept.var = (np.array(own[i, columns]).reshape(shape) for own in (ours.mean, ours.var))
             kept.count = ours.count
+        for own, learner in zip(self._returns, self._members, strict=True):
+            if isinstance(learner.env, VecNormalize):
+                learner.env.returns = own.copy()
 
     def _kept(self) -> Iterator[tuple[int, slice, RunningMeanStd, RunningMeanStd]]:
         """Yield each learner's own moments beside ours, with its row and columns."""

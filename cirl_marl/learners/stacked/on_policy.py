@@ -52,9 +52,15 @@ class RolloutStack(Stack):
         total = first.spec.steps_of(steps) * (self._rows // first.seat.copies)
         if self._timesteps >= total:
             return
-        self._current = self._inputs.begin()
-        self._starts = torch.ones(len(self.members), self._rows, device=self._device)
+        resuming = self._resuming
+        if not resuming:
+            self._current = self._inputs.begin()
         while self._timesteps < total:
+            self._reached()
+            if resuming:
+                self._current, resuming = self._inputs.observed(learning=False), False
+            starts = np.stack([each.seat.handed.ended for each in self.members])
+            self._starts = torch.as_tensor(starts, dtype=torch.float32, device=self._device)
             self._collect(wait)
             rules = Rules.of(self._models[0], self._rows * self._steps, 1.0 - self._timesteps / total)
             update = Update(self._weights, rules, self._rollout, self._acts, self._inputs.local)
@@ -86,7 +92,8 @@ class RolloutStack(Stack):
             self._starts = torch.as_tensor(ended, dtype=torch.float32, device=self._device)
             if ended.any():
                 for episodes, learner, own in zip(self._episodes, self.members, ended, strict=True):
-                    episodes.extend(learner.seat.episode_returns()[own])
+                    if learner.seat.handed.returns is not None:
+                        episodes.extend(learner.seat.handed.returns[own])
                 if self.members[0].spec.bootstrap:
                     rollout.cut.append((t, self._starts, self._inputs.last_seen(ended)))
         self._timesteps += self._steps * self._rows

@@ -54,8 +54,10 @@ class SearchStack(Stack):
             θ ← θ + α/(b σ_R) Σ_k (R_k+ − R_k−) δ_k
         """
         budget, first = self.members[0].budget(steps), self._models[0]
-        self._inputs.begin()
+        if not self._resuming:
+            self._inputs.begin()
         while self._steps < budget:
+            self._reached()
             remaining = 1.0 - self._steps / budget
             rate, std = first.lr_schedule(remaining), first.delta_std_schedule(remaining)
             deltas = self._drawn()

@@ -35,8 +35,21 @@ class Stack(ABC):
     def act(self, wait: Callable[[], None]) -> None:
         """Act for ever without noise, learning nothing."""
         while True:
+            self._reached()
             self._inputs.hand_in(self._best(self._inputs.observed(learning=False)))
             wait()
+
+    @property
+    def _resuming(self) -> bool:
+        """Whether the learners go on from where they were saved, and have not come there yet."""
+        return any(each.boundary.resuming for each in self.members)
+
+    def _reached(self) -> None:
+        """Let the members be saved, or go on."""
+        if any(each.boundary.folder is not None for each in self.members):
+            self.give()
+        for each in self.members:
+            each.boundary.reached()
 
     def give(self) -> None:
         """Bring models, normalisers and random streams up to date, as if each learner had learnt by itself."""

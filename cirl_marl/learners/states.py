@@ -1,0 +1,185 @@
+"""What an algorithm of Stable-Baselines3 has in it between two rollouts: all that it goes on from, bit for bit."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+
+from cirl_marl.errors import RunError
+from cirl_marl.learners.algorithms import RESERVED, parameters_of
+from cirl_marl.learners.trees import is_plain
+
+MATRICES = ("exploration_mat", "exploration_matrices")
+"""Noise that depends on the state, drawn at the beginning of a rollout."""
+
+
+def model_state(model: BaseAlgorithm) -> dict[str, Any]:
+    """Return parameters, optimisers, counters, last observations, noise and stream of actions, without the buffer."""
+    settings = {*parameters_of(type(model).__name__), *RESERVED, "start_time"}
+    return {
+        "parameters": model.get_parameters(),
+        "variables": variables(model),
+        "values": {k: v for k, v in vars(model).items() if k not in settings and _is_progress(v)},
+        "noise": [_plain_of(noise) for noise in _noises(model)],
+        "matrices": [{name: getattr(each, name) for name in MATRICES} for each in _explorers(model)],
+        "action_stream": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def set_model_state(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
+    """Bring a model that was built alike into a state of ``model_state``."""
+    model.set_parameters(dict(state["parameters"]), exact_match=True, device=model.device)
+    set_variables(model, state["variables"])
+    for name, value in state["values"].items():
+        setattr(model, name, _like(getattr(model, name, None), value))
+    for noise, values in zip(_noises(model), state["noise"], strict=True):
+        for name, value in values.items():
+            setattr(noise, name, value)
+    for each, matrices in zip(_explorers(model), state["matrices"], strict=True):
+        for name, value in matrices.items():
+            setattr(each, name, value)
+    model.action_space.np_random.bit_generator.state = state["action_stream"]
+
+
+def variables(model: BaseAlgorithm) -> dict[str, Any]:
+    """Return what is learnt beside the networks, such as an entropy coefficient."""
+    return {name: attrgetter(name)(model) for name in model._get_torch_save_params()[1]}
+
+
+def set_variables(model: BaseAlgorithm, told: Mapping[str, Any]) -> None:
+    """Bring what is learnt beside the networks into a state."""
+    for name, own in variables(model).items():
+        own.data.copy_(told[name])
+
+
+def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
+    """Return what is in a replay buffer, without the room that is left."""
+    used = buffer.buffer_size if buffer.full else buffer.pos
+    found = {name: value for name, value in vars(buffer).items() if is_plain(value)}
+    return {name: _first(value, used, buffer.buffer_size) for name, value in found.items()}
+
+
+def set_buffer_state(buffer: ReplayBuffer, state: Mapping[str, Any]) -> None:
+    """Fill an empty buffer; a ``ValueError`` if it is one of other observations, actions or rows."""
+    for name, value in state.items():
+        now = getattr(buffer, name)
+        parts = value.items() if isinstance(value, dict) else [(None, value)]
+        for key, part in parts:
+            into = now if key is None else now[key]
+            if isinstance(into, np.ndarray):
+                if into.shape[1:] != part.shape[1:] or len(part) > len(into):
+                    raise ValueError(f"holds what another learner saw: {name} of shape {part.shape}, not {into.shape}")
+                into[: len(part)] = part
+            else:
+                setattr(buffer, name, part)
+
+
+def normaliser_state(env: VecNormalize) -> dict[str, Any]:
+    """Return the moments of observations and rewards, and the discounted returns under way, as plain numbers."""
+    seen = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
+    kept = seen if env.norm_obs else {}
+    return {
+        "observations": {key: _moments(each) for key, each in kept.items()},
+        "rewards": _moments(env.ret_rms),
+        "returns": _numbers(env.returns),
+    }
+
+
+def set_normaliser_state(env: VecNormalize, state: Mapping[str, Any], *, returns: bool = True) -> None:
+    """Bring a normaliser into a state; a ``RunError`` if it sees something else."""
+    seen = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
+    known = seen if env.norm_obs else {}
+    if set(known) != set(state["observations"]):
+        raise RunError(f"normalises {sorted(state['observations'])}, not {sorted(known)}")
+    for own, told in ((env.ret_rms, state["rewards"]), *((known[key], state["observations"][key]) for key in known)):
+        mean, var = _array(told["mean"]), _array(told["var"])
+        if np.shape(own.mean) != mean.shape:
+            raise RunError(f"is for {mean.size} entries, not {np.size(own.mean)}")
+        own.mean, own.var, own.count = mean, var, told["count"]
+    if returns:
+        env.returns = _array(state["returns"])
+
+
+class Settled(RunningMeanStd):
+    """Statistics that no longer follow what is seen."""
+
+    def __init__(self, known: RunningMeanStd) -> None:
+        """Stay with what is ``known``."""
+        super().__init__(shape=known.mean.shape)
+        self.mean, self.var, self.count = known.mean.copy(), known.var.copy(), known.count
+
+    def update_from_moments(self, batch_mean: Any, batch_var: Any, batch_count: float) -> None:
+        """Do nothing."""
+
+
+def settle(env: VecNormalize) -> None:
+    """Let the statistics of observations stay as they are."""
+    known: Any = env.obs_rms
+    settled = {key: Settled(each) for key, each in known.items()} if isinstance(known, dict) else Settled(known)
+    env.obs_rms = settled  # type: ignore[assignment]
+
+
+def _moments(moments: RunningMeanStd) -> dict[str, Any]:
+    return {"mean": _numbers(moments.mean), "var": _numbers(moments.var), "count": float(moments.count)}
+
+
+def _numbers(array: Any) -> dict[str, Any]:
+    found = np.asarray(array)
+    return {"type": found.dtype.name, "values": found.tolist()}
+
+
+def _array(told: Mapping[str, Any]) -> Any:
+    if told["type"] not in ("float32", "float64"):
+        raise ValueError(f"numbers of type {told['type']!r}")
+    return np.array(told["values"], dtype=told["type"])
+
+
+def _is_progress(value: object) -> bool:
+    """Return whether an attribute tells how far a model is: lists alone do not, which hold parts of its networks."""
+    return _is_observation(value) or (not isinstance(value, list | Mapping | str) and is_plain(value))
+
+
+def _is_observation(value: object) -> bool:
+    return isinstance(value, dict) and bool(value) and all(isinstance(each, np.ndarray) for each in value.values())
+
+
+def _like(now: Any, value: Any) -> Any:
+    """Return a value as what the attribute is now: a queue of the same length, a named tuple of the same kind."""
+    if isinstance(now, deque):
+        return deque(value, maxlen=now.maxlen)
+    if isinstance(now, tuple) and hasattr(now, "_fields"):
+        return type(now)(*value)
+    return value
+
+
+def _plain_of(part: object) -> dict[str, Any]:
+    return {name: value for name, value in vars(part).items() if isinstance(value, np.ndarray)}
+
+
+def _noises(model: BaseAlgorithm) -> Iterator[Any]:
+    """Yield what draws the noise of actions; one of each row if there are several."""
+    noise = getattr(model, "action_noise", None)
+    if noise is not None:
+        yield from getattr(noise, "noises", [noise])
+
+
+def _explorers(model: BaseAlgorithm) -> list[Any]:
+    """Return distributions whose noise depends on the state."""
+    parts = (model.policy, getattr(model.policy, "actor", None))
+    found = [getattr(part, "action_dist", None) for part in parts]
+    return [each for each in found if isinstance(getattr(each, MATRICES[0], None), torch.Tensor)]
+
+
+def _first(value: Any, used: int, size: int) -> Any:
+    if isinstance(value, dict):
+        return {key: _first(each, used, size) for key, each in value.items()}
+    return value[:used] if isinstance(value, np.ndarray) and value.ndim and len(value) == size else value

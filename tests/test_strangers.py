@@ -1,0 +1,211 @@
+"""Run directories from strangers: nothing in them runs code, and nothing outside of them is read or written."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cirl_marl import CirlError, RunError
+from cirl_marl.learners import Recipe, RunDirectory, resume, train
+from cirl_marl.learners.trained import Trained
+
+pytestmark = pytest.mark.medium
+
+SOURCES = Path(__file__).parent.parent / "cirl_marl"
+OPENERS = re.compile(
+    r"\b(pickle|cloudpickle|dill|joblib|shelve|marshal)\b|torch\.load|allow_pickle|\.load_replay_buffer|VecNormalize\.load|\beval\(|\bexec\("
+)
+
+
+class Planted:
+    """What runs code when it is unpickled."""
+
+    def __init__(self, proof: Path) -> None:
+        """Leave ``proof`` behind."""
+        self.proof = proof
+
+    def __reduce__(self) -> tuple[object, ...]:  # noqa: D105 (pickle calls it)
+        return os.system, (f"touch {self.proof}",)
+
+
+def test_no_source_opens_what_can_run_code() -> None:
+    """Nowhere in the package is a format read that can hold code."""
+    said = [
+        f"{path.name}:{number}: {line.strip()}"
+        for path in sorted(SOURCES.rglob("*.py"))
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if OPENERS.search(line.split("#")[0]) and '"""' not in line
+    ]
+    assert [line for line in said if not line.startswith("exporting.py")] == []
+
+
+def metrics(run: Path) -> object:
+    """Read the episodes of a run."""
+    return RunDirectory(run).metrics()
+
+
+def resumed(run: Path) -> object:
+    """Go on with a run."""
+    return resume(run, steps=64)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run that was stopped, with everything that a run can hold."""
+    recipe = Recipe.model_validate(
+        {
+            "name": "stopped", "title": "stopped",
+            "run": {"steps": 60, "envs": 1, "engine": "lockstep", "evaluations": 3, "episodes": 2},
+            "learner": {
+                "algorithm": "SAC", "parameters": {"learning_starts": 4, "buffer_size": 20, "batch_size": 2},
+                "normalise": {"observation": True, "reward": True},
+            },
+        }
+    )  # fmt: skip
+    folder = tmp_path_factory.mktemp("runs") / "stopped"
+    train("copper_net", recipe, directory=folder, agents=["mine"], horizon=5)
+    status = json.loads((folder / "status.json").read_text())
+    (folder / "status.json").write_text(json.dumps(status | {"state": "interrupted"}))
+    return folder
+
+
+@pytest.mark.parametrize("form", ["pickle", "nested", "nul", "empty"])
+def test_hostile_files_run_nothing(form: str, stopped: Path, tmp_path: Path) -> None:
+    """Every file of a run, replaced by code or nonsense: an error of ours or no harm, and never the code."""
+    proof = tmp_path / "proof"
+    bytes_ = {"pickle": pickle.dumps(Planted(proof)), "nested": b"[" * 100_000, "nul": b"\0" * 99, "empty": b""}[form]
+    files = [path.relative_to(stopped) for path in sorted(stopped.rglob("*")) if path.is_file()]
+    tried = [path for path in files if path.suffix in (".json", ".safetensors", ".csv", ".toml")]
+    assert len(tried) >= 12
+    for number, file in enumerate(tried):
+        run = tmp_path / f"run{number}"
+        shutil.copytree(stopped, run)
+        (run / file).write_bytes(bytes_)
+        for use in (Trained, metrics, resumed):
+            try:
+                use(run)
+            except CirlError as error:
+                assert str(run) in str(error)
+        assert not proof.exists(), file
+        shutil.rmtree(run)
+
+
+@pytest.mark.parametrize("name", ["../../outside", "/tmp/outside", "..", "000000060-complete/../../../outside", ""])
+def test_names_that_lead_out_are_refused(name: str, stopped: Path, tmp_path: Path) -> None:
+    """Of checkpoints in the status, whoever reads it."""
+    run = tmp_path / "run"
+    shutil.copytree(stopped, run)
+    (outside := tmp_path / "outside").mkdir()
+    (outside / "precious").write_text("kept")
+    status = json.loads((run / "status.json").read_text())
+    best = status["best"] | {"checkpoint": name}
+    for changed in ({"checkpoint": name, "best": None}, {"best": best}):
+        (run / "status.json").write_text(json.dumps(status | changed))
+        with pytest.raises(RunError, match="is no name of a checkpoint"):
+            Trained(run)
+    assert (outside / "precious").read_text() == "kept"
+
+
+def test_links_are_not_followed(stopped: Path, tmp_path: Path) -> None:
+    """A link at any place of a run is named, and what it leads to stays as it is."""
+    places = [path.relative_to(stopped) for path in sorted(stopped.rglob("*"))]
+    for number, place in enumerate([*places, Path("next"), Path("checkpoints/next.partial"), Path(".lock")]):
+        run, outside = tmp_path / f"run{number}", tmp_path / f"outside{number}"
+        shutil.copytree(stopped, run)
+        target = run / place
+        if target.is_dir():
+            target.rename(outside)
+        elif target.exists():
+            outside.mkdir()
+            target.rename(outside / "file")
+        else:
+            outside.mkdir()
+        before = {path: path.read_bytes() for path in outside.rglob("*") if path.is_file()}
+        target.symlink_to(outside / "file" if (outside / "file").is_file() else outside)
+        for use in (Trained, resumed):
+            with pytest.raises(RunError, match="is a link"):
+                use(run)
+        assert {path: path.read_bytes() for path in outside.rglob("*") if path.is_file()} == before
+        shutil.rmtree(run)
+
+
+def test_a_network_that_was_edited_is_refused_before_anything_is_trained(stopped: Path, tmp_path: Path) -> None:
+    """And strangers among the checkpoints change nothing."""
+    run = tmp_path / "run"
+    shutil.copytree(stopped, run)
+    (run / "checkpoints" / "notes.txt").write_text("mine")
+    Trained(run)
+    text = (run / "network.toml").read_text()
+    (run / "network.toml").write_text(text.replace("horizon", "horizon ", 1))
+    for use in (Trained, resumed):
+        with pytest.raises(RunError, match=r"network\.toml: is not the file of this training"):
+            use(run)
+    assert (run / "checkpoints" / "notes.txt").read_text() == "mine"
+
+
+KILLED = """
+import os, signal, sys
+from cirl_marl.learners import Recipe, train, resume
+from cirl_marl.learners import training
+import cirl_marl.records.files as files, cirl_marl.learners.run as run_module
+from pathlib import Path
+
+directory, at = sys.argv[1], int(sys.argv[2])
+count = 0
+def killed_before(function):
+    def run(*args, **kwargs):
+        global count
+        count += 1
+        if count == at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*args, **kwargs)
+    return run
+for name in ("replace", "mkdir", "write_text", "unlink"):
+    setattr(Path, name, killed_before(getattr(Path, name)))
+recipe = Recipe.model_validate({"name": "k", "title": "k",
+    "run": {"steps": 48, "envs": 2, "evaluations": 4, "episodes": 2},
+    "learner": {"algorithm": "PPO", "parameters": {"n_steps": 6, "batch_size": 6, "policy_kwargs": {"net_arch": [4]}}}})
+if not (Path(directory) / "config.json").is_file():
+    train("copper_net", recipe, directory=directory, agents=["mine", "use"], horizon=5, seed=1)
+else:
+    resume(directory)
+"""
+
+
+@pytest.mark.slow
+def test_a_training_that_is_killed_at_any_file_operation(tmp_path: Path) -> None:
+    """SIGKILL before each of them, and taken up again: the same bits in the end."""
+    script = tmp_path / "train.py"
+    script.write_text(KILLED)
+
+    def run(folder: Path, at: int) -> int:
+        done = subprocess.run([sys.executable, script, folder, str(at)], check=False, capture_output=True, text=True)
+        assert done.returncode in (0, -9), done.stderr
+        return done.returncode
+
+    def kept(folder: Path) -> dict[str, bytes]:
+        chosen = RunDirectory(folder).checkpoint
+        return {path.name: path.read_bytes() for path in chosen.iterdir()} | {
+            "evaluations": (folder / "evaluations.csv").read_bytes()
+        }
+
+    assert run(tmp_path / "whole", 0) == 0
+    whole, at, killed = kept(tmp_path / "whole"), 1, 1
+    while killed:
+        folder = tmp_path / f"killed{at}"
+        killed = run(folder, at)
+        for _ in range(3):
+            if killed and run(folder, 0) == 0:
+                break
+        assert kept(folder) == whole, at
+        shutil.rmtree(folder)
+        at += 7
+    assert at > 50
