@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo check test test-all written lint types wheel fast unit every study planner speed clean
+.PHONY: demo check test test-all written lint types wheel fast unit every fuzz study planner speed clean
 
 demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
 	rm -rf runs/demo
@@ -45,6 +45,9 @@ wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clea
 
 written: $(VENV)/.runtime  ## the JSON schema of networks and docs/format.md, from the declarations of fields
 	$(BIN)/python -m cirl_marl.definitions.guide
+
+fuzz: $(VENV)/.dev  ## 10 000 mutated definitions and recipes, each refused or one that works (half an hour)
+	$(BIN)/python tests/fuzz.py 10000
 
 study: $(VENV)/.runtime  ## every recipe and controller on every network, against the bound (hours; it can be stopped)
 	$(BIN)/python benchmarks/study.py

@@ -4,8 +4,8 @@ Compartments of a thermodynamical material network are agents, coupled by the ma
 reward is the circularity λ(N;t) of the network.
 
 >>> import cirl_marl
->>> cirl_marl.networks()
-['carbo_net', 'copper_net', 'net_zero', 'solids_net']
+>>> cirl_marl.networks()[:3]
+['carbo_net', 'copper_net', 'net_zero']
 """
 
 from cirl_marl.definitions.catalogue import load_network, networks, recipes

@@ -115,7 +115,7 @@ def shown_commands(text: str) -> Iterator[str]:
     parts = [part.strip() for line in lines for part in line.split("&&")]
     for line in parts + spans(text):
         if line.startswith("cirl "):
-            yield line.split("  #")[0].replace("…", "")
+            yield line.split("  #")[0].replace("…", "").replace("cirl --allow-code ", "cirl ")
 
 
 @each_document

@@ -5,17 +5,26 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import random
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from fuzz import fuzzed
+from test_own_models import brewery
 
-from cirl_marl import CirlError, RunError
+from cirl_marl import CirlError, RunError, VectorEnv, load_network, single_agent_env
+from cirl_marl.cli import main
+from cirl_marl.definitions.catalogue import folder
+from cirl_marl.definitions.reading import write_network
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners.trained import Trained
+from cirl_marl.network.units import factor
 
 pytestmark = pytest.mark.medium
 
@@ -151,6 +160,42 @@ def test_a_network_that_was_edited_is_refused_before_anything_is_trained(stopped
     assert (run / "checkpoints" / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    "unit",
+    ["9**9**9 kg", "(9**99)**99 kg", "((kg**9)**9)**9", "kg**999999999", "((((kg", "(" * 60 + "kg", "k" * 10**6,
+     "9" * 5000 + " kg", "kg^9^9", "2**99*kg", "kg**(9**9)", "[" * 90, "kg**-9**9", "1e999 kg", "kg\x00"],
+)  # fmt: skip
+def test_units_from_strangers(unit: str) -> None:
+    """None takes long or ends in an error that is not ours, and what people write goes on to work."""
+    with pytest.raises(CirlError, match=r"^unit '"):
+        factor(unit, "kg")
+    for good in ("kg/day", "kg*m**2/s^2", "t/year", "1/day", "m**-3", "W/m**2", "(kg/m)**2", "g/(l*day)"):
+        factor(good, good)
+
+
+def test_definitions_import_nothing_unless_they_may(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Models of somebody else are imported when that is allowed, and then what ends a process is an error."""
+    name = f"stranger_{os.getpid()}"
+    (tmp_path / f"{name}.py").write_text(
+        f"import pathlib\npathlib.Path({str(tmp_path / 'proof')!r}).touch()\nraise SystemExit(3)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    path = tmp_path / "brewery.toml"
+    write_network(brewery(), path)
+    path.write_text(path.read_text().replace("own_models:", f"{name}:"))
+    for use in (lambda: load_network(path), lambda: VectorEnv(path, num_envs=1)):
+        with pytest.raises(CirlError, match=rf"kind '{name}:Fermenter' would import '{name}'.*--allow-code"):
+            use()
+    assert not (tmp_path / "proof").exists()
+    with pytest.raises(CirlError, match="importing it failed: SystemExit: 3"):
+        load_network(path, allow_code=True)
+    assert (tmp_path / "proof").exists()
+    monkeypatch.setattr(sys, "argv", ["cirl", "check", str(path)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+
+
 KILLED = """
 import os, signal, sys
 from cirl_marl.learners import Recipe, train, resume
@@ -209,3 +254,39 @@ def test_a_training_that_is_killed_at_any_file_operation(tmp_path: Path) -> None
         shutil.rmtree(folder)
         at += 7
     assert at > 50
+
+
+def test_mutated_definitions_are_refused_or_work() -> None:
+    """500 of them, others each time unless in continuous integration; ``make fuzz`` tries 10 000."""
+    seed = 0 if "CI" in os.environ else random.SystemRandom().randrange(10**6)
+    found = fuzzed(500, seed)
+    assert found["refused"] > 100 and found["works"] > 30
+    assert not found["without the file's name"]
+    assert not found["slow"]
+
+
+def test_what_is_no_network_agent_or_seed(tmp_path: Path) -> None:
+    """Errors are of ours, also for what nobody would write by mistake."""
+    text = (folder("envs") / "copper_net.toml").read_text()
+    (path := tmp_path / "x.toml").write_text(text)
+    env, alone = VectorEnv(path, num_envs=1), single_agent_env("copper_net", agent="mine")
+    wrong: list[tuple[Any, str]] = [
+        (lambda: load_network("a\0b.toml"), "no name of a network"),
+        (lambda: load_network(path, scenario=[]), "unknown scenario"),  # type: ignore[arg-type]
+        (lambda: VectorEnv(path, num_envs=1, agents=[["mine"]]), "agents must be a sequence of ids"),  # type: ignore[list-item]
+        (lambda: env.restore(None), "a snapshot is needed"),  # type: ignore[arg-type]
+        *((lambda seed=seed: alone.reset(seed=seed), "must be a non-negative integer") for seed in (-1, "a", 1.5, [1])),
+    ]
+    for bad, said in wrong:
+        with pytest.raises(CirlError, match=said):
+            bad()
+    first = alone.reset(seed=np.int64(3))[0]  # type: ignore[arg-type]
+    np.testing.assert_array_equal(first, alone.reset(seed=3)[0])
+    for line, said in (
+        ("x = " + "[" * 5000 + "]" * 5000, "nested too deeply"),
+        ("x = " + "9" * 5000, "a number cannot be read"),
+        ("x = " + "9" * 30, "x: is an integer of 30 digits"),
+    ):
+        path.write_text(line + "\n" + text)
+        with pytest.raises(CirlError, match=said):
+            load_network(path)

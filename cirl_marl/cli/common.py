@@ -13,12 +13,12 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from cirl_marl.definitions.permission import code_allowed
 from cirl_marl.definitions.reading import DEFAULT
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 
 app = typer.Typer(
-    help="Material networks whose compartments learn to raise circularity.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -26,6 +26,18 @@ app = typer.Typer(
 # without emoji=False rich prints a flag or a map for the region of FILE.toml:japan:
 console = Console(width=None if sys.stdout.isatty() else 140, emoji=False)
 errors = Console(stderr=True, emoji=False)
+
+
+@app.callback()
+def everywhere(
+    context: typer.Context,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Let definitions import the models of their own that they name.")
+    ] = False,
+) -> None:
+    """Material networks whose compartments learn to raise circularity."""
+    context.with_resource(code_allowed(allow_code))
+
 
 NetworkName = Annotated[
     str, typer.Argument(metavar="NETWORK", help="Name in the catalogue, or a file: FILE.toml, FILE.toml:REGION.")

@@ -114,7 +114,7 @@ def _elsewhere(place: str) -> type[Any]:
         lost = isinstance(error, ModuleNotFoundError) and error.name == module.split(".")[0]
         remedy = "; install it, or run with PYTHONPATH pointing to the folder that it lies in" if lost else ""
         raise CirlError(f"compartment kind '{place}': {error}{remedy}") from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise CirlError(f"compartment kind '{place}': importing it failed: {type(error).__name__}: {error}") from error
     if not isinstance(found, type):
         raise CirlError(f"compartment kind '{place}': is no class of compartment models, but {found!r}")

@@ -5,9 +5,10 @@ In a wheel they lie inside the package; in a checkout or an editable install bes
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 
+from cirl_marl.definitions.permission import code_allowed
 from cirl_marl.definitions.reading import Definition
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Network
@@ -46,17 +47,21 @@ def recipes() -> list[str]:
     return sorted(path.stem for path in folder("agents").glob("*.toml"))
 
 
-def load_network(name: str | Path, *, scenario: str | None = None) -> Network:
+def load_network(name: str | Path, *, scenario: str | None = None, allow_code: bool = False) -> Network:
     """Return a network of the catalogue, or of a definition file if ``name`` ends in ``.toml`` or ``.toml:REGION``.
 
-    It is under ``scenario``; None is the default, physical one.
+    It is under ``scenario``; None is the default, physical one. With ``allow_code`` the file may name models of its
+    own, whose modules are then imported; those that are imported already need no leave.
 
     Raises:
         DefinitionError: if the file has mistakes; all are named.
         CirlError: if there is no such network or scenario.
     """
+    if "\0" in str(name):
+        raise CirlError(f"{str(name)!r} is no name of a network or file: it has a character without a sign")
     path, region = file_and_region(str(name)) or _in_catalogue(str(name))
-    return _definition(path).network(region=region).scenario(scenario)
+    with code_allowed(allow_code):
+        return _definition(path).network(region=region).scenario(scenario)
 
 
 def file_and_region(name: str) -> tuple[Path, str] | None:
@@ -101,7 +106,7 @@ def _definition(path: Path) -> Definition:
     return found
 
 
-@cache
+@lru_cache(maxsize=64)
 def _read(path: Path, stamp: int) -> Definition:
     del stamp  # part of the cache key, so that an edited file is read again
     return Definition(path)

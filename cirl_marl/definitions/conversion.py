@@ -11,6 +11,7 @@ import numpy as np
 from cirl_marl.compartments import CompartmentModel, model_class
 from cirl_marl.definitions.columns import DataFiles
 from cirl_marl.definitions.mistakes import parameter_mistakes
+from cirl_marl.definitions.permission import refusal
 from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, QuantityTable, Range
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
 from cirl_marl.definitions.series import Clock, column_value, inline_series, product
@@ -170,6 +171,9 @@ class Converter:
         if table is None:
             return {}
         form = {} if table.form is None else {"form": table.form}
+        if (why := refusal(table.kind)) is not None:
+            self.mistakes.append(f"{where}: {why}")
+            return {}
         try:
             kind = model_class(table.kind)
             if mistakes := list(parameter_mistakes(kind, table.parameters, form)):
@@ -249,8 +253,7 @@ class Converter:
         if deviation is not None and relative is None:
             relative = deviation * unit / middle if middle > 0 else 0.0
         if middle <= 0 or (relative is not None and relative <= 0):
-            shown = deviation if isinstance(deviation, str) else f"{deviation:g}"
-            told = f"deviation {shown}" if middle > 0 else f"the number is {middle / unit:g}"
+            told = f"deviation {deviation}" if middle > 0 else f"the number is {middle / unit:g}"
             self.mistakes.append(f"{where}: {told}: what spreads, and its deviation, must be positive")
             return
         low, high = (0.0, math.inf) if span is None else (float(end * unit / middle) for end in span)

@@ -23,6 +23,8 @@ from cirl_marl.records.files import write_atomically
 
 DEFAULT = "default"
 """The scenario that stands outside ``[scenarios]``."""
+LARGEST = 64 * 2**20
+"""Bytes of the largest definition that is read."""
 FIXED = ("name", "regions", "scenarios")
 """What is the same in every scenario."""
 
@@ -137,15 +139,33 @@ def write_network(network: Network, path: Path) -> None:
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; a ``DefinitionError`` says if it is missing, unreadable or not TOML, with line and column."""
     try:
+        if path.stat().st_size > LARGEST:
+            raise DefinitionError(str(path), [f"has more than {LARGEST >> 20} MiB; keep long tables in CSV files"])
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise DefinitionError(str(path), ["no such file"]) from None
     except (OSError, UnicodeDecodeError) as error:
         raise DefinitionError(str(path), [f"cannot be read: {error}"]) from error
     try:
-        return tomllib.loads(text)
+        document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise DefinitionError(str(path), [toml_mistake(error, text)]) from error
+    except RecursionError:
+        raise DefinitionError(str(path), ["tables or lists are nested too deeply"]) from None
+    except ValueError as error:  # an integer of thousands of digits
+        raise DefinitionError(str(path), [f"a number cannot be read: {error}"]) from error
+    if mistakes := list(_too_long(document, "")):
+        raise DefinitionError(str(path), mistakes)
+    return document
+
+
+def _too_long(value: Any, where: str) -> Iterator[str]:
+    """Yield where integers are that no TOML file may hold."""
+    if isinstance(value, dict | list):
+        for key, each in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _too_long(each, f"{where}.{key}".lstrip("."))
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        yield f"{where}: is an integer of {len(str(value))} digits; more than 18 are not possible"
 
 
 def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:

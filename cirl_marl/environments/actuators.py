@@ -130,7 +130,7 @@ def wrong_shape(agent: str, shape: tuple[int, ...], expected: tuple[int, ...]) -
 def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:
     if agents is None:
         chosen = network.agents
-    elif isinstance(agents, str) or not isinstance(agents, Sequence):
+    elif isinstance(agents, str) or not isinstance(agents, Sequence) or not all(isinstance(a, str) for a in agents):
         raise CirlError(f"agents must be a sequence of ids in a fixed order, such as a list, not {agents!r}")
     else:
         chosen = tuple(agents)

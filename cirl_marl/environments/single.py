@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.parallel import OPTIONS, NetworkParallelEnv, check_options
 from cirl_marl.environments.state import Snapshot
-from cirl_marl.errors import CirlError
+from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Network
 
 SHARED = ("reward", "render_mode")
@@ -88,8 +88,10 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode; ``options={"initial_state": …}`` takes a mapping or, in the paper scenarios, an array."""
-        super().reset(seed=seed)
+        if seed is not None and not isinstance(seed, int | np.integer):
+            raise ControlError(f"seed {seed!r} must be a non-negative integer")
         observations, infos = self.parallel.reset(seed=seed, options=options)
+        super().reset(seed=None if seed is None else int(seed))
         return observations[self.agent], {**infos[self.agent], "state": self._paper_state()}
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:

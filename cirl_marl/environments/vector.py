@@ -292,6 +292,8 @@ class VectorEnv:
 
     def restore(self, snapshot: Snapshot) -> _Seen:
         """Go back to a snapshot, which must be of the same network, horizon, batch size and agents, and observe."""
+        if not isinstance(snapshot, Snapshot):
+            raise ControlError(f"a snapshot is needed, as ``snapshot()`` returns it, got {type(snapshot).__name__}")
         snapshot.check(self.network, self.num_envs, self.agents, uncertain=self.uncertain)
         self._starts.restore_streams(snapshot.streams)
         self._state = snapshot.state.copied()

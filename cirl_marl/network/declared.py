@@ -94,6 +94,10 @@ class Kinds(NamedTuple):
     otherwise: Kind
 
 
+SMALLEST, LARGEST = 1e-100, 1e100
+"""Sizes of numbers of which squares and quotients are finite."""
+
+
 @itemised
 @dataclass(frozen=True, slots=True)
 class Quantity(Declared):
@@ -122,6 +126,8 @@ class Quantity(Declared):
 
     def bound_problem(self, value: float) -> str:
         """Return what a number out of its bounds must be; nothing if it is within."""
+        if math.isfinite(value) and value and not SMALLEST <= abs(value) <= LARGEST:
+            return f"must be 0, or between {SMALLEST:g} and {LARGEST:g} in size"
         within = self.low <= value <= self.high and (value > 0 or not self.positive)
         if self.joint or (math.isfinite(value) and within):
             return ""

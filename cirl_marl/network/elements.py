@@ -387,7 +387,7 @@ class Episode(Checked):
     """Time and solver of an episode."""
 
     control_interval: Annotated[float, Positive("h, time between two decisions", of="time", required=True)] = 1.0
-    horizon: Annotated[int, Quantity("decisions per episode", of="steps", low=1, required=True)] = 50
+    horizon: Annotated[int, Quantity("decisions per episode", of="steps", low=1, high=10_000_000, required=True)] = 50
     solver: Annotated[
         str,
         Word(

@@ -59,7 +59,7 @@ class Network(Parts):
         """Return this network under scenario ``name`` (None: as it is); a ``CirlError`` lists those there are."""
         if name is None or name == self.scenario_name:
             return self
-        if name not in self.scenarios:
+        if not isinstance(name, str) or name not in self.scenarios:
             known = sorted({self.scenario_name, *self.scenarios})
             hint = "" if self.scenarios else " A network with other options has no other scenarios: choose it first."
             raise CirlError(f"network '{self.name}': {unknown('scenario', name, known)}{hint}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tokenize
 from functools import cache
 
 import pint
@@ -39,6 +40,32 @@ MISSPELT = {"y": "year", "T": "t (tonne)", "MT": "Mt (megatonne)"} | dict.fromke
 """Symbols that are written for a unit, and are none or another."""
 
 
+UNREADABLE = (
+    pint.errors.PintError, ArithmeticError, AssertionError, AttributeError, RecursionError, TypeError, ValueError,
+    tokenize.TokenError,
+)  # fmt: skip
+"""What pint raises for texts that are no units."""
+LONGEST = 100
+"""Characters of the longest unit."""
+POWER = r"(\*\*|\^)"
+
+
+def _check_form(unit: str) -> None:
+    """Refuse what no unit needs before it is computed with, such as powers of powers, which take for ever."""
+    powers = len(re.findall(POWER, unit))
+    why = None
+    if not unit.isprintable():
+        why = f"{unit[:LONGEST]!r} has characters that cannot be printed"
+    elif len(unit) > LONGEST:
+        why = f"it has {len(unit)} characters, and {LONGEST} are enough"
+    elif re.search(rf"(?<![^\W\d])\b[\d.]+\s*\)*\s*{POWER}|{POWER}[^*^]*\)\s*{POWER}", unit) or powers > 9:
+        why = "powers are those of units, as in m**3"
+    elif re.search(rf"{POWER}\s*[-+(\s]*\d{{3}}|\d{{16}}", unit):
+        why = "it has a number too long for a unit"
+    if why is not None:
+        raise CirlError(f"unit '{unit[:LONGEST]}': {why}; write units as in kg, t/day, 1/day or m**3")
+
+
 @cache
 def factor(unit: str, target: str) -> float:
     """Return the number by which values in ``unit`` are multiplied to be in ``target``.
@@ -51,6 +78,7 @@ def factor(unit: str, target: str) -> float:
     >>> factor("Mt", "kt")
     1000.0
     """
+    _check_form(unit)
     for symbol in re.findall(r"[^\W\d]\w*", unit):
         instead = _ambiguity(symbol)
         if instead is not None:
@@ -64,7 +92,7 @@ def factor(unit: str, target: str) -> float:
         zero, one = (float(registry.Quantity(value, unit).to(target).magnitude) for value in (0.0, 1.0))
     except pint.errors.DimensionalityError as error:
         raise CirlError(f"unit '{unit}' is inconsistent: a quantity in '{target}' is needed ({error})") from error
-    except (pint.errors.PintError, ArithmeticError, AssertionError, AttributeError, TypeError, ValueError) as error:
+    except UNREADABLE as error:
         form = "write units as in kg, t/day, 1/day or m**3"
         raise CirlError(f"unit '{unit}' cannot be read: {str(error) or 'it breaks off'}; {form}") from error
     if zero != 0.0:

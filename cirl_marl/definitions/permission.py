@@ -1,0 +1,31 @@
+"""Whether definitions may name code that is not imported yet. To read a file of somebody else must run nothing."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+_ALLOWED = ContextVar("_ALLOWED", default=False)
+
+
+@contextmanager
+def code_allowed(allowed: bool = True) -> Iterator[None]:
+    """Let definitions that are read in the block import the models that they name, if ``allowed``."""
+    token = _ALLOWED.set(allowed or _ALLOWED.get())
+    try:
+        yield
+    finally:
+        _ALLOWED.reset(token)
+
+
+def refusal(kind: str) -> str | None:
+    """Return why the model of that kind may not be imported; None if it may, or need not be."""
+    module = kind.partition(":")[0]
+    if ":" not in kind or _ALLOWED.get() or module in sys.modules:
+        return None
+    return (
+        f"kind '{kind}' would import '{module}', and run what it says; if you trust it, say so: "
+        "cirl --allow-code …, or load_network(…, allow_code=True)"
+    )
