@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo check test test-all written lint types wheel fast unit every fuzz study planner speed clean
+.PHONY: demo check test test-all written lint types wheel fast unit every fuzz kill study planner speed clean
 
 demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
 	rm -rf runs/demo
@@ -48,6 +48,9 @@ written: $(VENV)/.runtime  ## the JSON schema of networks and docs/format.md, fr
 
 fuzz: $(VENV)/.dev  ## 10 000 mutated definitions and recipes, each refused or one that works (half an hour)
 	$(BIN)/python tests/fuzz.py 10000
+
+kill: $(VENV)/.dev  ## trainings of every kind, killed 100 times at random and taken up again (half an hour)
+	$(BIN)/python tests/kill.py 100
 
 study: $(VENV)/.runtime  ## every recipe and controller on every network, against the bound (hours; it can be stopped)
 	$(BIN)/python benchmarks/study.py

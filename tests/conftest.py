@@ -87,13 +87,13 @@ def make_network() -> Callable[[int, int, int], Network]:
 
 
 @pytest.fixture
-def ctrl_c_after() -> Callable[[int], Callable[[Progress], None]]:
-    """Return ``ctrl_c_after(env_steps)``, which is to be reported to by ``train`` and then interrupts it."""
+def ctrl_c_after() -> Callable[..., Callable[[Progress], None]]:
+    """Return ``ctrl_c_after(env_steps, signal)``, which is to be reported to by ``train`` and then interrupts it."""
 
-    def reports_to(env_steps: int) -> Callable[[Progress], None]:
+    def reports_to(env_steps: int, which: int = signal.SIGINT) -> Callable[[Progress], None]:
         def report(progress: Progress) -> None:
             if progress.env_steps == env_steps:
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), which)
 
         return report
 

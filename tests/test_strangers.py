@@ -25,6 +25,7 @@ from cirl_marl.definitions.reading import write_network
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners.trained import Trained
 from cirl_marl.network.units import factor
+from cirl_marl.report import run as report_run
 
 pytestmark = pytest.mark.medium
 
@@ -290,3 +291,37 @@ def test_what_is_no_network_agent_or_seed(tmp_path: Path) -> None:
         path.write_text(line + "\n" + text)
         with pytest.raises(CirlError, match=said):
             load_network(path)
+
+
+def test_figures_are_shown_where_they_cannot_be_kept(
+    stopped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a disk that is full or read-only."""
+    run = tmp_path / "run"
+    shutil.copytree(stopped, run)
+
+    def full(path: Path, value: object) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(report_run, "write_json", full)
+    monkeypatch.setattr(sys, "argv", ["cirl", "evaluate", str(run), "--episodes", "2"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code in (0, None)
+    printed = capsys.readouterr().out
+    assert "neutral" in printed and "No space left on device" in printed
+
+
+def test_other_versions_and_other_steps_are_told(stopped: Path, tmp_path: Path) -> None:
+    """A run that goes on with others is warned; a status that tells of other steps than its checkpoint is refused."""
+    run = tmp_path / "run"
+    shutil.copytree(stopped, run)
+    versions = json.loads((run / "versions.json").read_text())
+    (run / "versions.json").write_text(json.dumps(versions | {"numpy": "0.1"}))
+    with pytest.warns(UserWarning, match=r"other versions may give other bits: numpy 0\.1, now"):
+        resume(run, steps=64)
+    for steps in (-5, 10**9):
+        status = json.loads((run / "status.json").read_text())
+        (run / "status.json").write_text(json.dumps(status | {"joint_steps": steps}))
+        with pytest.raises(RunError, match="is not the status of a run"):
+            resume(run)

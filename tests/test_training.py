@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import tempfile
 from contextvars import ContextVar
 from pathlib import Path
@@ -311,11 +312,15 @@ def test_failure_names_the_agent_and_keeps_what_was_learnt(tmp_path: Path, ppo_r
     assert set(controller.act(env.reset(seed=0))) == set(env.agents)
 
 
-def test_interruption_saves_and_resumption_finishes(tmp_path: Path, mixed_recipe: Recipe, ctrl_c_after: Any) -> None:
-    """Ctrl-C saves everything; the run goes on from there, and a finished run is not run again."""
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interruption_saves_and_resumption_finishes(
+    which: int, tmp_path: Path, mixed_recipe: Recipe, ctrl_c_after: Any
+) -> None:
+    """Ctrl-C and requests to end save everything; the run goes on from there, and a finished run is not run again."""
     directory = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        train("copper_net", mixed_recipe, directory=directory, horizon=5, report=ctrl_c_after(30))
+        train("copper_net", mixed_recipe, directory=directory, horizon=5, report=ctrl_c_after(30, which))
+    assert signal.getsignal(which) in (signal.SIG_DFL, signal.default_int_handler)
     status = RunDirectory(directory).status
     assert status["state"] == "interrupted" and 15 <= status["joint_steps"] < 30
     assert not list(directory.rglob("*.partial*"))

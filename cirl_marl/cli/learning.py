@@ -130,6 +130,8 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     console.print(local_returns_table(figures))
     say(choice(RunDirectory(run)))
     _say_shortages(rollouts, env.network)
+    if "not_written" in figures:
+        say(f"evaluation.json could not be written: {figures['not_written']}")
     if "no_bound" in figures:
         say(f"gap to bound: {figures['no_bound']}")
 

@@ -7,6 +7,7 @@ import difflib
 import hashlib
 import tomllib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,9 @@ class Definition:
             example = f"as in {self.path.name}:{next(iter(self.regions), 'japan')}"
             which = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
             raise DefinitionError(str(self.path), [unknown("region", region, self.regions) if region else which])
+        if (name, region) not in self._built and name != DEFAULT and not self._overrides[name]:
+            like = self.network(DEFAULT, region)
+            self._built[name, region] = replace(like, scenario_name=name, scenarios=_Others(self, name, region))
         if (name, region) not in self._built:
             override, where = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
             mistakes = list(_strangers(self._document, override, where))

@@ -205,6 +205,8 @@ def resume(
     config = run.config
     with global_streams_claimed(), run.claimed():
         config = _extended(run, config, steps)
+        if others := run.other_versions():
+            warnings.warn(f"{run.path}: other versions may give other bits: {'; '.join(others)}", stacklevel=2)
         training, checkpoint = _gone_on(run, config, checkpoint_every)
         training.check_callbacks(callbacks or {})
         run.go_on(config, checkpoint)

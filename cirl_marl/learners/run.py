@@ -173,6 +173,8 @@ class RunDirectory:
         fits = isinstance(status, dict) and {"state", "joint_steps", "checkpoint"} <= set(status)
         fits = fits and status["state"] in STATES and type(status["joint_steps"]) is int and status["joint_steps"] >= 0
         fits = fits and isinstance(status["checkpoint"], str | None) and _is_best(status.setdefault("best", None))
+        if fits and status["checkpoint"] is not None and CHECKPOINT.fullmatch(status["checkpoint"]):
+            fits = status["joint_steps"] == steps_of(Path(status["checkpoint"]))
         if not fits:
             raise RunError(f"{self.path / 'status.json'}: is not the status of a run: {status!r}")
         return status
@@ -183,6 +185,13 @@ class RunDirectory:
         """Say how far the run got, and which checkpoint is the best; written atomically."""
         status = {"state": state, "joint_steps": joint_steps, "checkpoint": checkpoint, "best": best, "reason": reason}
         write_json(self.path / "status.json", status)
+
+    def other_versions(self) -> list[str]:
+        """Return of what the run began with other versions than there are now."""
+        then, now = self._json("versions.json"), versions()
+        if not isinstance(then, dict):
+            raise RunError(f"{self.path / 'versions.json'}: is no table of versions")
+        return [f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]]
 
     def go_on(self, config: RunConfig, checkpoint: Path | None) -> None:
         """Say that the run goes on from ``checkpoint``, to the steps of ``config``, which is its own but for these."""

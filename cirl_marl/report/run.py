@@ -34,7 +34,8 @@ def evaluate_run(
     The other arguments are those of ``compare``; bounds take longer than the episodes.
 
     Returns:
-        The figures, which are also written to ``evaluation.json``, the rollouts by controller, and the environment. An
+        The figures, which are also written to ``evaluation.json`` (``not_written`` says why, where that cannot be), the
+        rollouts by controller, and the environment. An
         evaluation of the same checkpoint in the same episodes is left there if this one has no bounds.
 
     Raises:
@@ -58,7 +59,10 @@ def evaluate_run(
     figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": comparison.first_seed}
     figures["checkpoint"] = entries["trained"].checkpoint
     if bounds or not _is_evaluated(run, figures):
-        write_json(run.path / "evaluation.json", figures)
+        try:
+            write_json(run.path / "evaluation.json", figures)
+        except OSError as error:
+            figures["not_written"] = str(error)
     return figures, rollouts, env
 
 
