@@ -387,10 +387,10 @@ def test_a_stopped_training_says_what_is_saved(
     checkpoint = kept.status["checkpoint"]
     for state, name, said in (
         ("interrupted", checkpoint, "everything learnt is saved. Go on with: cirl train --resume run"),
-        ("running", checkpoint, "what was learnt in the first 160 steps is saved. Go on with"),
+        ("running", checkpoint, "what was learnt in the first 320 steps is saved. Go on with"),
         ("running", None, "nothing was learnt yet that could be saved"),
     ):
-        kept.set_status(state, 20, name)
+        kept.set_status(state, 0 if name is None else 40, name)
         assert run(monkeypatch, "train", "copper_net", "--out", "run") == 130
         assert said in " ".join(capsys.readouterr().out.split())
 

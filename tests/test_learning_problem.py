@@ -43,6 +43,7 @@ def test_there_is_room_above_neutral(network: str) -> None:
     assert better.episode_service.mean() >= neutral.episode_service.mean()
 
 
+@pytest.mark.slow
 @pytest.mark.medium
 def test_learners_raise_their_returns_together(tmp_path: Path) -> None:
     """A twentieth of the default run already lifts the mean return of the sixteen agents well above where it began."""

@@ -164,6 +164,7 @@ def test_truck_and_incinerator_pull_the_right_way() -> None:
     assert (np.diff(heat) > 0.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.medium
 def test_the_incinerator_s_script_knows_its_set_point() -> None:
     """It holds what its model asks for, to some degrees."""

@@ -164,6 +164,7 @@ def test_series_means_are_exact(gaps: list[float], interval: float, seed: int) -
         assert advanced(network, step)[1] == pytest.approx(values @ held, rel=1e-12, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.medium
 def test_hundred_thousand_compartments() -> None:
     """A generated network of 50 000 nodes and 50 000 arcs steps, conserves mass and stays positive."""
