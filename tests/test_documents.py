@@ -280,7 +280,7 @@ def test_own_model_in_the_guide_is_valid(tmp_path: Path) -> None:
     whole, parts = blocks((ROOT / "envs" / "README.md").read_text(), "toml")
     definition = tmp_path / "brewery.toml"
     definition.write_text(re.sub(r"\[episode\].*?\n\n", "", whole.split("[nodes.")[0], flags=re.DOTALL) + parts)
-    env = cirl_marl.parallel_env(definition)
+    env = cirl_marl.parallel_env(cirl_marl.load_network(definition, allow_code=True))
     env.reset(seed=0)
     infos = env.step({"tank": [0.5]})[-1]
     assert infos["tank"]["flows"][0] > 0.0
