@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.lockstep import Lockstep, Participant, World
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.recipe import Recipe
 from cirl_marl.learners.seat import Handed, Seat
 from cirl_marl.learners.views import OneAgent
@@ -228,10 +229,12 @@ def lone_seat(env: FreeEnv, agent: str) -> Seat:
 
 def learn_together(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weights]:
     """Let every agent learn for ``steps`` in lockstep; return the seconds it took, without set-up, and the weights."""
-    world = World(env, range(env.num_envs))
+    world = NetworkWorld(env, range(env.num_envs))
     learners = {agent: _built(seat, recipe, env) for agent, seat in world.seats.items()}
     everyone = [
-        Participant(agent, _learning(learner, steps), learner.act, learner.streams, budget=learner.budget(steps))
+        Participant(
+            agent, _learning(learner, steps), learner.act, learner.streams, budget=partial(learner.budget, steps)
+        )
         for agent, learner in learners.items()
     ]
     began = time.perf_counter()

@@ -8,6 +8,9 @@ reward is the circularity λ(N;t) of the network.
 ['carbo_net', 'copper_net', 'net_zero']
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from cirl_marl.definitions.catalogue import load_network, networks, recipes
 from cirl_marl.environments.parallel import NetworkParallelEnv, aec_env, parallel_env, vector_env
 from cirl_marl.environments.registration import register
@@ -29,6 +32,9 @@ from cirl_marl.network.elements import (
     Service,
 )
 from cirl_marl.network.series import Series
+
+if TYPE_CHECKING:
+    from cirl_marl.learners.teams.team import Team, independent, load_team
 
 __version__ = "0.1.0"
 
@@ -55,9 +61,12 @@ __all__ = [
     "Service",
     "SingleAgentEnv",
     "Snapshot",
+    "Team",
     "VectorEnv",
     "aec_env",
+    "independent",
     "load_network",
+    "load_team",
     "networks",
     "parallel_env",
     "recipes",
@@ -67,3 +76,10 @@ __all__ = [
 ]
 
 register()
+
+
+def __getattr__(name: str) -> Any:
+    """Return what trains, which loads torch, when it is first asked for."""
+    if name not in ("Team", "independent", "load_team"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module("cirl_marl.learners.teams.team"), name)

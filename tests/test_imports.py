@@ -17,10 +17,10 @@ LAYERS = (
     ("definitions",),
     ("dynamics",),
     ("environments",),
-    ("__init__", "controllers", "testing"),
+    ("controllers", "testing"),
     ("importing", "optimum"),
     ("learners",),
-    ("evaluation", "paper"),
+    ("__init__", "evaluation", "paper"),
     ("report",),
     ("cli",),
 )

@@ -22,7 +22,7 @@ from cirl_marl import DefinitionError, Network, VectorEnv, vector_env
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import load_recipe, train
 from cirl_marl.learners.central_critic import CentralCriticPolicy
-from cirl_marl.learners.lockstep import Lockstep, Participant, World
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.recipe import LearnerSettings, Match, Normalisation, Recipe, Run
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.trained import Trained
@@ -155,7 +155,7 @@ def test_rows_of_a_seat_are_agents_in_copies() -> None:
     """Time limits, returns and attributes of a row are those of its agent and copy; the last state as well."""
     env = vector_env("copper_net", num_envs=2, horizon=3)
     by_hand = vector_env("copper_net", num_envs=2, horizon=3)
-    world = World(env, [1, 2], {"all": SharedPolicy(env, env.agents).with_state(env)})
+    world = NetworkWorld(env, [1, 2], {"all": SharedPolicy(env, env.agents).with_state(env)})
     seat, count = world.seats["all"], len(env.agents)
     by_hand.reset(seed=[1, 2])
     assert seat.get_attr("agent") == [agent for agent in env.agents for _ in range(2)]
@@ -196,7 +196,7 @@ def test_rows_of_a_seat_are_agents_in_copies() -> None:
 def central_critic() -> PPO:
     """Return PPO with a central critic on a toy view."""
     env = vector_env("carbo_net", num_envs=2)
-    world = World(env, [0, 1], {"all": SharedPolicy(env, env.agents).with_state(env)})
+    world = NetworkWorld(env, [0, 1], {"all": SharedPolicy(env, env.agents).with_state(env)})
     return PPO(CentralCriticPolicy, world.seats["all"], seed=0, device="cpu", **SMALL)
 
 

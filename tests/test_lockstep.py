@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from cirl_marl import LearnerError, VectorEnv
-from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, World
+from cirl_marl.learners.lockstep import Interrupted, Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams
 
@@ -20,10 +20,10 @@ HORIZON = 5
 COPIES = 3
 
 
-def make_world(agents: list[str] | None = None) -> World:
+def make_world(agents: list[str] | None = None) -> NetworkWorld:
     """Seat the agents of a short copper_net."""
     env = VectorEnv("copper_net", num_envs=COPIES, agents=agents, horizon=HORIZON)
-    return World(env, seeds=[11, 12, 13])
+    return NetworkWorld(env, seeds=[11, 12, 13])
 
 
 def scripted(seat: Seat, steps: int, seen: list[VecEnvStepReturn], value: float = 0.0) -> Callable[[], None]:
@@ -47,7 +47,7 @@ def hold(seat: Seat) -> Callable[[], None]:
     return run
 
 
-def run_scripted(world: World, steps: dict[str, int], **options: Any) -> dict[str, list[VecEnvStepReturn]]:
+def run_scripted(world: NetworkWorld, steps: dict[str, int], **options: Any) -> dict[str, list[VecEnvStepReturn]]:
     """Run scripted learners for the given numbers of steps."""
     seen: dict[str, list[VecEnvStepReturn]] = {agent: [] for agent in world.seats}
     learn = {agent: scripted(seat, steps[agent], seen[agent]) for agent, seat in world.seats.items()}
@@ -55,7 +55,7 @@ def run_scripted(world: World, steps: dict[str, int], **options: Any) -> dict[st
     return seen
 
 
-def participants(world: World, learn: dict[str, Callable[[], None]]) -> list[Participant]:
+def participants(world: NetworkWorld, learn: dict[str, Callable[[], None]]) -> list[Participant]:
     """Return who learns by its own function, and holds action 0 after it."""
     seats = world.seats.items()
     return [Participant(seat.title, learn[a], hold(seat), Streams(i)) for i, (a, seat) in enumerate(seats)]

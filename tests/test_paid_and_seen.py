@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Service, VectorEnv
-from cirl_marl.learners.lockstep import Lockstep, Participant, World
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.streams import Streams
 
 VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
@@ -108,7 +108,7 @@ def test_an_episode_reports_the_means_over_its_own_steps() -> None:
 
 def test_a_second_episode_has_a_return_of_its_own() -> None:
     """The return and the length that a learner is told are those of the episode that ended, and of no other."""
-    world = World(VectorEnv("carbo_net", num_envs=2, horizon=4), seeds=[1, 2])
+    world = NetworkWorld(VectorEnv("carbo_net", num_envs=2, horizon=4), seeds=[1, 2])
     seen: dict[str, list[Any]] = {name: [] for name in world.seats}
 
     def learner(name: str, steps: int) -> None:

@@ -11,7 +11,7 @@ from stable_baselines3 import PPO
 
 import cirl_marl
 from cirl_marl import VectorEnv
-from cirl_marl.learners.lockstep import Lockstep, Participant, World
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.streams import Streams
 
 with warnings.catch_warnings():
@@ -58,7 +58,7 @@ def test_three_defects_of_the_vector_bridge_are_not_ours() -> None:
     assert np.all(dones)
     assert not any("TimeLimit.truncated" in info for info in infos)
 
-    ours = World(VectorEnv("copper_net", num_envs=2, agents=AGENTS, horizon=4), seeds=[1, 2])
+    ours = NetworkWorld(VectorEnv("copper_net", num_envs=2, agents=AGENTS, horizon=4), seeds=[1, 2])
     seat = ours.seats["refinery"]
     mine = np.asarray(seat.handed.seen)
     assert not np.array_equal(mine[0], mine[1])
@@ -76,5 +76,7 @@ def test_three_defects_of_the_vector_bridge_are_not_ours() -> None:
             other.step(np.zeros((2, 1), dtype=np.float32))
 
     acting = {"refinery": learn, "mine": rest}
-    Lockstep([ours], [Participant(agent, acting[agent], acting[agent], Streams(0), budget=4) for agent in AGENTS]).run()
+    Lockstep(
+        [ours], [Participant(agent, acting[agent], acting[agent], Streams(0), budget=lambda: 4) for agent in AGENTS]
+    ).run()
     assert all(info["TimeLimit.truncated"] and "terminal_observation" in info for info in seen[3])

@@ -45,14 +45,19 @@ NOISES: Mapping[str, type[ActionNoise]] = {
 }
 
 
-def algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """Return every algorithm for continuous actions that the installed packages export, by class name."""
+def every_algorithm() -> dict[str, type[BaseAlgorithm]]:
+    """Return every algorithm that the installed packages export, by class name."""
     exported = {name: getattr(module, name) for module in (stable_baselines3, sb3_contrib) for name in module.__all__}
     return {
         name: found
         for name, found in sorted(exported.items())
-        if isinstance(found, type) and issubclass(found, BaseAlgorithm) and name not in DISCRETE
+        if isinstance(found, type) and issubclass(found, BaseAlgorithm)
     }
+
+
+def algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """Return those for continuous actions, which compartments have."""
+    return {name: found for name, found in every_algorithm().items() if name not in DISCRETE}
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
@@ -61,7 +66,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     >>> algorithm_class("PPO").__name__
     'PPO'
     """
-    known = algorithms()
+    known = every_algorithm()
     if name not in known:
         raise RecipeError(f"algorithm: {unknown('algorithm', name, known)}")
     return known[name]
@@ -207,7 +212,8 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         arguments["action_noise"] = NOISES[noise["kind"]](mean, noise["sigma"] * np.ones_like(mean))  # type: ignore[call-arg]
     try:
         model = algorithm_class(name)(POLICIES.get(policy, policy), env, **arguments, **fixed)
-    except (TypeError, ValueError, AssertionError, KeyError) as error:
-        raise RecipeError(f"{name} refuses its parameters {dict(parameters)}: {error}") from error
+    except (TypeError, ValueError, AssertionError, KeyError, NotImplementedError) as error:
+        seen = f"for observations {env.observation_space} and actions {env.action_space}"
+        raise RecipeError(f"{name} refuses its parameters {dict(parameters)}, {seen}: {error}") from error
     model.set_logger(Logger(None, []))  # left to itself it makes an empty temporary folder when it begins to learn
     return model

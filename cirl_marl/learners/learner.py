@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sb3_contrib import ARS
+from sb3_contrib import ARS, MaskablePPO
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import Schedule, TrainFreq, TrainFrequencyUnit
@@ -225,6 +226,16 @@ class Learner:
         if isinstance(self.model, ARS):
             # It counts each step of its copies once for every copy, and schedules by this number, done before or not.
             total = self.budget(steps) * steps_counted(self.model, self.seat.num_envs)
+        self._learn(total, callback)
+
+    def learn_on(self, steps: int, callback: BaseCallback | None) -> None:
+        """Run the algorithm's own ``learn()`` for so many steps more, from what its seat shows now."""
+        self._begun, self.model._last_obs = self.model.num_timesteps, None
+        counted = steps_counted(self.model, self.seat.num_envs) if isinstance(self.model, ARS) else self.seat.num_envs
+        self._learn(math.ceil(steps / self.seat.copies) * counted, callback)
+
+    def _learn(self, total: int, callback: BaseCallback | None) -> None:
+        """Run the algorithm's own ``learn()`` for ``total`` steps as it counts them, or until it is stopped."""
         if total > 0:
             callbacks = [each for each in (AtRollouts(self.boundary), callback) if each is not None]
             try:
@@ -243,7 +254,7 @@ class Learner:
             observation = self.seat.reset()
             if isinstance(self.env, VecNormalize):
                 observation = self.env.normalize_obs(observation)  # type: ignore[arg-type]
-            action, state = self.model.predict(observation, state, done, deterministic=True)  # type: ignore[arg-type]
+            action, state = chosen(self.model, observation, state, done, self.seat)
             _, _, done, _ = self.seat.step(action)
 
     def save(self, folder: Path) -> None:
@@ -277,6 +288,16 @@ class Learner:
         except UNREADABLE as error:
             raise RunError(f"{path}: cannot be read: {error!r}") from error
         return self
+
+
+def chosen(
+    model: BaseAlgorithm, observation: Any, memory: Any, starts: Any, env: VecEnv, *, deterministic: bool = True
+) -> tuple[Any, Any]:
+    """Return what a policy does and remembers; only what is legal if it knows of masks and ``env`` has some."""
+    masks: dict[str, Any] = {}
+    if isinstance(model, MaskablePPO) and is_masking_supported(env):
+        masks = {"action_masks": get_action_masks(env)}
+    return model.predict(observation, memory, starts, deterministic=deterministic, **masks)
 
 
 def learnt(folder: Path, group: Group, env: VectorEnv) -> Learner:

@@ -20,7 +20,7 @@ from cirl_marl.environments.state import Snapshot, State
 from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import ControlError, LearnerError
 from cirl_marl.learners.boundary import Boundary
-from cirl_marl.learners.seat import JointStep, Seat
+from cirl_marl.learners.seat import JointEnv, JointStep, Seat
 from cirl_marl.learners.streams import Streams
 from cirl_marl.learners.views import OneAgent, View
 
@@ -41,28 +41,22 @@ def wait() -> None:
 
 
 class World:
-    """A batched environment with the seats of its learners.
+    """A joint environment with the seats of its learners.
 
-    ``joint_steps`` are control intervals done, each in every copy, those of a run that is resumed included.
+    ``joint_steps`` are steps done, each in every copy, those of a run that is resumed included.
     """
 
-    def __init__(
-        self, env: VectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None, *, done: int = 0
-    ) -> None:
-        """Reset ``env`` with one of ``seeds`` per copy and seat its learners, after ``done`` joint steps before.
+    def __init__(self, env: JointEnv, seeds: Sequence[int], seats: Mapping[str, Seat], *, done: int = 0) -> None:
+        """Reset ``env`` with one of ``seeds`` per copy for those in ``seats``, after ``done`` joint steps before.
 
-        ``views`` are what each learner sees, by its name; together they act for every agent once. None gives every
-        agent a learner of its own.
+        Together they act for every agent once.
         """
-        self.env = env
-        self.joint_steps = done
-        views = views if views is not None else {agent: OneAgent(env, agent) for agent in env.agents}
-        self.seats = {name: Seat(env, name, view, wait) for name, view in views.items()}
+        self.env, self.seats, self.joint_steps = env, dict(seats), done
         observations = env.reset(seed=list(seeds))
         for seat in self.seats.values():
             seat.show(observations, env.state)
         self._returns = np.zeros((len(env.agents), env.num_envs))
-        self._lengths = np.zeros(env.num_envs, dtype=int)
+        self._lengths = np.zeros((len(env.agents), env.num_envs), dtype=int)
 
     def step(self, hook: StepHook | None = None) -> None:
         """Move by the actions that were handed in, and show every seat what came of it.
@@ -72,26 +66,60 @@ class World:
         """
         actions: dict[str, NDArray[np.floating]] = {}
         for seat in self.seats.values():
-            assert seat.action is not None
-            actions.update(seat.view.act(seat.action))
+            if not seat.absent:
+                assert seat.action is not None
+                actions.update(seat.view.act(seat.action))
         try:
-            observations, rewards, _, truncations, infos = self.env.step(actions)
+            observations, rewards, terminations, truncations, infos = self.env.step(actions)
         except ControlError as error:
             raise LearnerError(f"a learner failed at joint step {self.joint_steps}: {error}") from error
         self.joint_steps += 1
-        done = next(iter(truncations.values()))
+        truncated = np.array(list(truncations.values()))
+        ended = truncated | list(terminations.values())
         self._returns = self._returns + list(rewards.values())
-        self._lengths = self._lengths + 1
-        returns = dict(zip(self.env.agents, self._returns, strict=True))
-        step = JointStep(observations, self.env.state, rewards, done, returns, self._lengths, infos)
+        self._lengths = self._lengths + self._took_part()
+        returns = self._by_agent(self._returns)
+        step = JointStep(
+            observations,
+            self.env.state,
+            rewards,
+            self._by_agent(ended),
+            self._by_agent(truncated),
+            returns,
+            self._by_agent(self._lengths),
+            infos,
+        )
         for seat in self.seats.values():
             seat.hand(step)
         if hook is not None:
-            if done.any():
+            if ended.any():
                 for agent, total in returns.items():
                     infos[agent]["episode_return"] = total.copy()
-            hook(infos, done)
-        self._returns, self._lengths = np.where(done, 0.0, self._returns), np.where(done, 0, self._lengths)
+            hook(infos, ended.all(axis=0))
+        self._returns, self._lengths = np.where(ended, 0.0, self._returns), np.where(ended, 0, self._lengths)
+
+    def _took_part(self) -> int | NDArray[np.integer]:
+        """Return 1 for each agent and copy in which it acted."""
+        return 1
+
+    def _by_agent(self, rows: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        return dict(zip(self.env.agents, rows, strict=True))
+
+
+class NetworkWorld(World):
+    """The world of a network, which can be saved and go on."""
+
+    env: VectorEnv
+
+    def __init__(
+        self, env: VectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None, *, done: int = 0
+    ) -> None:
+        """Seat learners in ``env``, as ``World`` does.
+
+        ``views`` are what each learner sees, by its name; None gives every agent a learner of its own.
+        """
+        views = views if views is not None else {agent: OneAgent(env, agent) for agent in env.agents}
+        super().__init__(env, seeds, {name: Seat(env, name, view, wait) for name, view in views.items()}, done=done)
 
     def told(self) -> dict[str, Any]:
         """Return all that a world goes on from, but for its learners."""
@@ -119,7 +147,8 @@ class Participant:
         streams: its random streams.
         boundaries: of each learner that it is.
         busy: whether it will come to no boundary before something is over.
-        budget: joint steps after which it is stopped by ``BudgetSpent``, if it has not returned.
+        budget: returns the joint steps after which it is stopped by ``BudgetSpent``, if it has not returned.
+        absent: whether it has nothing to do in the next joint step, and is not asked.
     """
 
     title: str
@@ -128,7 +157,8 @@ class Participant:
     streams: Streams
     boundaries: Sequence[Boundary] = ()
     busy: Callable[[], bool] = lambda: False
-    budget: int = 2**62
+    budget: Callable[[], int] = lambda: 2**62
+    absent: Callable[[], bool] = lambda: False
 
 
 class Lockstep:
@@ -167,8 +197,9 @@ class Lockstep:
             for i, participant in enumerate(self._participants):
                 self._coroutines.append(greenlet(self._task(i, participant)))
                 self._coroutines[i].gr_context = copy_context()
-                self._resume(i)
-                self._again(i)
+                if not participant.absent():
+                    self._resume(i)
+                    self._again(i)
             while self._learning:
                 for place, world in enumerate(self._worlds):
                     world.step(hooks[place] if hooks is not None else None)
@@ -183,8 +214,9 @@ class Lockstep:
 
     def _turn(self, i: int, step: int) -> None:
         """Let a participant go on after a joint step, and stop it if it has used up its steps."""
-        self._resume(i)
-        if i in self._learning and step >= self._participants[i].budget:
+        if not self._participants[i].absent():
+            self._resume(i)
+        if i in self._learning and step >= self._participants[i].budget():
             self._stop_learning(i)
 
     def _again(self, i: int) -> None:
@@ -227,7 +259,10 @@ class Lockstep:
     def _stop_learning(self, i: int) -> None:
         """End ``learn()`` of a learner that has used up its steps; it goes on acting from its next turn."""
         self._learning.discard(i)
-        self._enter(i, lambda: self._coroutines[i].throw(BudgetSpent))
+        if self._coroutines[i]:
+            self._enter(i, lambda: self._coroutines[i].throw(BudgetSpent))
+        else:  # it was absent from the beginning, and has not begun
+            self._coroutines[i] = greenlet(self._participants[i].act)
 
     def _end(self) -> None:
         self._learning = set(range(len(self._participants)))

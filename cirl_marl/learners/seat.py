@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,26 @@ from cirl_marl.network import Floats
 from cirl_marl.network.elements import Compartment
 
 
+class JointEnv(Protocol):
+    """Several copies of an environment of many agents, all stepped at once; ``VectorEnv`` is one.
+
+    What it takes and gives is by agent, with a leading axis of ``num_envs`` entries. An episode that has ended is
+    followed by the next at once; what was seen last is ``final_observation`` in the infos.
+    """
+
+    num_envs: int
+    agents: tuple[str, ...]
+
+    def reset(self, *, seed: Any = None) -> Any:
+        """Begin episodes in all copies and return the first observations."""
+
+    def step(self, actions: Any) -> Any:
+        """Move all copies; return observations, rewards, terminations, truncations and infos."""
+
+    def state(self) -> Floats:
+        """Return the whole state, for critics that see it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Handed:
     """What a learner is handed after a joint step, one row for each row of its view.
@@ -29,6 +49,7 @@ class Handed:
         final: what was seen last in these, anything in others; None if none ended.
         returns: sum of the rewards of the episodes that ended, anything in others.
         lengths: steps of these.
+        truncated: rows whose episode a time limit ended; None if it was this wherever one ended.
     """
 
     seen: ObservedRows
@@ -37,6 +58,7 @@ class Handed:
     final: ObservedRows | None = None
     returns: Floats | None = None
     lengths: NDArray[np.integer] | None = None
+    truncated: NDArray[np.bool_] | None = None
 
     def told(self) -> dict[str, Any]:
         """Return the parts by name."""
@@ -55,18 +77,20 @@ class JointStep:
         observations: of each agent, of the episodes that begin where one ended.
         state: returns the state of the environment for critics.
         rewards: of this step by agent, shape (B,).
-        done: the copies whose episode ended, shape (B,).
+        ended: the copies in which the agent's episode ended, by agent, shape (B,).
+        truncated: those in which a time limit ended it, likewise.
         returns: of the episodes so far by agent, shape (B,).
-        lengths: of the episodes so far, shape (B,).
+        lengths: of the episodes so far, likewise.
         infos: of the environment.
     """
 
     observations: Arrays
     state: Callable[[], Floats]
     rewards: Mapping[str, Floats]
-    done: NDArray[np.bool_]
+    ended: Mapping[str, NDArray[np.bool_]]
+    truncated: Mapping[str, NDArray[np.bool_]]
     returns: Mapping[str, Floats]
-    lengths: NDArray[np.integer]
+    lengths: Mapping[str, NDArray[np.integer]]
     infos: Infos
 
 
@@ -110,13 +134,18 @@ class Seat(VecEnv):
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
     """
 
-    def __init__(self, env: VectorEnv, name: str, view: View, wait: Callable[[], object]) -> None:
-        """Seat the learner ``name``; ``wait`` returns when every learner has acted and the environment has moved."""
+    def __init__(
+        self, env: JointEnv, name: str, view: View, wait: Callable[[], object], row: Callable[..., Any] = CopyView
+    ) -> None:
+        """Seat the learner ``name``; ``wait`` returns when every learner has acted and the environment has moved.
+
+        ``row`` returns what attributes of a row are those of, from the environment, the copy and the agent.
+        """
         self.name, self.view, self.copies = name, view, env.num_envs
         self.handed: Handed = _NOTHING
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
-        self.views = [CopyView(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
+        self.views = [row(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
         self._wait = wait
         super().__init__(len(self.views), view.observation_space, view.action_space)
 
@@ -131,19 +160,25 @@ class Seat(VecEnv):
         seen = _rows_in_order(self.view.observe(observations, state))
         self.handed = Handed(seen, np.zeros(rows, dtype=np.float32), np.ones(rows, dtype=bool))
 
+    @property
+    def absent(self) -> bool:
+        """Whether none of its rows has anybody who acts next, so that the learner is not asked."""
+        return False
+
     def hand(self, step: JointStep) -> None:
         """Hand over what the joint step brought."""
-        agents, times = self.view.agents, self.num_envs // self.copies
+        agents, rows = self.view.agents, self.view.row_agents or self.view.agents[:1]
         seen = _rows_in_order(self.view.observe(step.observations, step.state))
         rewards = self.view.score(step.rewards).astype(np.float32)
-        ended = np.tile(step.done, times)
-        if not step.done.any():
+        ended = np.concatenate([step.ended[agent] for agent in rows])
+        if not ended.any():
             self.handed = Handed(seen, rewards, ended)
             return
         last = {agent: step.infos[agent]["final_observation"] for agent in agents}
         final = _rows_in_order(self.view.observe(last, lambda: step.infos[agents[0]]["final_state"]))
-        returns, lengths = self.view.score(step.returns), np.tile(step.lengths, times)
-        self.handed = Handed(seen, rewards, ended, final, returns, lengths)
+        returns, lengths = self.view.score(step.returns), np.concatenate([step.lengths[agent] for agent in rows])
+        truncated = np.concatenate([step.truncated[agent] for agent in rows])
+        self.handed = Handed(seen, rewards, ended, final, returns, lengths, truncated)
 
     def paid(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Return the reward of each row, and whether its episode ended; arrays of its own, which PPO adds to."""
@@ -167,11 +202,13 @@ class Seat(VecEnv):
         now = self.handed
         if now.final is not None and now.returns is not None and now.lengths is not None:
             for row in np.flatnonzero(ended):
+                limited = now.truncated is None or bool(now.truncated[row])
                 infos[row] = {
-                    "TimeLimit.truncated": self.bootstrap,
+                    "TimeLimit.truncated": self.bootstrap and limited,
                     "terminal_observation": _row(now.final, int(row)),
-                    "episode": {"r": float(now.returns[row]), "l": int(now.lengths[row]), "t": 0.0},
                 }
+                if now.lengths[row]:
+                    infos[row]["episode"] = {"r": float(now.returns[row]), "l": int(now.lengths[row]), "t": 0.0}
         return self.reset(), rewards, ended, infos
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ from cirl_marl.environments.vector import Infos, VectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
-from cirl_marl.learners.lockstep import Interrupted, Lockstep, Participant, World, wait
+from cirl_marl.learners.lockstep import Interrupted, Lockstep, NetworkWorld, Participant, wait
 from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.price import FIRST, ServicePrice
 from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory, steps_of
@@ -95,7 +95,7 @@ class Training:
         seeds = [derived_seed(config.seed, "copies", 0 if alike else i, self.begun) for i in range(config.envs)]
         self.groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
         views = {name: group.view(env) for name, group in self.groups.items()}
-        self.world = World(env, seeds, views, done=self.begun)
+        self.world = NetworkWorld(env, seeds, views, done=self.begun)
         self.learners: dict[str, Learner] = {}
         with one_torch_thread():
             for name, seat in self.world.seats.items():
@@ -434,7 +434,7 @@ def _participants(
                     learner.streams,
                     [learner.boundary],
                     partial(getattr, learner, "shown"),
-                    learner.budget(steps),
+                    partial(learner.budget, steps),
                 )
 
 

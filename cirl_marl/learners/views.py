@@ -8,8 +8,8 @@ and evaluation, with any number of copies.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from gymnasium import spaces
@@ -23,6 +23,13 @@ ObservedRows = NDArray[np.floating] | dict[str, NDArray[np.floating]]
 Scheme = Literal["independent", "shared", "joint"]
 CENTRAL_CRITIC = "CentralCriticPolicy"
 """Name of the policy whose critic sees the whole state."""
+
+
+class Spaced(Protocol):
+    """Whatever has a space for the observation and one for the action of each agent."""
+
+    observation_spaces: Any
+    action_spaces: Any
 
 
 class View(ABC):
@@ -79,15 +86,16 @@ class View(ABC):
 class OneAgent(View):
     """The view of a single agent: its own observation, action and reward, as they are."""
 
-    def __init__(self, env: VectorEnv, agent: str) -> None:
+    def __init__(self, env: Spaced, agent: str) -> None:
         """View ``env`` as ``agent``."""
         self.agents, self.row_agents = (agent,), (agent,)
         self.observation_space = env.observation_spaces[agent]
         self.action_space = env.action_spaces[agent]
 
     def rows(self, observations: Arrays) -> NDArray[np.floating]:
-        """Return the agent's observation, shape (B, k)."""
-        return np.ascontiguousarray(observations[self.agents[0]])
+        """Return the agent's observation, shape (B, k), or as its space has it."""
+        seen = observations[self.agents[0]]
+        return seen if isinstance(seen, Mapping) else np.ascontiguousarray(seen)
 
     def act(self, actions: NDArray[np.floating]) -> Arrays:
         """Return the actions, shape (B, m), as the agent's."""

@@ -1,0 +1,1 @@
+"""Independent Stable-Baselines3 learners in any PettingZoo environment."""

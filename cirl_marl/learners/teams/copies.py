@@ -1,0 +1,232 @@
+"""Copies of any PettingZoo environment as one joint environment, with a record of who is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel
+
+from cirl_marl.errors import CirlError, LearnerError, unknown
+from cirl_marl.network import Floats
+
+MakeEnv = Callable[[], Any]
+"""Makes an environment: a PettingZoo ``ParallelEnv`` or ``AECEnv``."""
+Rows = NDArray[Any] | dict[str, NDArray[Any]]
+"""Observations of an agent in all copies."""
+MASK = "action_mask"
+"""Key of an observation, or of the infos, under which PettingZoo's environments tell which actions are legal."""
+
+
+def parallel(env: Any) -> Any:
+    """Return an environment in which all agents act at once, by PettingZoo's own conversion if it is none.
+
+    Agents that take turns act at once then, too; the actions of those whose turn it is not are ignored.
+    """
+    if isinstance(env, AECEnv):
+        return aec_to_parallel(env) if env.metadata.get("is_parallelizable") else turn_based_aec_to_parallel(env)
+    if not isinstance(env, ParallelEnv):
+        raise CirlError(f"make_env() must return a PettingZoo ParallelEnv or AECEnv, got {type(env).__name__}")
+    return env
+
+
+class Copies:
+    """Copies of a PettingZoo environment, stepped one after the other.
+
+    A copy in which nobody is left begins its next episode at once. An agent whose episode ended while others go on is
+    absent, as one is that has not come yet: it has the observation that it had last, and what it does is ignored.
+
+    Attributes:
+        num_envs: the copies, B.
+        agents: all that may take part, by their names as text, in the order of ``possible_agents``.
+        observation_spaces: of each agent.
+        action_spaces: of each agent.
+        present: the copies in which each agent acts next, shape (B,).
+        masks: of each agent that has such, which actions are legal, shape (B, actions).
+        begun: the copies whose episode has just begun, shape (B,).
+    """
+
+    def __init__(self, make_env: MakeEnv, num_envs: int) -> None:
+        """Make the copies; they begin with ``reset``.
+
+        Raises:
+            CirlError: for something else than an environment, or one that does not say who may take part.
+        """
+        self.envs = [parallel(make_env()) for _ in range(num_envs)]
+        self.num_envs = num_envs
+        first = self.envs[0]
+        possible = getattr(first, "possible_agents", None)
+        if not possible:
+            raise CirlError(f"environment '{first}': has no possible_agents, so nobody knows who will need a learner")
+        self._own = {str(agent): agent for agent in possible}
+        if len(self._own) != len(possible):
+            raise CirlError(f"environment '{first}': agents share a name: {[str(agent) for agent in possible]}")
+        self.agents = tuple(self._own)
+        self._place = {name: place for place, name in enumerate(self.agents)}
+        self.observation_spaces = {name: first.observation_space(own) for name, own in self._own.items()}
+        self.action_spaces = {name: first.action_space(own) for name, own in self._own.items()}
+        self.present = {name: np.zeros(num_envs, dtype=bool) for name in self.agents}
+        self.masks: dict[str, NDArray[np.int8]] = {}
+        self.begun = np.ones(num_envs, dtype=bool)
+        self._seen: dict[str, Rows] = {name: _blank(self.observation_spaces[name], num_envs) for name in self.agents}
+
+    def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, Rows]:
+        """Begin an episode in every copy, with one of the seeds each; return what everybody sees."""
+        self._renew()
+        for i in range(self.num_envs):
+            self._begin(i, None if seed is None else int(seed[i]))
+        return dict(self._seen)
+
+    def step(self, actions: Mapping[str, NDArray[Any]]) -> tuple[Any, ...]:
+        """Let those who are present act; return observations, rewards, terminations, truncations and infos.
+
+        Raises:
+            LearnerError: if an environment tells of others than it promised; names the copy and them.
+        """
+        shape = (len(self.agents), self.num_envs)
+        rewards, ended, truncated = np.zeros(shape), np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+        told: dict[str, list[dict[str, Any]]] = {name: [{} for _ in self.envs] for name in self.agents}
+        before = self.present
+        self._renew()
+        last = {name: _copied(rows) for name, rows in self._seen.items()}
+        for i, env in enumerate(self.envs):
+            acting = [name for name in self.agents if before[name][i]]
+            observations, paid, terminations, truncations, infos = env.step(
+                {self._own[name]: _action(self.action_spaces[name], actions[name][i]) for name in acting}
+            )
+            for name in acting:
+                own, place = self._own[name], self._place[name]
+                try:
+                    over = bool(terminations[own]) or bool(truncations[own])
+                    rewards[place, i], ended[place, i] = paid[own], over
+                    truncated[place, i] = over and not terminations[own]
+                    if over:
+                        _put(last[name], i, observations[own], self.observation_spaces[name], self._where(i, name))
+                except KeyError:
+                    raise LearnerError(f"{self._where(i, name)}: acted, but step() tells nothing of it") from None
+                told[name][i] = dict(infos.get(own) or {})
+            self._arrive(i, observations, infos, {name for name in acting if ended[self._place[name], i]})
+            if not env.agents:
+                self._begin(i, None)
+        shown = {name: {"final_observation": last[name], "copies": told[name]} for name in self.agents}
+        by_agent = [dict(zip(self.agents, each, strict=True)) for each in (rewards, ended & ~truncated, truncated)]
+        return dict(self._seen), *by_agent, shown
+
+    def state(self) -> Floats:
+        """Refuse: PettingZoo's environments differ in whether they tell their state, and how."""
+        raise CirlError("the state of these environments is not shown to critics; use another policy")
+
+    def close(self) -> None:
+        """Close all copies."""
+        for env in self.envs:
+            env.close()
+
+    def _renew(self) -> None:
+        """Begin new arrays of what changes in a step: learners may have kept those that there were."""
+        self.present = {name: np.zeros(self.num_envs, dtype=bool) for name in self.agents}
+        self.begun = np.zeros(self.num_envs, dtype=bool)
+        self.masks = {name: mask.copy() for name, mask in self.masks.items()}
+        self._seen = {name: _copied(rows) for name, rows in self._seen.items()}
+
+    def _begin(self, i: int, seed: int | None) -> None:
+        observations, infos = self.envs[i].reset(seed=seed)
+        self.begun[i] = True
+        self._arrive(i, observations, infos, set())
+        if not self.envs[i].agents:
+            raise LearnerError(f"copy {i} of the environment: nobody is there after reset()")
+
+    def _arrive(self, i: int, observations: Mapping[Any, Any], infos: Mapping[Any, Any], gone: Iterable[str]) -> None:
+        """Note who is in a copy now, and what they see."""
+        for own in self.envs[i].agents:
+            name = str(own)
+            if name not in self._own:
+                raise LearnerError(
+                    f"copy {i} of the environment: possible_agents: {unknown('agent', name, self.agents)}"
+                )
+            if name in gone:
+                raise LearnerError(f"{self._where(i, name)}: its episode has ended, and it is still in env.agents")
+            if own not in observations:
+                raise LearnerError(f"{self._where(i, name)}: is in env.agents, but there is no observation for it")
+            seen = observations[own]
+            _put(self._seen[name], i, seen, self.observation_spaces[name], self._where(i, name))
+            self.present[name][i] = True
+            self._mask(i, name, seen, infos.get(own) or {})
+
+    def _mask(self, i: int, name: str, seen: Any, info: Mapping[str, Any]) -> None:
+        mask = seen[MASK] if isinstance(seen, Mapping) and MASK in seen else info.get(MASK)
+        if mask is not None:
+            flat = np.asarray(mask, dtype=np.int8).ravel()
+            self.masks.setdefault(name, np.ones((self.num_envs, flat.size), dtype=np.int8))[i] = flat
+
+    def _where(self, i: int, name: str) -> str:
+        return f"copy {i} of the environment: agent '{name}'"
+
+
+class AgentInCopy:
+    """An agent in one copy: what ``env_method`` and ``get_attr`` of a learner's ``VecEnv`` reach.
+
+    Attributes that it lacks are those of the copy itself.
+    """
+
+    def __init__(self, copies: Copies, index: int, agent: str) -> None:
+        """View copy ``index`` as ``agent``."""
+        self.index, self.agent, self._copies = index, agent, copies
+
+    @property
+    def env(self) -> Any:
+        """The copy, a PettingZoo ``ParallelEnv``."""
+        return self._copies.envs[self.index]
+
+    @property
+    def render_mode(self) -> str | None:
+        """How the copy is drawn."""
+        mode: str | None = getattr(self.env, "render_mode", None)
+        return mode
+
+    @property
+    def action_masks(self) -> Callable[[], NDArray[np.int8]]:
+        """Returns which actions are legal now, for ``MaskablePPO``; there is no such attribute if all always are."""
+        if self.agent not in self._copies.masks:
+            raise AttributeError(f"agent '{self.agent}' has no {MASK} in its observations or infos")
+        return lambda: self._copies.masks[self.agent][self.index]
+
+    def __getattr__(self, name: str) -> Any:
+        """Fall back on the copy."""
+        if name.startswith("_") or name == "action_masks":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+
+def _blank(space: spaces.Space[Any], copies: int) -> Rows:
+    """Return zeros in the form of a space, for copies in which nothing was seen yet."""
+    if isinstance(space, spaces.Dict):
+        return {key: np.zeros((copies, *(part.shape or ())), dtype=part.dtype) for key, part in space.spaces.items()}
+    return np.zeros((copies, *(space.shape or ())), dtype=space.dtype)
+
+
+def _copied(rows: Rows) -> Rows:
+    return {key: part.copy() for key, part in rows.items()} if isinstance(rows, dict) else rows.copy()
+
+
+def _put(rows: Rows, i: int, seen: Any, space: spaces.Space[Any], where: str) -> None:
+    """Write what an agent sees into a row."""
+    parts = [(None, rows)] if not isinstance(rows, dict) else list(rows.items())
+    for key, part in parts:
+        if key is not None and not (isinstance(seen, Mapping) and key in seen):
+            raise LearnerError(f"{where}: its observation lacks '{key}', which its space {space} has")
+        value = np.asarray(seen if key is None else seen[key])
+        if value.shape != part.shape[1:]:
+            named = "" if key is None else f" '{key}'"
+            raise LearnerError(f"{where}: its observation{named} has the shape {value.shape}, not that of {space}")
+        part[i] = value
+
+
+def _action(space: spaces.Space[Any], row: Any) -> Any:
+    """Return an action as the space has it; a whole number of a ``Discrete`` one."""
+    if isinstance(space, spaces.Discrete):
+        return int(row)
+    return row

@@ -1,0 +1,192 @@
+"""Learners of agents that are absent at times: what a copy tells of an agent that is not there is not learnt.
+
+In Stable-Baselines3 every row of a ``VecEnv`` acts in every step. A learner none of whose rows is present is therefore
+not asked at all: its next step is the one in which it is back, so that in a single copy it learns what it would learn
+alone. With several copies, some rows may be absent while others act. Those are filled with what was seen last, and
+left out of what is learnt: of rollouts before they are cut into minibatches, of the moments of normalisers; in replay
+buffers, the transition of another row stands in the place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.buffers import RecurrentDictRolloutBuffer, RecurrentRolloutBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+
+from cirl_marl.controllers.basic import Arrays
+from cirl_marl.errors import LearnerError
+from cirl_marl.learners.seat import Handed, JointStep, Seat
+from cirl_marl.learners.teams.copies import AgentInCopy, Copies
+from cirl_marl.learners.views import ObservedRows, OneAgent
+from cirl_marl.network import Floats
+
+WHOLE = (ReplayBuffer, DictReplayBuffer)
+"""Replay buffers in which every row of a step is a transition by itself."""
+
+
+class TeamSeat(Seat):
+    """The seat of one agent of any environment, who may be absent in some copies or in all.
+
+    Attributes:
+        present: rows in which the agent acts next.
+        counted: rows in which it acted in the step that was handed over last.
+        missed_steps: joint steps in which it was not asked.
+        leave_out: called when there are rows for the first time that are to be left out; raises if they cannot be.
+    """
+
+    def __init__(self, copies: Copies, agent: str, wait: Callable[[], object]) -> None:
+        """Seat the learner of ``agent``."""
+        super().__init__(copies, agent, OneAgent(copies, agent), wait, AgentInCopy)
+        self._joint = copies
+        self.missed_steps = 0
+        self.present = self.counted = np.ones(copies.num_envs, dtype=bool)
+        self.leave_out: Callable[[], None] | None = None
+
+    @property
+    def absent(self) -> bool:
+        """Whether the agent is in no copy."""
+        return not self.present.any()
+
+    def show(self, observations: Arrays, state: Callable[[], Floats]) -> None:
+        """Show the first observation."""
+        super().show(observations, state)
+        self._meet(self._joint.present[self.name])
+
+    def hand(self, step: JointStep) -> None:
+        """Hand over what the joint step brought; what came while the agent was away belongs to the step before."""
+        acted, before, known = self.present, self.handed, self.absent
+        super().hand(step)
+        present = self._joint.present[self.name]
+        back = present & ~acted
+        if known:
+            self.handed = _later(before, self.handed.seen, back)
+        else:
+            self.counted = acted
+            if back.any():
+                self.handed = _later(self.handed, self.handed.seen, back, before.seen)
+        if not self.counted.all() and self.leave_out is not None:
+            leave_out, self.leave_out = self.leave_out, None
+            leave_out()
+        self._meet(present)
+
+    def _meet(self, present: NDArray[np.bool_]) -> None:
+        self.present = present
+        self.missed_steps += self.absent
+
+
+def _later(handed: Handed, seen: ObservedRows, back: NDArray[np.bool_], last: ObservedRows | None = None) -> Handed:
+    """Return what is handed over when the agent is ``back`` in some rows, which end what stood there until then."""
+    none = np.zeros(len(back))
+    truncated = handed.ended if handed.truncated is None else handed.truncated
+    return Handed(
+        seen,
+        handed.rewards,
+        handed.ended | back,
+        _where(back & ~handed.ended, handed.seen if last is None else last, handed.final),
+        none if handed.returns is None else handed.returns,
+        none.astype(int) if handed.lengths is None else handed.lengths,
+        truncated & handed.ended,
+    )
+
+
+def _where(rows: NDArray[np.bool_], one: ObservedRows, other: ObservedRows | None) -> ObservedRows:
+    """Return ``one`` in some rows and ``other`` elsewhere; all of ``one`` if there is no other."""
+    if other is None:
+        return one
+    if isinstance(one, dict) and isinstance(other, dict):
+        return {key: _where(rows, one[key], other[key]) for key in one}  # type: ignore[misc]
+    assert isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
+    found = other.copy()
+    found[rows] = one[rows]
+    return found
+
+
+class _Rollout(RolloutBuffer):
+    """Rollouts of which only rows in which the agent acted are learnt."""
+
+    seat: TeamSeat
+    acted: NDArray[np.bool_]
+
+    def reset(self) -> None:
+        super().reset()
+        self.acted = np.ones((self.buffer_size, self.n_envs), dtype=bool)
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        self.acted[self.pos] = self.seat.counted
+        super().add(*args, **kwargs)
+
+    def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
+        if self.acted.all():
+            yield from super().get(batch_size)
+            return
+        next(super().get(1))  # it lays the steps of a row one after the other
+        order = np.random.permutation(np.flatnonzero(self.acted.T))  # noqa: NPY002 (the learner's own stream)
+        size = len(order) if batch_size is None else batch_size
+        for start in range(0, len(order), size):
+            yield self._get_samples(order[start : start + size])
+
+
+class _Replay(ReplayBuffer):
+    """A replay buffer into which no row goes in which the agent did not act."""
+
+    seat: TeamSeat
+
+    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:  # type: ignore[override]
+        counted = self.seat.counted
+        rows = np.arange(self.n_envs)
+        acted = np.flatnonzero(counted)
+        rows[~counted] = np.resize(acted, self.n_envs - len(acted))
+        told = [infos[row] for row in rows]
+        super().add(_chosen(obs, rows), _chosen(next_obs, rows), action[rows], reward[rows], done[rows], told)
+
+
+def _chosen(seen: Any, rows: NDArray[np.integer]) -> Any:
+    return {key: part[rows] for key, part in seen.items()} if isinstance(seen, dict) else seen[rows]
+
+
+class _Moments(RunningMeanStd):
+    """Moments of the rows that somebody acts in."""
+
+    seat: TeamSeat
+    which: str
+
+    def update(self, arr: NDArray[Any]) -> None:
+        super().update(arr[getattr(self.seat, self.which)])
+
+
+def leave_out_absent(model: BaseAlgorithm, env: Any, seat: TeamSeat) -> None:
+    """Let a learner learn only from rows of its ``seat`` in which the agent is present.
+
+    Raises:
+        LearnerError: for algorithms that learn from whole sequences of rows.
+    """
+    rollout, replay = getattr(model, "rollout_buffer", None), getattr(model, "replay_buffer", None)
+    sequences = isinstance(rollout, RecurrentRolloutBuffer | RecurrentDictRolloutBuffer)
+    if isinstance(rollout, RolloutBuffer) and not sequences:
+        _become(rollout, _Rollout, seat)
+        rollout.acted = np.ones((rollout.buffer_size, rollout.n_envs), dtype=bool)  # type: ignore[attr-defined]
+    elif replay is not None and type(replay) in WHOLE and not replay.optimize_memory_usage:
+        _become(replay, _Replay, seat)
+    else:
+        raise LearnerError(
+            f"{seat.title}: is absent in some copies while it acts in others, and {type(model).__name__} cannot leave "
+            f"those out; use num_envs=1, or another algorithm"
+        )
+    if isinstance(env, VecNormalize):
+        seen = env.obs_rms.values() if isinstance(env.obs_rms, dict) else [env.obs_rms]
+        for which, moments in (("counted", env.ret_rms), *(("present", each) for each in seen)):
+            _become(moments, _Moments, seat)
+            moments.which = which  # type: ignore[attr-defined]
+
+
+def _become(thing: Any, kind: type, seat: TeamSeat) -> None:
+    """Make an object one of ``kind`` as well, with what it has in it."""
+    thing.__class__ = type(f"Present{type(thing).__name__}", (kind, type(thing)), {})
+    thing.seat = seat
