@@ -16,7 +16,7 @@ from cirl_marl.network import Floats
 
 MakeEnv = Callable[[], Any]
 """Makes an environment: a PettingZoo ``ParallelEnv`` or ``AECEnv``."""
-Rows = NDArray[Any] | dict[str, NDArray[Any]]
+Observed = NDArray[Any] | dict[str, NDArray[Any]]
 """Observations of an agent in all copies."""
 MASK = "action_mask"
 """Key of an observation, or of the infos, under which PettingZoo's environments tell which actions are legal."""
@@ -69,12 +69,14 @@ class Copies:
         self._place = {name: place for place, name in enumerate(self.agents)}
         self.observation_spaces = {name: first.observation_space(own) for name, own in self._own.items()}
         self.action_spaces = {name: first.action_space(own) for name, own in self._own.items()}
+        for name, space in self.observation_spaces.items():
+            _check(name, space)
         self.present = {name: np.zeros(num_envs, dtype=bool) for name in self.agents}
         self.masks: dict[str, NDArray[np.int8]] = {}
         self.begun = np.ones(num_envs, dtype=bool)
-        self._seen: dict[str, Rows] = {name: _blank(self.observation_spaces[name], num_envs) for name in self.agents}
+        self._seen: dict[str, Observed] = {name: _blank(self.observation_spaces[name], num_envs) for name in self.agents}
 
-    def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, Rows]:
+    def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, Observed]:
         """Begin an episode in every copy, with one of the seeds each; return what everybody sees."""
         self._renew()
         for i in range(self.num_envs):
@@ -201,18 +203,31 @@ class AgentInCopy:
         return getattr(self.env, name)
 
 
-def _blank(space: spaces.Space[Any], copies: int) -> Rows:
+def _blank(space: spaces.Space[Any], copies: int) -> Observed:
     """Return zeros in the form of a space, for copies in which nothing was seen yet."""
     if isinstance(space, spaces.Dict):
         return {key: np.zeros((copies, *(part.shape or ())), dtype=part.dtype) for key, part in space.spaces.items()}
     return np.zeros((copies, *(space.shape or ())), dtype=space.dtype)
 
 
-def _copied(rows: Rows) -> Rows:
+def _check(agent: str, space: spaces.Space[Any]) -> None:
+    """Refuse what no learner can take: arrays, numbers, or a dict of such."""
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    plain = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+    for key, part in parts.items():
+        if not isinstance(part, plain):
+            named = f" '{key}'" if key else ""
+            raise CirlError(
+                f"agent '{agent}': learners cannot take its observation{named}, which is {part}; wrap the environment "
+                f"so that it gives a Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these"
+            )
+
+
+def _copied(rows: Observed) -> Observed:
     return {key: part.copy() for key, part in rows.items()} if isinstance(rows, dict) else rows.copy()
 
 
-def _put(rows: Rows, i: int, seen: Any, space: spaces.Space[Any], where: str) -> None:
+def _put(rows: Observed, i: int, seen: Any, space: spaces.Space[Any], where: str) -> None:
     """Write what an agent sees into a row."""
     parts = [(None, rows)] if not isinstance(rows, dict) else list(rows.items())
     for key, part in parts:

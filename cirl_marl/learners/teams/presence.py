@@ -38,7 +38,6 @@ class TeamSeat(Seat):
         present: rows in which the agent acts next.
         counted: rows in which it acted in the step that was handed over last.
         missed_steps: joint steps in which it was not asked.
-        leave_out: called when there are rows for the first time that are to be left out; raises if they cannot be.
     """
 
     def __init__(self, copies: Copies, agent: str, wait: Callable[[], object]) -> None:
@@ -47,7 +46,7 @@ class TeamSeat(Seat):
         self._joint = copies
         self.missed_steps = 0
         self.present = self.counted = np.ones(copies.num_envs, dtype=bool)
-        self.leave_out: Callable[[], None] | None = None
+        self._leave_out: Callable[[], None] | None = None
 
     @property
     def absent(self) -> bool:
@@ -71,14 +70,23 @@ class TeamSeat(Seat):
             self.counted = acted
             if back.any():
                 self.handed = _later(self.handed, self.handed.seen, back, before.seen)
-        if not self.counted.all() and self.leave_out is not None:
-            leave_out, self.leave_out = self.leave_out, None
-            leave_out()
         self._meet(present)
+
+    def at_first_gap(self, leave_out: Callable[[], None]) -> None:
+        """Have ``leave_out`` called as soon as the agent is absent in some rows, not in all; it may raise."""
+        self._leave_out = leave_out
+        self._notice_gap()
 
     def _meet(self, present: NDArray[np.bool_]) -> None:
         self.present = present
         self.missed_steps += self.absent
+        self._notice_gap()
+
+    def _notice_gap(self) -> None:
+        whole = self.counted.all() and (self.present.all() or self.absent)
+        if not whole and self._leave_out is not None:
+            leave_out, self._leave_out = self._leave_out, None
+            leave_out()
 
 
 def _later(handed: Handed, seen: ObservedRows, back: NDArray[np.bool_], last: ObservedRows | None = None) -> Handed:
@@ -138,7 +146,7 @@ class _Replay(ReplayBuffer):
 
     seat: TeamSeat
 
-    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:  # type: ignore[override]
+    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
         counted = self.seat.counted
         rows = np.arange(self.n_envs)
         acted = np.flatnonzero(counted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path, PurePath
@@ -32,7 +32,7 @@ from cirl_marl.learners.teams.presence import TeamSeat, leave_out_absent
 from cirl_marl.learners.training import one_torch_thread
 from cirl_marl.learners.trees import read_tree, write_tree
 
-Algorithm = type[BaseAlgorithm] | partial[BaseAlgorithm]
+Algorithm = Callable[..., BaseAlgorithm]
 """A class of Stable-Baselines3 or sb3-contrib, or one with parameters: ``functools.partial(PPO, n_steps=128)``."""
 
 
@@ -105,7 +105,7 @@ class Team:
         with one_torch_thread():
             for agent, seat in seats.items():
                 learner = Learner(seat, settings[agent], seed).build()
-                seat.leave_out = partial(leave_out_absent, learner.model, learner.env, seat)
+                seat.at_first_gap(partial(leave_out_absent, learner.model, learner.env, seat))
                 self.learners[agent] = learner
 
     def __getitem__(self, agent: str) -> BaseAlgorithm:
@@ -279,12 +279,12 @@ def _settings(agent: str, algorithm: Algorithm, seen: spaces.Space[Any], normali
         raise RecipeError(f"agent '{agent}': {name}: give a policy by its name and parameters by theirs, got {asked}")
     if reserved := sorted(set(parameters) & set(RESERVED)):
         raise RecipeError(f"agent '{agent}': {name}: {', '.join(reserved)}: the team sees to that")
-    policy = asked[0] if asked else _policy_for(seen)
+    policy = asked[0] if asked else _policy_for(seen, known[name])
     own = Normalisation(observation=normalise, reward=normalise)
     return LearnerSettings(algorithm=name, policy=policy, parameters=parameters, normalise=own)
 
 
-def _policy_for(seen: spaces.Space[Any]) -> str:
-    if isinstance(seen, spaces.Dict):
-        return "MultiInputPolicy"
-    return "CnnPolicy" if is_image_space(seen) else "MlpPolicy"
+def _policy_for(seen: spaces.Space[Any], kind: type[BaseAlgorithm]) -> str:
+    """Return the first policy of an algorithm for observations of a space."""
+    prefix = "MultiInput" if isinstance(seen, spaces.Dict) else "Cnn" if is_image_space(seen) else "Mlp"
+    return next((alias for alias in kind.policy_aliases if alias.startswith(prefix)), f"{prefix}Policy")
