@@ -74,7 +74,9 @@ class Copies:
         self.present = {name: np.zeros(num_envs, dtype=bool) for name in self.agents}
         self.masks: dict[str, NDArray[np.int8]] = {}
         self.begun = np.ones(num_envs, dtype=bool)
-        self._seen: dict[str, Observed] = {name: _blank(self.observation_spaces[name], num_envs) for name in self.agents}
+        self._seen: dict[str, Observed] = {
+            name: _blank(self.observation_spaces[name], num_envs) for name in self.agents
+        }
 
     def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, Observed]:
         """Begin an episode in every copy, with one of the seeds each; return what everybody sees."""
