@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import sys
 import warnings
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from mpe2 import simple_spread_v3
 from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 import cirl_marl
 from cirl_marl.learners.teams.copies import Copies
@@ -53,7 +55,7 @@ def shared(seed: int) -> list[float]:
     env = supersuit.pettingzoo_env_to_vec_env_v1(make_env())
     env = supersuit.concat_vec_envs_v1(env, COPIES, num_cpus=1, base_class="stable_baselines3")
     model = PPO("MlpPolicy", env, device="cpu", **{**LEARNS, "batch_size": 1500})  # it takes no seed
-    model.set_random_seed = lambda seed=None: None  # type: ignore[method-assign]
+    model.set_random_seed = lambda seed=None: None
     agents = make_env().possible_agents
     found = [mean_return(dict.fromkeys(agents, model))]
     for _ in range(POINTS):
@@ -64,7 +66,7 @@ def shared(seed: int) -> list[float]:
     return found
 
 
-def mean_return(models: dict[str, PPO]) -> float:
+def mean_return(models: Mapping[str, BaseAlgorithm]) -> float:
     """Return the mean over fresh episodes of the sum of what all agents are paid."""
     copies = Copies(make_env, 10)
     seen = copies.reset(seed=list(range(10**6, 10**6 + 10)))
