@@ -206,9 +206,8 @@ class Seat(VecEnv):
                 infos[row] = {
                     "TimeLimit.truncated": self.bootstrap and limited,
                     "terminal_observation": _row(now.final, int(row)),
+                    "episode": {"r": float(now.returns[row]), "l": int(now.lengths[row]), "t": 0.0},
                 }
-                if now.lengths[row]:
-                    infos[row]["episode"] = {"r": float(now.returns[row]), "l": int(now.lengths[row]), "t": 0.0}
         return self.reset(), rewards, ended, infos
 
     def close(self) -> None:

@@ -10,6 +10,7 @@ buffers, the transition of another row stands in the place.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.errors import LearnerError
-from cirl_marl.learners.seat import Handed, JointStep, Seat
+from cirl_marl.learners.seat import JointStep, Seat
 from cirl_marl.learners.teams.copies import AgentInCopy, Copies
-from cirl_marl.learners.views import ObservedRows, OneAgent
+from cirl_marl.learners.views import OneAgent
 from cirl_marl.network import Floats
 
 WHOLE = (ReplayBuffer, DictReplayBuffer)
@@ -60,17 +61,13 @@ class TeamSeat(Seat):
 
     def hand(self, step: JointStep) -> None:
         """Hand over what the joint step brought; what came while the agent was away belongs to the step before."""
-        acted, before, known = self.present, self.handed, self.absent
+        acted, before, away = self.present, self.handed, self.absent
         super().hand(step)
-        present = self._joint.present[self.name]
-        back = present & ~acted
-        if known:
-            self.handed = _later(before, self.handed.seen, back)
+        if away:
+            self.handed = replace(before, seen=self.handed.seen)
         else:
             self.counted = acted
-            if back.any():
-                self.handed = _later(self.handed, self.handed.seen, back, before.seen)
-        self._meet(present)
+        self._meet(self._joint.present[self.name])
 
     def at_first_gap(self, leave_out: Callable[[], None]) -> None:
         """Have ``leave_out`` called as soon as the agent is absent in some rows, not in all; it may raise."""
@@ -87,33 +84,6 @@ class TeamSeat(Seat):
         if not whole and self._leave_out is not None:
             leave_out, self._leave_out = self._leave_out, None
             leave_out()
-
-
-def _later(handed: Handed, seen: ObservedRows, back: NDArray[np.bool_], last: ObservedRows | None = None) -> Handed:
-    """Return what is handed over when the agent is ``back`` in some rows, which end what stood there until then."""
-    none = np.zeros(len(back))
-    truncated = handed.ended if handed.truncated is None else handed.truncated
-    return Handed(
-        seen,
-        handed.rewards,
-        handed.ended | back,
-        _where(back & ~handed.ended, handed.seen if last is None else last, handed.final),
-        none if handed.returns is None else handed.returns,
-        none.astype(int) if handed.lengths is None else handed.lengths,
-        truncated & handed.ended,
-    )
-
-
-def _where(rows: NDArray[np.bool_], one: ObservedRows, other: ObservedRows | None) -> ObservedRows:
-    """Return ``one`` in some rows and ``other`` elsewhere; all of ``one`` if there is no other."""
-    if other is None:
-        return one
-    if isinstance(one, dict) and isinstance(other, dict):
-        return {key: _where(rows, one[key], other[key]) for key in one}  # type: ignore[misc]
-    assert isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
-    found = other.copy()
-    found[rows] = one[rows]
-    return found
 
 
 class _Rollout(RolloutBuffer):
