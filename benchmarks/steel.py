@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.document import write_sections
-from cirl_marl import CirlError, VectorEnv, load_network
+from benchmarks.plans import plan_lines
+from cirl_marl import VectorEnv, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import Rollout, beginning, rollout
+from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.tables import FlowTable, read_flows
 from cirl_marl.network import Floats
-from cirl_marl.optimum import achieved, bound, gap, improved
 from cirl_marl.records.files import write_table
 
 ROOT = Path(__file__).parent.parent
@@ -380,35 +379,6 @@ def hindcast_lines(found: Sequence[Past]) -> Iterator[str]:
         yield f"| {what} | | {ours:.1%} | {theirs:.1%} | | |"
 
 
-def plan_lines(names: Sequence[str]) -> Iterator[str]:
-    """Yield the table of bounds and plans at full service."""
-    yield "| country | as usual, Mt | bound, Mt | plan, Mt | gap | bound, s | plan, s |"
-    yield "|-|-|-|-|-|-|-|"
-    for name, region in identifiers(names).items():
-        network = load_network(f"{ENVS / 'steel.toml'}:{region}")
-        env = VectorEnv(network, num_envs=1)
-        begun = beginning(env)
-        usual = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
-        begin = time.perf_counter()
-        try:
-            found = bound(network, min_service=1.0)
-        except CirlError as error:
-            yield f"| {name} | {_megatonnes(usual)} | {str(error).partition(': ')[2][:60]} | | | | |"
-            continue
-        solved = time.perf_counter()
-        run = achieved(improved(found))
-        done = time.perf_counter()
-        off = float(gap(found.verify().bound, run.episode_circularity[0]))
-        seconds = f"{solved - begin:.0f} | {done - begin:.0f}"
-        least = "" if float(run.levels[0].mean(axis=1).min()) >= 1 - 1e-6 else " (service short)"
-        said = f"{found.objective / 1e3:.2f} | {_megatonnes(run)}{least} | {off:.2%}"
-        yield f"| {name} | {_megatonnes(usual)} | {said} | {seconds} |"
-
-
-def _megatonnes(run: Rollout) -> str:
-    return f"{run.episode_circularity[0] / 1e3:.2f}"
-
-
 def main() -> None:
     """Write the data files, or a table of ``docs/data.md``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -420,7 +390,9 @@ def main() -> None:
     if asked.hindcast:
         write_sections(DOCUMENT, {"hindcast": "\n".join(hindcast_lines(pasts(everyone)))})
     if asked.plans:
-        write_sections(DOCUMENT, {"plans": "\n".join(plan_lines([each.name for each in everyone]))})
+        found = identifiers([each.name for each in everyone])
+        networks = {name: load_network(f"{ENVS / 'steel.toml'}:{region}") for name, region in found.items()}
+        write_sections(DOCUMENT, {"plans": "\n".join(plan_lines("country", networks, unit=1e3))})
     if not asked.hindcast and not asked.plans:
         write_all(everyone)
 

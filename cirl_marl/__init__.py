@@ -5,7 +5,7 @@ reward is the circularity λ(N;t) of the network.
 
 >>> import cirl_marl
 >>> cirl_marl.networks()[:3]
-['carbo_net', 'copper_net', 'net_zero']
+['aluminium_world', 'carbo_net', 'copper_net']
 """
 
 from importlib import import_module
