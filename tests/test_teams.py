@@ -263,7 +263,9 @@ def test_normalisers_do_not_know_absent_rows() -> None:
 
 def test_who_learns_from_sequences_needs_one_copy() -> None:
     """Recurrent policies and ARS say so when somebody is absent in some copies; in one they learn."""
-    kinds: tuple[Any, ...] = (partial(RecurrentPPO, n_steps=8, batch_size=8), ARS)
+    thrifty = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    thrifty_dqn: Any = partial(DQN, buffer_size=100, **thrifty)  # type: ignore[arg-type]
+    kinds: tuple[Any, ...] = (partial(RecurrentPPO, n_steps=8, batch_size=8), ARS, thrifty_dqn)
     for kind in kinds:
         lengths = iter([7, 5, 7])
         team = cirl_marl.independent(lambda: Shifts(PAIR, next(lengths)), kind, num_envs=2)  # noqa: B023

@@ -133,7 +133,6 @@ class Copies:
         """Begin new arrays of what changes in a step: learners may have kept those that there were."""
         self.present = {name: np.zeros(self.num_envs, dtype=bool) for name in self.agents}
         self.begun = np.zeros(self.num_envs, dtype=bool)
-        self.masks = {name: mask.copy() for name, mask in self.masks.items()}
         self._seen = {name: _copied(rows) for name, rows in self._seen.items()}
 
     def _begin(self, i: int, seed: int | None) -> None:
