@@ -21,6 +21,7 @@ from cirl_marl.cli.common import (
     shares,
 )
 from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.jobs import PLACES
 from cirl_marl.optimum.named import CONTROLLERS
 
 
@@ -81,6 +82,8 @@ def pareto(
     ] = None,
     episodes: EpisodeCount = 16,
     scenario: Scenario = None,
+    on: Annotated[str, typer.Option(help=f"Where learners are trained: {', '.join(PLACES)}.")] = "here",
+    workers: Annotated[int | None, typer.Option(min=1, help="Trainings at a time; default: all that can be.")] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK[_SCENARIO]."),
@@ -100,7 +103,8 @@ def pareto(
     asked: dict[str, Any] = {"points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
     try:
         with shares() as progress:
-            found = swept(network, recipe, directory=folder, scenario=scenario, progress=progress, **asked)
+            where: dict[str, Any] = {"directory": folder, "on": on, "workers": workers}
+            found = swept(network, recipe, scenario=scenario, progress=progress, **where, **asked)
     except KeyboardInterrupt:
         say(f"\nstopped; finished trainings are kept in {folder}. The same command goes on.")
         raise typer.Exit(130) from None

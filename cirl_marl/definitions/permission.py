@@ -20,6 +20,11 @@ def code_allowed(allowed: bool = True) -> Iterator[None]:
         _ALLOWED.reset(token)
 
 
+def is_code_allowed() -> bool:
+    """Return whether definitions may import the models that they name; other processes have to be told."""
+    return _ALLOWED.get()
+
+
 def refusal(kind: str) -> str | None:
     """Return why the model of that kind may not be imported; None if it may, or need not be."""
     module = kind.partition(":")[0]

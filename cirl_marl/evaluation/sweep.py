@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cirl_marl import learners
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import CirlError, RunError
@@ -18,7 +16,9 @@ from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.evaluation.contenders import differences
 from cirl_marl.evaluation.yardsticks import FRONT
+from cirl_marl.jobs import Standing, Tell, raise_first, run_jobs
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
+from cirl_marl.learners.completion import completed
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
 from cirl_marl.optimum.maximise import highest_service
@@ -76,6 +76,8 @@ def pareto(
     seeds: int = 1,
     steps: int | None = None,
     episodes: int = 16,
+    on: str = "here",
+    workers: int | None = None,
     progress: ProgressReport = lambda what, share: None,
 ) -> Sweep:
     """Sweep the weight between circularity and service.
@@ -94,12 +96,14 @@ def pareto(
         seeds: training seeds 0, 1, … of each weight.
         steps: environment steps of each training; None is the recipe's.
         episodes: fresh episodes on which each policy is evaluated.
+        on: where learners are trained: ``here``, ``local``, ``slurm`` or ``ray``, see ``jobs.run_jobs``.
+        workers: how many are trained at a time; None is all that the place has.
         progress: as for ``compare``.
 
     Raises:
         CirlError: for input that cannot be used, or a reward in which the weight has no part.
         NoCertificate: if there is no bound and nothing to train either.
-        RunError: if ``directory`` holds the runs of something else.
+        RunError: if ``directory`` holds the runs of something else, or a training fails elsewhere.
     """
     if points < 2 or seeds < 1:
         raise CirlError(f"points must be at least 2 and seeds at least 1, got {points} and {seeds}")
@@ -107,7 +111,13 @@ def pareto(
     chosen = _unpriced(load_recipe(recipe) if isinstance(recipe, str | Path) else recipe)
     if chosen is not None:
         _check_fit(found, chosen)
-    share = 1.0 if chosen is None else points / (points + points * seeds)
+    asked: list[_Asked] = []
+    if chosen is not None:
+        weights = [(place / (points - 1), seed) for place in range(points) for seed in range(seeds)]
+        asked = [_Asked(found, chosen, weight, seed, steps, directory / "runs") for weight, seed in weights]
+        for each in asked:
+            each.check()
+    share = points / (points + len(asked))
     reason = ""
     possible: tuple[Point, ...] = ()
     front = np.empty((0, 2))
@@ -119,53 +129,70 @@ def pareto(
         reason, share = str(missing), 0.0
     if chosen is None:
         return Sweep(found, None, possible, front=front)
-    runs = []
-    for place in range(points * seeds):
-        asked = _Asked(found, chosen, place // seeds / (points - 1), place % seeds, steps)
-        each = (1 - share) / (points * seeds)
-        told = part_of(progress, f"training {asked}", share + each * place, each)
-        runs.append(asked.run(directory / "runs", told))
+
+    def watch(standings: Sequence[Standing]) -> None:
+        busy = [each.name for each in standings if each.state == "running"]
+        done = sum(each.share for each in standings) / len(standings)
+        progress(f"training {', '.join(busy)}", share + (1 - share) * done)
+
+    raise_first(run_jobs(asked, directory / "runs" / "jobs", on=on, workers=workers, watch=watch))
+    runs = [each.directory for each in asked]
     return Sweep(found, chosen, (*possible, *_learnt(runs, episodes)), tuple(runs), reason, front)
 
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """A training run of a sweep."""
+    """A training run of a sweep, as a job."""
 
     network: Network
     recipe: Recipe
     weight: float
     seed: int
     steps: int | None
+    folder: Path
 
-    def __str__(self) -> str:
-        return f"weight {self.weight:.3g}, seed {self.seed}"
+    @property
+    def name(self) -> str:
+        """Name of its directory."""
+        return f"{self.recipe.name}-weight{self.weight:.6g}-seed{self.seed}"
 
-    def run(self, folder: Path, progress: Callable[[float], None]) -> RunDirectory:
-        """Train, go on training, or find the finished run."""
-        run = RunDirectory(folder / f"{self.recipe.name}-weight{self.weight:.6g}-seed{self.seed}")
+    @property
+    def directory(self) -> RunDirectory:
+        """The run."""
+        return RunDirectory(self.folder / self.name)
 
-        def report(now: learners.Progress) -> None:
-            progress(now.env_steps / max(now.total, 1))
+    @property
+    def _is_begun(self) -> bool:
+        return (self.directory.path / "config.json").is_file()
 
-        if not run.path.exists():
-            options: dict[str, Any] = {"steps": self.steps, "seed": self.seed, "circularity_weight": self.weight}
-            learners.train(self.network, self.recipe, directory=run.path, report=report, **options)
-            return run
-        self._check(run)
-        if run.status["state"] != "complete":
-            learners.resume(run.path, report=report)
-        return run
+    def is_done(self) -> bool:
+        """Return whether the run is complete."""
+        return self._is_begun and self.directory.status["state"] == "complete"
 
-    def _check(self, run: RunDirectory) -> None:
-        """Refuse a run that answers another question."""
-        config = run.config
+    def run(self, tell: Tell) -> None:
+        """Train, or go on training."""
+        completed(
+            self.directory.path,
+            self.network,
+            self.recipe,
+            report=lambda now: tell("training", now.env_steps, max(now.total, 1)),
+            steps=self.steps,
+            seed=self.seed,
+            circularity_weight=self.weight,
+        )
+
+    def check(self) -> None:
+        """Refuse a run that is there and answers another question."""
+        if not self._is_begun:
+            return
+        config = self.directory.config
         steps = self.recipe.run.steps if self.steps is None else self.steps
-        found = list(differences(run.make_env(1), _env(self.network, self.recipe)))
+        found = list(differences(self.directory.make_env(1), _env(self.network, self.recipe)))
         found += [f"{config.steps} steps, not {steps}"] if config.steps != steps else []
         found += ["another recipe of this name"] if config.recipe != self.recipe else []
         if found:
-            raise RunError(f"{run.path}: is of another sweep ({'; '.join(found)}); choose another folder")
+            path = self.directory.path
+            raise RunError(f"{path}: is of another sweep ({'; '.join(found)}); choose another folder")
 
 
 def _unpriced(recipe: Recipe | None) -> Recipe | None:

@@ -1,0 +1,172 @@
+"""``cirl sweep``: many trainings, on every core or machine."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.live import Live
+from rich.table import Table
+
+from cirl_marl.cli.common import app, console, errors, folder_for
+from cirl_marl.errors import CirlError
+from cirl_marl.jobs import PLACES
+
+if TYPE_CHECKING:
+    from cirl_marl.sweeps import CellStanding
+
+ROWS = 30
+"""Most rows of the live table; those at work come first."""
+ORDER = ("running", "elsewhere", "failed", "waiting", "done")
+OPTIONS_SHOWN: tuple[str, ...] = (
+    "steps",
+    "envs",
+    "engine",
+    "min_service",
+    "reward",
+    "observe",
+    "circularity_in_reward",
+)
+OPTIONS_SHOWN += ("circularity_weight", "horizon", "uncertain")
+"""Columns of the results that are shown if they differ between cells of one recipe."""
+
+
+@app.command()
+def sweep(
+    file: Annotated[Path, typer.Argument(metavar="SWEEP", help="Sweep file: networks, scenarios, recipes, seeds.")],
+    on: Annotated[str, typer.Option(help=f"Where the cells are trained: {', '.join(PLACES)}.")] = "local",
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Cells at a time; default: as many as there are cores, or the place has.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the sweep; default: runs/sweep-NAME.")] = None,
+    slurm: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="A setting of submitit, such as slurm_partition=long; repeatable."),
+    ] = None,
+    checkpoint_every: Annotated[
+        float | None, typer.Option(min=0, help="Seconds between checkpoints; 0: none by time.", show_default="60")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the results as JSON; all else goes to stderr.")
+    ] = False,
+) -> None:
+    """Train every cell of a sweep as a run of its own, and hold each against the bound.
+
+    The cells are networks x scenarios x recipes x options x seeds. The same command does what is missing and goes on
+    with what was interrupted; several may share a folder. Results are in sweep.csv. Exit code 1: cells have failed.
+    """
+    from cirl_marl.sweeps import sweep as swept
+
+    if out is not None:
+        folder_for(out, "--out")
+    printer = errors if as_json else console
+    options: dict[str, Any] = {"on": on, "workers": workers, "out": out, "settings": _settings(slurm or [])}
+    try:
+        with _live(as_json) as watch:
+            found = swept(
+                file,
+                **options,
+                checkpoint_every=checkpoint_every,
+                watch=watch,
+                say=lambda line: printer.print(line, soft_wrap=True, highlight=False, markup=False),
+            )
+    except KeyboardInterrupt:
+        where = out or Path("runs") / f"sweep-{file.stem}"
+        said = f"\nstopped; everything learnt is kept in {where}. The same command goes on."
+        printer.print(said, soft_wrap=True, highlight=False)
+        raise typer.Exit(130) from None
+    if as_json:
+        sys.stdout.write(json.dumps(found.rows, indent=2) + "\n")
+    else:
+        console.print(_results(found.rows))
+    done = sum(row["state"] == "done" for row in found.rows)
+    said = f"{done} of {len(found.rows)} cells done; table: {found.folder / 'sweep.csv'}"
+    printer.print(said, soft_wrap=True, highlight=False)
+    for failure in found.failures:
+        errors.print(f"failed: {failure}", soft_wrap=True, highlight=False, markup=False)
+    if found.failures:
+        raise typer.Exit(1)
+
+
+def _settings(given: Sequence[str]) -> dict[str, str]:
+    """Return settings by name."""
+    for each in given:
+        if "=" not in each:
+            raise CirlError(f"--slurm {each}: must be NAME=VALUE, such as slurm_partition=long")
+    return {name: value for name, _, value in (each.partition("=") for each in given)}
+
+
+@contextmanager
+def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStanding]], None]]:
+    """Live table of all cells; where nobody looks on, a line for each cell that begins or ends."""
+    printer = errors if on_stderr else console
+    if printer.is_terminal:
+        with Live(console=printer, transient=True, auto_refresh=False) as live:
+            yield lambda standings: live.update(_table(standings), refresh=True)
+        return
+    before: dict[str, str] = {}
+
+    def tell(standings: Sequence[CellStanding]) -> None:
+        for each in standings:
+            name, state = each.standing.name, each.standing.state
+            if before.setdefault(name, "waiting") != state:
+                before[name] = state
+                line = f"{state}: {name}" + (
+                    f", gap {each.gap:.1%}" if state == "done" and each.gap is not None else ""
+                )
+                printer.print(line, soft_wrap=True, highlight=False, markup=False)
+
+    yield tell
+
+
+def _table(standings: Sequence[CellStanding]) -> Table:
+    """Draw who is how far."""
+    counts = {state: sum(each.standing.state == state for each in standings) for state in ORDER}
+    title = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    table = Table("cell", "state", "steps", "gap to the bound", title=title)
+    ordered = sorted(standings, key=lambda each: ORDER.index(each.standing.state))
+    for each in ordered[:ROWS]:
+        about = "" if each.standing.state == "done" else "~"
+        gap = "" if each.gap is None else f"{about}{each.gap:.1%}"
+        table.add_row(each.standing.name, _doing(each), _steps(each), gap)
+    if len(ordered) > ROWS:
+        table.add_row(f"… and {len(ordered) - ROWS} more", "", "", "")
+    return table
+
+
+def _doing(each: CellStanding) -> str:
+    doing = each.standing.figures.get("what", "") if each.standing.state in ("running", "elsewhere") else ""
+    return f"{each.standing.state} {doing}".strip()
+
+
+def _steps(each: CellStanding) -> str:
+    figures, steps = each.standing.figures, f"{each.cell.steps:,}"
+    if each.standing.state == "done" or figures.get("what", "").startswith("evaluat"):
+        return f"{steps} of {steps}"
+    return f"{figures['done']:,} of {steps}" if figures.get("what") == "training" else ""
+
+
+def _results(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Draw the results, with those options that were swept."""
+    fixed = ("network", "scenario", "recipe", "seed")
+    recipes = {row["recipe"] for row in rows}
+    shown = [*fixed, *(key for key in OPTIONS_SHOWN if len({(row["recipe"], row[key]) for row in rows}) > len(recipes))]
+    table = Table(*shown, "λ̄", "service", "gap to the bound")
+    for row in rows:
+        figures = (("circularity", "{:.5g}"), ("service", "{:.4f}"), ("gap", "{:.1%}"))
+        table.add_row(*(str(row[key]) for key in shown), *(_figure(row, key, form) for key, form in figures))
+    return table
+
+
+def _figure(row: Mapping[str, Any], key: str, form: str) -> str:
+    if row[key] is None:
+        return "—"
+    low, high = row[f"{key}_low"], row[f"{key}_high"]
+    interval = "" if low is None or high is None else f" [{form.format(low)}, {form.format(high)}]"
+    unit = f" {row['unit']}" if key == "circularity" else ""
+    return (form.format(row[key]) + interval + unit).replace("[", r"\[")

@@ -1,0 +1,212 @@
+"""The driver: it has what is missing done, sees who is how far, and names who died."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from filelock import Timeout
+
+from cirl_marl.definitions.permission import is_code_allowed
+from cirl_marl.errors import CirlError, RunError
+from cirl_marl.jobs.places import Place, Worker, place_of
+from cirl_marl.jobs.work import Job, JobFiles, Work, do
+
+State = Literal["waiting", "running", "elsewhere", "done", "failed"]
+POLL, WATCH = 0.1, 1.0
+"""Seconds between two looks at the workers, and between two calls of who watches."""
+PATIENCE = 60.0
+"""Seconds for workers that are told to stop to save what they have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A job that was not done: its name, in words why, and the exception if it was raised in this process."""
+
+    name: str
+    said: str
+    log: Path
+    error: Exception | None = None
+
+    def __str__(self) -> str:
+        """Say all of it in a line."""
+        return f"{self.name}: {self.said}" + (f" (log: {self.log})" if self.log.is_file() else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How far a job is.
+
+    Attributes:
+        state: ``elsewhere`` is what another driver has claimed.
+        figures: what the job told last, ``what`` it does and how much is ``done`` of a ``total`` among it.
+    """
+
+    name: str
+    state: State
+    figures: Mapping[str, Any]
+
+    @property
+    def share(self) -> float:
+        """Share that is done of what it does at the moment, or of all if it is done."""
+        return 1.0 if self.state == "done" else float(self.figures.get("done", 0)) / float(self.figures.get("total", 1))
+
+
+Watch = Callable[[Sequence[Standing]], None]
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    folder: Path,
+    *,
+    on: str = "here",
+    workers: int | None = None,
+    settings: Mapping[str, str] | None = None,
+    watch: Watch = lambda standings: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> list[Failure]:
+    """Do every job that is not done. One that fails, or whose worker dies, keeps no other from being done.
+
+    Jobs that somebody else has claimed are waited for, and done here if they are left undone. Whoever is killed leaves
+    nothing behind that would have to be cleared away: call this again.
+
+    Args:
+        jobs: with distinct names; they are begun in this order.
+        folder: where logs, locks and what was told are kept.
+        on: ``here`` (one after the other in this process), ``local``, ``slurm`` or ``ray``.
+        workers: how many work at a time; None is all that the place has.
+        settings: of submitit, for ``slurm``.
+        watch: called with the standing of every job, about once a second.
+        say: called with where the jobs are done.
+
+    Returns:
+        The jobs that were not done, each with the reason.
+
+    Raises:
+        CirlError: if the place is unknown or cannot be used; nothing is begun then.
+        KeyboardInterrupt: after Ctrl-C; workers are told to stop, and what they save is kept.
+    """
+    place = place_of(on, folder, workers, settings or {})
+    folder.mkdir(parents=True, exist_ok=True)
+    if place is not None:
+        say(place.said)
+    driver = _Driver(jobs, folder, watch)
+    try:
+        while driver.goes_on(place):
+            time.sleep(POLL)
+    finally:
+        driver.stop()
+    return driver.failures
+
+
+def raise_first(failures: Sequence[Failure]) -> None:
+    """Raise what the first of several jobs failed by, if any did.
+
+    Raises:
+        Exception: what it raised, if that was in this process.
+        RunError: what it said, if not.
+    """
+    for failure in failures:
+        raise failure.error or RunError(str(failure))
+
+
+class _Driver:
+    """What is waiting, who is at work, and what has failed."""
+
+    def __init__(self, jobs: Sequence[Job], folder: Path, watch: Watch) -> None:
+        self._files = {job.name: JobFiles(folder, job.name) for job in jobs}
+        if len(self._files) != len(jobs):
+            raise CirlError("jobs must have distinct names")
+        self._states: dict[str, State] = {job.name: "done" if job.is_done() else "waiting" for job in jobs}
+        self._waiting = [job for job in jobs if self._states[job.name] == "waiting"]
+        self._running: dict[str, tuple[Job, Worker]] = {}
+        self._told: dict[str, Mapping[str, Any]] = {}
+        self._watch, self._watched = watch, -WATCH
+        self.failures: list[Failure] = []
+
+    def goes_on(self, place: Place | None) -> bool:
+        """Look after those at work, start others, and return whether anything is left to be done."""
+        for job, worker in list(self._running.values()):
+            if (how := worker.ended()) is not None:
+                self._take_back(job, how)
+        for job in list(self._waiting):
+            if place is not None and len(self._running) >= place.workers:
+                break
+            if self._files[job.name].is_claimed():
+                self._states[job.name] = "elsewhere"
+            elif self._states[job.name] == "elsewhere" and job.is_done():
+                self._settle(job, "done")
+            elif place is None:
+                self._do_here(job)
+            else:
+                self._waiting.remove(job)
+                self._states[job.name] = "running"
+                self._told.pop(job.name, None)
+                self._running[job.name] = job, place.start(self._work(job))
+        left = bool(self._waiting or self._running)
+        self._look(at_once=not left)
+        return left
+
+    def stop(self) -> None:
+        """Tell all who are at work to stop, and wait for what they save."""
+        for _, worker in self._running.values():
+            worker.stop()
+        late = time.monotonic() + PATIENCE
+        while any(worker.ended() is None for _, worker in self._running.values()) and time.monotonic() < late:
+            time.sleep(POLL)
+
+    def _take_back(self, job: Job, how: str) -> None:
+        """Note how a worker ended: the job is done, has failed, or was somebody else's."""
+        del self._running[job.name]
+        files = self._files[job.name]
+        if job.is_done():
+            self._settle(job, "done")
+        elif not how:
+            self._waiting.append(job)
+            self._states[job.name] = "elsewhere"
+        else:
+            said = files.figures().get("said") or ": ".join(
+                filter(None, (how, files.last_words() or "it said nothing"))
+            )
+            self._settle(job, "failed", Failure(job.name, said, files.log))
+
+    def _do_here(self, job: Job) -> None:
+        """Do a job in this process, unless somebody was faster to claim it."""
+        files = self._files[job.name]
+        self._states[job.name] = "running"
+        try:
+            with files.lock():
+                do(lambda: job, files, self._look)
+        except Timeout:
+            self._states[job.name] = "elsewhere"
+        except Exception as error:  # of whatever kind: the others go on, and it is reported
+            said = f"{type(error).__name__}: {error}"
+            self._settle(job, "failed", Failure(job.name, said, files.log, error))
+        else:
+            self._settle(job, "done")
+
+    def _settle(self, job: Job, state: State, failure: Failure | None = None) -> None:
+        if job in self._waiting:
+            self._waiting.remove(job)
+        self._states[job.name] = state
+        self._told.pop(job.name, None)
+        if failure is not None:
+            self.failures.append(failure)
+
+    def _work(self, job: Job) -> Work:
+        return Work(pickle.dumps(job), self._files[job.name], os.getcwd(), is_code_allowed())
+
+    def _look(self, at_once: bool = False) -> None:
+        """Call who watches, unless that was a moment ago."""
+        if not at_once and time.monotonic() - self._watched < WATCH:
+            return
+        self._watched = time.monotonic()
+        for name, state in self._states.items():
+            if state in ("running", "elsewhere") or name not in self._told:
+                self._told[name] = self._files[name].figures()
+        self._watch([Standing(name, state, self._told[name]) for name, state in self._states.items()])

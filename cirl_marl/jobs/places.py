@@ -1,0 +1,263 @@
+"""Where jobs are done: ``here`` in this process, ``local`` on the cores of this machine, ``slurm``, ``ray``."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from multiprocessing import get_context, parent_process
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, Protocol
+
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.jobs.work import Work
+
+EXTRAS = {"submitit": "slurm", "ray": "ray"}
+"""Packages that a place needs, and the extra of this library that installs them."""
+MINUTES = 24 * 60
+"""Longest that a Slurm job may take unless something else is asked for; what is cut off goes on in another one."""
+
+
+class Worker(Protocol):
+    """Somebody who works on a job."""
+
+    def ended(self) -> str | None:
+        """Return None while at work, an empty text after an orderly end, and how it ended if it did otherwise."""
+
+    def stop(self) -> None:
+        """Ask for the end; what was learnt is saved first, if that can be done."""
+
+
+class Place(Protocol):
+    """Where jobs are done. ``workers`` work at a time, and ``said`` tells the user where that is."""
+
+    workers: int
+    said: str
+
+    def start(self, work: Work) -> Worker:
+        """Have a job done."""
+
+
+def cores() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class LocalProcess:
+    """A worker in a process of its own on this machine."""
+
+    def __init__(self, work: Work) -> None:
+        """Start it."""
+        self._process: BaseProcess = get_context("spawn").Process(target=_in_process, args=(work,))
+        with _one_thread():
+            self._process.start()
+
+    def ended(self) -> str | None:
+        """Say how the process ended."""
+        code = self._process.exitcode
+        if code is None or code == 0:
+            return None if code is None else ""
+        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+    def stop(self) -> None:
+        """Send SIGTERM, at which trainings are saved."""
+        self._process.terminate()
+
+
+class Local:
+    """The cores of this machine, a process for each job, so that nothing but its job dies with a worker."""
+
+    def __init__(self, workers: int | None) -> None:
+        """Take all cores if no number of ``workers`` is given."""
+        self.workers = workers or cores()
+        self.said = f"{self.workers} at a time on this machine"
+
+    def start(self, work: Work) -> LocalProcess:
+        """Start a process."""
+        return LocalProcess(work)
+
+
+def _in_process(work: Work) -> None:
+    """Do a job in this process, which ends when the one that started it is gone."""
+    if hasattr(os, "setsid"):
+        os.setsid()  # Ctrl-C is for the driver, which tells its workers
+    parent = parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=follow, daemon=True).start()
+    work()
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let processes that are started in the block compute on one thread each, unless the user said otherwise."""
+    given = "OMP_NUM_THREADS" in os.environ
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        yield
+    finally:
+        if not given:
+            del os.environ["OMP_NUM_THREADS"]
+
+
+class SlurmJob:
+    """A worker in a job of Slurm."""
+
+    def __init__(self, job: Any) -> None:
+        """Follow a job of submitit."""
+        self._job = job
+
+    def ended(self) -> str | None:
+        """Say how the job ended, by what submitit knows of it."""
+        if not self._job.done():
+            return None
+        error = self._job.exception()
+        return "" if error is None else f"{self._job.state}: {_last_line(error)}"
+
+    def stop(self) -> None:
+        """Cancel it."""
+        self._job.cancel()
+
+
+class Slurm:
+    """The queue of Slurm, through submitit; where there is no Slurm, submitit starts processes on this machine."""
+
+    def __init__(self, folder: Path, workers: int | None, settings: Mapping[str, str]) -> None:
+        """Set up submitit, whose own files go to ``folder``, with ``settings`` by its own names.
+
+        Raises:
+            CirlError: if submitit is not installed, or does not take the settings.
+        """
+        submitit = _wanted("submitit")
+        self._executor = submitit.AutoExecutor(folder=folder / "slurm")
+        parameters = {"name": "cirl", "cpus_per_task": 1, "timeout_min": MINUTES}
+        try:
+            self._executor.update_parameters(
+                **parameters | {name: int(value) if value.isdigit() else value for name, value in settings.items()}
+            )
+        except (NameError, TypeError, ValueError) as error:
+            raise CirlError(f"--slurm {_settings(settings)}: submitit says: {_last_line(error)}") from error
+        real = self._executor.cluster == "slurm"
+        self.workers = workers or (2**31 if real else cores())
+        at_once = "all" if workers is None and real else f"{self.workers}"
+        self.said = f"{at_once} at a time in the queue of Slurm"
+        if not real:
+            self.said = (
+                f"{at_once} at a time on this machine, as there is no Slurm here (no sbatch): submitit runs them"
+            )
+
+    def start(self, work: Work) -> SlurmJob:
+        """Put a job into the queue."""
+        with _one_thread():
+            return SlurmJob(self._executor.submit(work))
+
+
+class RayTask:
+    """A worker in a task of Ray."""
+
+    def __init__(self, ray: Any, reference: Any) -> None:
+        """Follow a task."""
+        self._ray, self._reference = ray, reference
+
+    def ended(self) -> str | None:
+        """Say how the task ended, by what Ray knows of it."""
+        ready, _ = self._ray.wait([self._reference], timeout=0)
+        if not ready:
+            return None
+        try:
+            self._ray.get(self._reference)
+        except Exception as error:  # whatever the job raised, and Ray's own
+            return _last_line(error)
+        return ""
+
+    def stop(self) -> None:
+        """Interrupt it, at which trainings are saved."""
+        self._ray.cancel(self._reference)
+
+
+class Ray:
+    """A cluster of Ray: that of RAY_ADDRESS, or a new one of the cores of this machine."""
+
+    def __init__(self, workers: int | None) -> None:
+        """Join or start the cluster.
+
+        Raises:
+            CirlError: if Ray is not installed, or there is no cluster at the address.
+        """
+        self._ray = _wanted("ray")
+        if not self._ray.is_initialized():
+            try:
+                self._ray.init(log_to_driver=False, include_dashboard=False if not _address() else None)
+            except (ConnectionError, ValueError) as error:
+                raise CirlError(f"no Ray at RAY_ADDRESS={_address()}: {_last_line(error)}") from error
+        found = int(self._ray.cluster_resources().get("CPU", 1))
+        self.workers = workers or found
+        self.said = f"{self.workers} at a time on the Ray cluster, which has {found} processors"
+        self._do = self._ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_in_task)
+
+    def start(self, work: Work) -> RayTask:
+        """Start a task in a process of its own."""
+        return RayTask(self._ray, self._do.remote(work))
+
+
+def _in_task(work: Work) -> bool:
+    return work()
+
+
+def _address() -> str:
+    return os.environ.get("RAY_ADDRESS", "")
+
+
+def _wanted(package: str) -> Any:
+    """Import what a place needs."""
+    try:
+        return import_module(package)
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        extra = EXTRAS[package]
+        raise CirlError(
+            f"--on {extra} needs the package {package}, which is not installed: pip install 'cirl-marl[{extra}]'"
+        ) from None
+
+
+def _last_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__
+
+
+def _settings(settings: Mapping[str, str]) -> str:
+    return " ".join(f"{name}={value}" for name, value in settings.items())
+
+
+PLACES: tuple[str, ...] = ("here", "local", "slurm", "ray")
+
+
+def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, str]) -> Place | None:
+    """Return a place by its name; None is this process.
+
+    Raises:
+        CirlError: for an unknown place, settings that it does not take, or a package that is missing.
+    """
+    if on not in PLACES:
+        raise CirlError(unknown("place", on, PLACES))
+    if settings and on != "slurm":
+        raise CirlError(f"--slurm {_settings(settings)}: goes with --on slurm, not with --on {on}")
+    if workers is not None and workers < 1:
+        raise CirlError(f"workers must be at least 1, got {workers}")
+    if on == "here" and workers not in (None, 1):
+        raise CirlError(f"in this process there is one worker, not {workers}; use --on local")
+    makers: dict[str, Callable[[], Place]] = {
+        "local": lambda: Local(workers),
+        "slurm": lambda: Slurm(folder, workers, settings),
+        "ray": lambda: Ray(workers),
+    }
+    return makers[on]() if on in makers else None

@@ -1,0 +1,170 @@
+"""What happens where a job is done: it is claimed, what it says goes into its log, and it tells how far it is."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from filelock import FileLock, Timeout
+
+from cirl_marl.definitions.permission import code_allowed
+from cirl_marl.errors import RunError
+from cirl_marl.records.files import write_json
+
+APART = 1.0
+"""Seconds between two reports of a job."""
+
+
+class Tell(Protocol):
+    """Takes what a job is doing, how much of it is done, and figures that are known so far."""
+
+    def __call__(
+        self, what: str, done: float, total: float, figures: Callable[[], Mapping[str, Any]] = lambda: {}
+    ) -> None:
+        """Say how far the job is; it may be called as often as one likes, and asks for ``figures`` now and then."""
+
+
+class Job(Protocol):
+    """Work that is done once. It is pickled on its way to where it is done."""
+
+    @property
+    def name(self) -> str:
+        """What it is called in messages and files; no other job in the same folder has this name."""
+
+    def is_done(self) -> bool:
+        """Return whether nothing is left to do."""
+
+    def run(self, tell: Tell) -> None:
+        """Do what is left. It may be killed at any instant, and begun again."""
+
+
+@dataclass(frozen=True, slots=True)
+class JobFiles:
+    """Where a job keeps what it says and how far it is, and by which lock it is claimed."""
+
+    folder: Path
+    name: str
+
+    @property
+    def log(self) -> Path:
+        """What the last who worked on it said."""
+        return self.folder / f"{self.name}.log"
+
+    @property
+    def told(self) -> Path:
+        """How far it is."""
+        return self.folder / f"{self.name}.json"
+
+    def lock(self) -> FileLock:
+        """Return the lock that whoever works on it holds; the system frees it when a process dies."""
+        return FileLock(self.folder / f".{self.name}.lock", blocking=False)
+
+    def is_claimed(self) -> bool:
+        """Return whether somebody works on it at the moment."""
+        try:
+            with self.lock():
+                return False
+        except Timeout:
+            return True
+
+    def figures(self) -> dict[str, Any]:
+        """Return what was told last; empty if nothing was."""
+        try:
+            found: dict[str, Any] = json.loads(self.told.read_text())
+        except FileNotFoundError:
+            return {}
+        return found
+
+    def last_words(self) -> str:
+        """Return the last line of the log; empty if there is none."""
+        text = self.log.read_text(errors="replace") if self.log.is_file() else ""
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        return lines[-1] if lines else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """A job on its way: it is called where it is done, in a process that may know nothing of who sent it.
+
+    Attributes:
+        job: pickled, so that also what fails when it is read is said in its log.
+        directory: the working directory, from which relative paths count.
+        allow_code: whether definitions may import the models that they name.
+    """
+
+    job: bytes
+    files: JobFiles
+    directory: str
+    allow_code: bool
+
+    def __call__(self) -> bool:
+        """Do the job in a process of its own.
+
+        Returns:
+            Whether it was done; if not, somebody else works on it.
+        """
+        os.chdir(self.directory)
+        try:
+            with self.files.lock(), _redirected(self.files.log):
+                with code_allowed(self.allow_code):
+                    do(lambda: pickle.loads(self.job), self.files, lambda: None)
+        except Timeout:
+            return False
+        return True
+
+
+def do(job: Callable[[], Job], files: JobFiles, listen: Callable[[], None]) -> None:
+    """Do a job that is claimed, and ``listen`` whenever it has told how far it is.
+
+    Raises:
+        Exception: what the job raised, when it is in the log and among what was told.
+    """
+    told = files.figures()
+    earlier, began, last = float(told.get("cpu_seconds", 0.0)), time.process_time(), -APART
+
+    def tell(what: str, done: float, total: float, figures: Callable[[], Mapping[str, Any]] = lambda: {}) -> None:
+        nonlocal last, told
+        if what == told.get("what") and time.monotonic() - last < APART:
+            return
+        last = time.monotonic()
+        now = {"what": what, "done": done, "total": total, "said": ""}
+        told = {**told, **figures(), **now, "cpu_seconds": earlier + time.process_time() - began}
+        write_json(files.told, told)
+        listen()
+
+    try:
+        found = job()
+        tell("beginning", 0, 1)
+        if not found.is_done():
+            found.run(tell)
+        if not found.is_done():
+            raise RunError(f"{found.name}: came to its end without being done")
+        tell("done", 1, 1)
+    except Exception as error:
+        write_json(files.told, told | {"said": f"{type(error).__name__}: {error}"})
+        raise
+
+
+@contextmanager
+def _redirected(log: Path) -> Iterator[None]:
+    """Let all that this process says, also from outside of Python, stand in its log."""
+    with log.open("w", buffering=1) as file:
+        for stream, descriptor in ((sys.stdout, 1), (sys.stderr, 2)):
+            with contextlib.suppress(ValueError):  # it is closed
+                stream.flush()
+            os.dup2(file.fileno(), descriptor)
+        try:
+            yield
+        except BaseException:
+            file.write(traceback.format_exc())
+            raise

@@ -1,0 +1,7 @@
+"""Sweeps: the product of networks, scenarios, recipes, options and seeds, each cell trained and held to the bound."""
+
+from cirl_marl.sweeps.cells import Cell
+from cirl_marl.sweeps.reading import SweepFile, load_sweep
+from cirl_marl.sweeps.running import CellStanding, Swept, sweep
+
+__all__ = ["Cell", "CellStanding", "SweepFile", "Swept", "load_sweep", "sweep"]

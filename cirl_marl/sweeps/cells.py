@@ -1,0 +1,196 @@
+"""A cell of a sweep: a training run and its evaluation, in a folder whose name follows from what they are."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.definitions.writing import fingerprint
+from cirl_marl.errors import RunError
+from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.statistics import SHARE, over_episodes
+from cirl_marl.jobs import Tell
+from cirl_marl.learners.completion import completed
+from cirl_marl.learners.recipe import Recipe, load_recipe
+from cirl_marl.learners.run import RunDirectory
+from cirl_marl.records.files import write_json
+from cirl_marl.sweeps.reading import SweepEvaluation, SweepFile
+
+if TYPE_CHECKING:
+    from cirl_marl.learners.training import Progress
+
+DIGITS = 12
+"""Of the hash in the name of a cell."""
+
+
+def plain_name(words: str) -> str:
+    """Return words as part of a file name."""
+    return re.sub(r"[^\w-]", "_", words)[:100]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """A training run of a sweep and its evaluation.
+
+    Attributes:
+        address: of the network, as ``load_network`` takes it.
+        options: of ``train``, by name.
+        definition_sha256: of the network under its scenario, data files included.
+        origins: hashes of the policies with which learners begin.
+    """
+
+    address: str
+    network: str
+    scenario: str
+    recipe: Recipe
+    seed: int
+    options: tuple[tuple[str, Any], ...]
+    definition_sha256: str
+    origins: str = ""
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of the training, summed over the copies."""
+        return int(dict(self.options).get("steps", self.recipe.run.steps))
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """All that its result depends on, as resolved and ready for JSON."""
+        given = dict(self.options)
+        run = self.recipe.run.model_dump(mode="json")
+        run |= {key: given.pop(key) for key in tuple(given) if key in run}
+        environment = {key: value for key, value in self.recipe.environment.items() if key != "scenario"} | given
+        return {
+            "network": self.network,
+            "scenario": self.scenario,
+            "seed": self.seed,
+            "recipe": self.recipe.model_dump(mode="json") | {"run": run, "environment": environment},
+            "definition_sha256": self.definition_sha256,
+            "origins": self.origins,
+        }
+
+    @property
+    def name(self) -> str:
+        """Name of its folder: what it is in words, and the hash of its content."""
+        words = f"{self.network}-{self.scenario}-{self.recipe.name}-seed{self.seed}"
+        text = json.dumps(self.content, sort_keys=True)
+        return f"{plain_name(words)}-{hashlib.sha256(text.encode()).hexdigest()[:DIGITS]}"
+
+
+def cells_of(asked: SweepFile) -> list[Cell]:
+    """Return the cells of a sweep: seeds vary last, so that what is compared comes to its end together.
+
+    Raises:
+        CirlError: for a combination that cannot be trained, before anything is written.
+    """
+    from cirl_marl.learners.launch import prepared  # it needs torch
+
+    found = []
+    recipes = [load_recipe(name) for name in asked.recipes]
+    lists = {key: values for key, values in asked.options.model_dump().items() if values is not None}
+    scenarios: list[str | None] = [*asked.scenarios] if asked.scenarios is not None else [None]
+    for seed, address, scenario, recipe, *values in itertools.product(
+        asked.seeds, asked.networks, scenarios, recipes, *lists.values()
+    ):
+        options = dict(zip(lists, values, strict=True))
+        named = scenario or recipe.environment.get("scenario")
+        network = load_network(address, scenario=named)
+        begins = any(learner.start is not None for _, learner in recipe.learners())
+        origins = ""
+        if begins or seed == asked.seeds[0]:
+            config = prepared(address, recipe, seed=seed, scenario=network.scenario_name, **options).config
+            read = {name: origin.sha256 for name, origin in config.origins.items()}
+            origins = hashlib.sha256(json.dumps(read, sort_keys=True).encode()).hexdigest() if read else ""
+        found.append(
+            Cell(
+                address=address,
+                network=network.name,
+                scenario=network.scenario_name,
+                recipe=recipe,
+                seed=seed,
+                options=tuple(options.items()),
+                definition_sha256=fingerprint(network),
+                origins=origins,
+            )
+        )
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class CellJob:
+    """The work on a cell, in a folder of a sweep."""
+
+    cell: Cell
+    folder: Path
+    evaluation: SweepEvaluation
+    checkpoint_every: float | None
+
+    @property
+    def name(self) -> str:
+        """Name of the cell."""
+        return self.cell.name
+
+    @property
+    def run_directory(self) -> RunDirectory:
+        """The training run."""
+        return RunDirectory(self.folder / "run")
+
+    @property
+    def result(self) -> Path:
+        """The file that is there when the cell is done."""
+        return self.folder / "result.json"
+
+    def is_done(self) -> bool:
+        """Return whether it is trained and evaluated."""
+        return self.result.is_file()
+
+    def run(self, tell: Tell) -> None:
+        """Train, or go on training, and evaluate."""
+        cell = self.cell
+        found = load_network(cell.address, scenario=cell.scenario)
+        if fingerprint(found) != cell.definition_sha256:
+            raise RunError(f"{cell.address}: was edited while the sweep was running; start the sweep again")
+        run = completed(
+            self.run_directory.path,
+            cell.address,
+            cell.recipe,
+            report=self._reporting(tell),
+            checkpoint_every=self.checkpoint_every,
+            scenario=cell.scenario,
+            seed=cell.seed,
+            **dict(cell.options),
+        )
+        asked = self.evaluation.model_dump()
+        compared = compare([run], ["neutral"], **asked, progress=lambda what, share: tell("evaluating", share, 1.0))
+        entry = next(each for each in compared.entries if each.run is not None)
+        gap = None if entry.gap is None else over_episodes(entry.gap, (0.0, np.inf)).as_dict()
+        figures = {
+            "circularity": over_episodes(entry.circularity).as_dict(),
+            "service": over_episodes(entry.service, SHARE).as_dict(),
+            "gap": gap,
+            "no_bound": compared.yardstick.reason,
+            "unit": compared.network.mass_unit,
+            "checkpoint": entry.checkpoint,
+            "evaluation": asked,
+        }
+        tell("evaluated", 1, 1, lambda: {"gap": None if gap is None else gap["value"]})
+        write_json(self.result, figures)
+
+    def _reporting(self, tell: Tell) -> Callable[[Progress], None]:
+        """Return what tells how far the training is, and what the policies reach that are the best so far."""
+        steps = self.cell.steps
+
+        def reached() -> dict[str, float]:
+            best = self.run_directory.status["best"]
+            return {} if best is None else {name: best["figures"][name] for name in ("circularity", "service")}
+
+        return lambda now: tell("training", steps - now.total + now.env_steps, steps, reached)

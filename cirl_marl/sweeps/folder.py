@@ -1,0 +1,166 @@
+"""A sweep on disk: what was asked for, a folder for each cell, and the table of results.
+
+::
+
+    SWEEP/
+      asked.json       networks, recipes, options, seeds and evaluation, as resolved; the names of the cells
+      cells/CELL/      cell.json: what it is; run/: its training; result.json: there when it is done
+      bounds/          what is proved of each network, for the gaps that are shown meanwhile
+      jobs/            CELL.log, CELL.json: what its last worker said, and how far it was; locks
+      sweep.csv        a row for each cell
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from cirl_marl.errors import RunError
+from cirl_marl.records.files import write_atomically, write_json, write_table
+from cirl_marl.sweeps.cells import Cell, CellJob
+from cirl_marl.sweeps.reading import SweepFile
+
+INTERVALS = ("circularity", "service", "gap")
+SHOWN = 5
+"""Differences between two sweeps that are named."""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepFolder:
+    """The folder of a sweep."""
+
+    path: Path
+
+    def claim(self, asked: SweepFile, cells: Sequence[Cell]) -> None:
+        """Say what the folder is for, if it is new, or was for a part of this sweep.
+
+        Raises:
+            RunError: if the folder holds another sweep, with what differs, or something else.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise RunError(f"{self.path}: is a file, not a folder")
+        if self.path.is_dir() and not self._asked.is_file() and any(self._strangers()):
+            found = ", ".join(sorted(self._strangers())[:SHOWN])
+            raise RunError(f"{self.path}: holds something else than a sweep ({found}); choose another folder")
+        now = self._described(asked, cells)
+        self.path.mkdir(parents=True, exist_ok=True)
+        with FileLock(self.path / ".asked.lock"):
+            if self._asked.is_file():
+                self._check(now, self._kept())
+            for cell in cells:
+                file = self.cell(cell.name) / "cell.json"
+                if not file.is_file():
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    write_json(file, cell.content)
+            write_json(self._asked, now)
+
+    def cell(self, name: str) -> Path:
+        """Return the folder of a cell."""
+        return self.path / "cells" / name
+
+    @property
+    def bounds(self) -> Path:
+        """The folder of what is proved of the networks."""
+        return self.path / "bounds"
+
+    @property
+    def jobs(self) -> Path:
+        """The folder of what workers said."""
+        return self.path / "jobs"
+
+    @property
+    def table(self) -> Path:
+        """The table of results."""
+        return self.path / "sweep.csv"
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row for each cell: what it is, and its figures with their 95 % intervals, None where not known."""
+        return [self.row(name) for name in self._kept()["cells"]]
+
+    def write_table(self) -> list[dict[str, Any]]:
+        """Write the table of results, and return its rows."""
+        rows = self.rows()
+        cells = [[row[key] for key in rows[0]] for row in rows]
+        write_atomically(self.table, lambda partial: write_table(partial, list(rows[0]), cells))
+        return rows
+
+    def row(self, name: str) -> dict[str, Any]:
+        """Return the row of a cell."""
+        content = _json(self.cell(name) / "cell.json")
+        run, environment = content["recipe"]["run"], content["recipe"]["environment"]
+        file = self.cell(name) / "result.json"
+        result = _json(file) if file.is_file() else {}
+        told = self.jobs / f"{name}.json"
+        row: dict[str, Any] = {"cell": name, "state": "done" if result else "missing"}
+        row |= {key: content[key] for key in ("network", "scenario")}
+        row |= {"recipe": content["recipe"]["name"], "seed": content["seed"]}
+        row |= {key: run[key] for key in ("steps", "envs", "engine", "min_service")}
+        row |= {column: environment.get(key) for key, column in _ENVIRONMENT.items()}
+        for figure in INTERVALS:
+            found = result.get(figure) or {}
+            row |= {figure: found.get("value"), f"{figure}_low": found.get("low"), f"{figure}_high": found.get("high")}
+        row |= {key: result.get(key) or None for key in ("unit", "no_bound", "checkpoint")}
+        return row | {"cpu_seconds": _json(told).get("cpu_seconds") if told.is_file() else None}
+
+    @property
+    def _asked(self) -> Path:
+        return self.path / "asked.json"
+
+    def _kept(self) -> dict[str, Any]:
+        return _json(self._asked)
+
+    def _strangers(self) -> Iterator[str]:
+        own = {"cells", "bounds", "jobs", ".asked.lock", ".asked.partial.json"}
+        return (each.name for each in self.path.iterdir() if each.name not in own)
+
+    def _described(self, asked: SweepFile, cells: Sequence[Cell]) -> dict[str, Any]:
+        """Return what is asked for as JSON has it."""
+        plain = asked.model_dump(mode="json")
+        plain["options"] = {key: values for key, values in plain["options"].items() if values is not None}
+        plain["networks"] = list(dict.fromkeys(cell.network for cell in cells))
+        plain["definitions"] = {f"{cell.network}, {cell.scenario}": cell.definition_sha256 for cell in cells}
+        plain["recipes"] = {cell.recipe.name: cell.recipe.model_dump(mode="json") for cell in cells}
+        return {**plain, "cells": [cell.name for cell in cells]}
+
+    def _check(self, now: dict[str, Any], kept: dict[str, Any]) -> None:
+        """Refuse to make another sweep of the one that is kept; one may add cells to it."""
+        lost = set(kept["cells"]) - set(now["cells"])
+        if not lost and now["evaluation"] == kept["evaluation"]:
+            return
+        found = [each for key in now if key != "cells" for each in _differences(now[key], kept.get(key), key)]
+        more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+        raise RunError(
+            f"{self.path}: holds another sweep ({'; '.join(found[:SHOWN])}{more}), of which {len(lost)} of "
+            f"{len(kept['cells'])} cells are none of this one; choose another folder. Nothing was changed"
+        )
+
+
+_ENVIRONMENT = {key: key for key in ("reward", "observe", "circularity_weight", "horizon", "uncertain")}
+_ENVIRONMENT |= {"circularity": "circularity_in_reward"}  # circularity itself is a result
+
+
+def jobs_of(cells: Sequence[Cell], asked: SweepFile, folder: SweepFolder, every: float | None) -> list[CellJob]:
+    """Return the work on the cells."""
+    return [CellJob(cell, folder.cell(cell.name), asked.evaluation, every) for cell in cells]
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: cannot be read: {error}") from error
+    return found
+
+
+def _differences(asked: Any, kept: Any, where: str) -> Iterator[str]:
+    """Yield where two JSON values differ."""
+    if isinstance(asked, dict) and isinstance(kept, dict):
+        for key in dict.fromkeys((*asked, *kept)):
+            yield from _differences(asked.get(key), kept.get(key), f"{where}.{key}")
+    elif asked != kept:
+        yield f"{where}: {json.dumps(asked)}, there {json.dumps(kept)}"

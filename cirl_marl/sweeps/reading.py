@@ -1,0 +1,135 @@
+"""A sweep as a TOML file: what is multiplied out, and how the results are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, ValidationError
+
+from cirl_marl.definitions.catalogue import file_and_region, load_network, networks, recipes
+from cirl_marl.definitions.mistakes import mistakes_of
+from cirl_marl.definitions.quantities import Number
+from cirl_marl.definitions.reading import read_toml
+from cirl_marl.errors import CirlError, DefinitionError, unknown
+from cirl_marl.learners.recipe import Count, EngineName, Recipe, Settings, load_recipe
+from cirl_marl.network import Network
+from cirl_marl.network.elements import Moment, Observe, Reward
+
+Value = TypeVar("Value")
+Level = Annotated[Number, Field(ge=0, le=1)]
+Seed = Annotated[StrictInt, Field(ge=0)]
+
+
+def _several(value: Any) -> Any:
+    """Return a value as the list of one that it stands for; of what is listed, nothing may stand there twice."""
+    listed = value if isinstance(value, list) else [value]
+    if not listed:
+        raise ValueError("lists nothing")
+    twice = [each for i, each in enumerate(listed) if each in listed[:i]]
+    if twice:
+        raise ValueError(f"lists {twice[0]!r} twice")
+    return listed
+
+
+Several = Annotated[list[Value], BeforeValidator(_several)]
+
+
+class SweepOptions(Settings):
+    """Options of ``train`` for all cells; a list of several values is multiplied out. None takes the recipe's."""
+
+    steps: Several[Count] | None = None
+    envs: Several[Count] | None = None
+    engine: Several[EngineName] | None = None
+    min_service: Several[Level] | None = None
+    reward: Several[Reward] | None = None
+    observe: Several[Observe] | None = None
+    circularity: Several[Moment] | None = None
+    circularity_weight: Several[Level] | None = None
+    horizon: Several[Count] | None = None
+    uncertain: Several[StrictBool] | None = None
+
+
+class SweepEvaluation(Settings):
+    """The fresh episodes in which every cell is measured: how many, from which seed, and whether to the bound."""
+
+    episodes: Annotated[int, Field(strict=True, ge=2)] = 64
+    seed: Seed = 0
+    bounds: StrictBool = True
+
+
+class SweepFile(Settings):
+    """What a sweep file says.
+
+    Attributes:
+        networks: names of the catalogue, or files, which count from the folder of the sweep file.
+        recipes: likewise.
+        scenarios: of every network; None takes the recipe's, else the default one.
+    """
+
+    networks: Several[StrictStr]
+    recipes: Several[StrictStr] = Field(["independent_ars"])
+    scenarios: Several[StrictStr] | None = None
+    seeds: Several[Seed] = Field([0])
+    options: SweepOptions = SweepOptions()
+    evaluation: SweepEvaluation = SweepEvaluation()
+
+
+def load_sweep(path: Path) -> SweepFile:
+    """Read a sweep file; names of files in it become paths from the working directory.
+
+    Raises:
+        DefinitionError: if the file has mistakes; all are named, those in what it names as well.
+    """
+    document = read_toml(path)
+    mistakes: list[str] = []
+    faulty: set[str] = set()
+    try:
+        SweepFile.model_validate(document)
+    except ValidationError as error:
+        mistakes += mistakes_of(error, SweepFile)
+        faulty = {str(item["loc"][0]) for item in error.errors()}
+    sound = {key: _several(value) for key, value in document.items() if key in _NAMES and key not in faulty}
+    sound = {key: [_from(path.parent, str(name)) for name in names] for key, names in sound.items()}
+    mistakes += _unknown_names(sound)
+    if mistakes:
+        raise DefinitionError(str(path), mistakes)
+    return SweepFile.model_validate(document | sound)
+
+
+_NAMES = ("networks", "recipes", "scenarios")
+
+
+def _from(folder: Path, name: str) -> str:
+    """Return the name of a file as it is from the working directory, and a name of the catalogue as it is."""
+    return str(folder / name) if file_and_region(name) is not None else name
+
+
+def _unknown_names(sound: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield what is wrong with networks, scenarios and recipes, each by itself."""
+    found: list[Network] = []
+    for key, read, known in (("networks", load_network, networks), ("recipes", load_recipe, recipes)):
+        for name in sound.get(key, ()):
+            try:
+                each = _read(read, known, key[:-1], name)
+            except DefinitionError as error:
+                yield from (f"{key}: {problem}" for problem in str(error).splitlines())
+            except CirlError as error:
+                yield f"{key}: {error}"
+            else:
+                found += [each] if isinstance(each, Network) else []
+    for network in found:
+        there = [network.scenario_name, *network.scenarios]
+        for name in sound.get("scenarios", ()):
+            if name not in there:
+                yield f"scenarios: network '{network.name}': {unknown('scenario', name, there)}"
+
+
+def _read(
+    read: Callable[[str], Network | Recipe], known: Callable[[], list[str]], kind: str, name: str
+) -> Network | Recipe:
+    """Read a network or recipe; one without a name at all is refused in the same words as an unknown one."""
+    if not name.strip():
+        raise CirlError(unknown(kind, name, known()))
+    return read(name)

@@ -1,0 +1,97 @@
+"""A sweep from its file to its table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cirl_marl.jobs import Failure, Job, Standing, run_jobs
+from cirl_marl.sweeps.cells import Cell, cells_of
+from cirl_marl.sweeps.folder import SweepFolder, jobs_of
+from cirl_marl.sweeps.fronts import FrontJob
+from cirl_marl.sweeps.reading import load_sweep
+
+
+@dataclass(frozen=True, slots=True)
+class CellStanding:
+    """How far a cell is.
+
+    Attributes:
+        standing: of the work on it.
+        gap: to the bound: that of its result, or about that of the best policies so far; None if it is not known.
+    """
+
+    cell: Cell
+    standing: Standing
+    gap: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Swept:
+    """What came of a sweep.
+
+    Attributes:
+        rows: a row for each cell, as in ``sweep.csv``.
+        failures: cells, and bounds, that were not done, and why.
+    """
+
+    folder: Path
+    rows: tuple[Mapping[str, Any], ...]
+    failures: tuple[Failure, ...]
+
+
+def sweep(
+    file: str | Path,
+    *,
+    on: str = "local",
+    workers: int | None = None,
+    out: str | Path | None = None,
+    settings: Mapping[str, str] | None = None,
+    checkpoint_every: float | None = None,
+    watch: Callable[[Sequence[CellStanding]], None] = lambda standings: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Swept:
+    """Train and evaluate all cells of a sweep file that are not done: networks x scenarios x recipes x options x seeds.
+
+    Each cell has a folder named by the hash of its content, so the same call does what is missing and goes on with what
+    was interrupted, from its last checkpoint and to the same bits. Several calls may share a folder, on any machine
+    that sees it. Whatever is killed in between, the results are the same.
+
+    Args:
+        file: the sweep file.
+        on: ``here``, ``local``, ``slurm`` or ``ray``.
+        workers: how many cells at a time; None is as many as the place has.
+        out: folder of the sweep; None is ``runs/sweep-NAME`` after the name of the file.
+        settings: of submitit, for ``slurm``.
+        checkpoint_every: seconds after which a training is saved; None is a minute.
+        watch: called with the standing of all cells, about once a second.
+        say: called with where the cells are trained.
+
+    Raises:
+        CirlError: for input that cannot be used, before anything is trained; the folder of another sweep among it.
+        KeyboardInterrupt: after Ctrl-C; what was learnt is saved.
+    """
+    path = Path(file)
+    asked = load_sweep(path)
+    cells = cells_of(asked)
+    folder = SweepFolder(Path("runs") / f"sweep-{path.stem}" if out is None else Path(out))
+    folder.claim(asked, cells)
+    work = {job.name: job for job in jobs_of(cells, asked, folder, checkpoint_every)}
+    fronts = {cell.name: FrontJob.of(cell, folder.bounds) for cell in cells} if asked.evaluation.bounds else {}
+    missing = {fronts[name].name: fronts[name] for name, job in work.items() if name in fronts and not job.is_done()}
+
+    def told(standings: Sequence[Standing]) -> None:
+        known = {each.name: each for each in standings}
+        watch([_standing(work[name].cell, known[name], fronts.get(name)) for name in work])
+
+    jobs: list[Job] = [*missing.values(), *work.values()]
+    failures = run_jobs(jobs, folder.jobs, on=on, workers=workers, settings=settings, watch=told, say=say)
+    return Swept(folder.path, tuple(folder.write_table()), tuple(failures))
+
+
+def _standing(cell: Cell, standing: Standing, front: FrontJob | None) -> CellStanding:
+    if standing.state == "done":
+        return CellStanding(cell, standing, standing.figures.get("gap"))
+    return CellStanding(cell, standing, None if front is None else front.gap(standing.figures))
