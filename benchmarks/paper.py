@@ -6,35 +6,28 @@ finished rows are kept. ``--table`` only writes the tables, ``--speed`` compares
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
-import time
-import traceback
-from collections import deque
-from dataclasses import dataclass
-from multiprocessing import get_context
-from multiprocessing.process import BaseProcess
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from benchmarks.paper_document import markdown
 from cirl_marl.cli.common import shares
 from cirl_marl.errors import CirlError
+from cirl_marl.jobs import Standing, run_jobs
 from cirl_marl.paper.published import BOX_ALGORITHMS, GOAL_ALGORITHMS
 from cirl_marl.paper.results import PaperRow, Results
-from cirl_marl.paper.running import outdated
+from cirl_marl.paper.running import RowJob, outdated
 from cirl_marl.paper.selection import minutes, overview, planned
 from cirl_marl.paper.table import result_line
 
 console = Console(width=None if sys.stdout.isatty() else 140)
-processes = get_context("spawn")
-PHASES = ("waiting", "training", "evaluating")
 KEPT = Path(__file__).parent / "results" / "paper"
 FAST = ("ARS", "PPO", "A2C")
 """Learners that take minutes; the others take half an hour and more."""
@@ -77,7 +70,7 @@ def main(
         else:
             rows = study_rows(steps=steps, seeds=seeds, settings=settings)
         try:
-            failed = Study(results, rows, jobs, episodes).run()
+            failed = run(results, rows, jobs, episodes)
         except KeyboardInterrupt:
             message = f"\nstopped; finished rows are kept in {out}. The same command goes on."
             console.print(message, soft_wrap=True, highlight=False)
@@ -110,128 +103,62 @@ def study_rows(*, steps: int | None = None, seeds: int | None = None, settings: 
     return sorted(wanted, key=order)
 
 
-@dataclass(slots=True)
-class Job:
-    """A row that runs in a process of its own."""
+def run(results: Results, rows: Sequence[PaperRow], workers: int, episodes: int | None) -> list[PaperRow]:
+    """Run every row that is not done, some at a time; one that fails has a second try. Return those that failed twice.
 
-    row: PaperRow
-    process: BaseProcess
-    state: Any
-    bar: TaskID
-
-
-class Study:
-    """Runs rows in processes, some at a time; a row that fails has a second try after all others."""
-
-    def __init__(self, results: Results, rows: list[PaperRow], jobs: int, episodes: int | None) -> None:
-        """Leave out the rows that are done."""
-        self._results, self._jobs, self._episodes = results, jobs, episodes
-        self._queue = deque(row for row in rows if not self._is_done(row))
-        self._failed: list[PaperRow] = []
-        self._again = True
-        self._running: list[Job] = []
-        results.prepare()
-        overall = overview(rows, self._queue)
-        console.print(f"{overall}; results in {results.path}", soft_wrap=True, highlight=False)
-
-    def _is_done(self, row: PaperRow) -> bool:
-        again = outdated(self._results.read(row), self._episodes) if self._results.has(row) else ""
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, when the rows that ran are stopped.
+    """
+    left = []
+    for row in rows:
+        again = outdated(results.read(row), episodes) if results.has(row) else ""
         if again:
-            console.print(f"{row}: once more, as {again}", soft_wrap=True, highlight=False)
-        return self._results.has(row) and not again
-
-    def run(self) -> list[PaperRow]:
-        """Run every row and return those that failed twice.
-
-        Raises:
-            KeyboardInterrupt: after Ctrl-C, when the rows that ran are stopped.
-        """
-        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-            finished = 0.0
-            whole = bars.add_task("all rows", total=sum(minutes(row) for row in self._queue))
-            try:
-                while self._queue or self._running or self._retry():
-                    while self._queue and len(self._running) < self._jobs:
-                        self._start(self._queue.popleft(), bars)
-                    time.sleep(0.2)
-                    underway = 0.0
-                    for job in list(self._running):
-                        phase, done, total = job.state
-                        bars.update(job.bar, description=f"{job.row}: {PHASES[phase]}", completed=done, total=total)
-                        if job.process.exitcode is not None:
-                            self._finish(job, bars)
-                            finished += minutes(job.row)
-                        elif PHASES[phase] == "training":
-                            underway += minutes(job.row) * done / total
-                    bars.update(whole, completed=finished + underway)
-            finally:
-                for job in self._running:
-                    job.process.terminate()
-                    job.process.join()
-        return self._failed
-
-    def _start(self, row: PaperRow, bars: Progress) -> None:
-        log = _log(self._results, row)
-        log.parent.mkdir(parents=True, exist_ok=True)
-        state = processes.Array("q", [0, 0, 1], lock=False)
-        arguments = (row, str(self._results.path), self._episodes, state)
-        process = processes.Process(target=work, args=arguments, daemon=True)
-        process.start()
-        self._running.append(Job(row, process, state, bars.add_task(str(row), total=1)))
-
-    def _finish(self, job: Job, bars: Progress) -> None:
-        job.process.join()
-        self._running.remove(job)
-        bars.remove_task(job.bar)
-        if job.process.exitcode == 0:
-            console.print(result_line(self._results.read(job.row)), soft_wrap=True, highlight=False)
-            return
-        self._failed.append(job.row)
-        lines = _log(self._results, job.row).read_text().splitlines() or ["no message"]
-        console.print(f"{job.row}: failed: {lines[-1]}", soft_wrap=True, markup=False)
-
-    def _retry(self) -> bool:
-        again = self._again and bool(self._failed)
-        if again:
-            console.print(f"once more: {len(self._failed)} rows that failed")
-            self._queue.extend(self._failed)
-            self._failed, self._again = [], False
-        return again
+            say(f"{row}: once more, as {again}")
+        if again or not results.has(row):
+            left.append(row)
+    results.prepare()
+    say(f"{overview(rows, left)}; results in {results.path}")
+    failed = _run_once(results, left, workers, episodes)
+    if failed:
+        say(f"once more: {len(failed)} rows that failed")
+    return _run_once(results, failed, workers, episodes) if failed else []
 
 
-def work(row: PaperRow, folder: str, episodes: int | None, state: Any) -> None:
-    """Run one row in this process; what it says goes into its log."""
-    parent = os.getppid()
-    os.nice(10)
-    results = Results(folder)
-    log = _log(results, row).open("w", buffering=1)
-    os.dup2(log.fileno(), 1)
-    os.dup2(log.fileno(), 2)
-    said = time.perf_counter()
+def _run_once(results: Results, rows: Sequence[PaperRow], workers: int, episodes: int | None) -> list[PaperRow]:
+    """Run rows in processes of their own; return those that failed."""
+    jobs = {row.stem: RowJob(row, results.path, episodes) for row in rows}
+    shown: set[str] = set()
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+        whole = bars.add_task("all rows", total=sum(minutes(row) for row in rows))
 
-    def report(what: str, done: int, total: int) -> None:
-        nonlocal said
-        state[0], state[1], state[2] = PHASES.index(what), done, total
-        if time.perf_counter() - said > 30:
-            said = time.perf_counter()
-            log.write(f"{what}: {done:,} of {total:,}\n")
-            if os.getppid() != parent:
-                raise KeyboardInterrupt("the study that started this row is gone")
+        def watch(standings: Sequence[Standing]) -> None:
+            busy = [f"{jobs[each.name].row}: {each.figures.get('what', '')}" for each in standings if _runs(each)]
+            done = sum(minutes(jobs[each.name].row) * _trained(each) for each in standings)
+            bars.update(whole, description=", ".join(busy), completed=done)
+            for each in standings:
+                if each.state == "done" and each.name not in shown:
+                    shown.add(each.name)
+                    say(result_line(results.read(jobs[each.name].row)))
 
-    try:
-        from cirl_marl.paper.running import run_row
-
-        results.write(run_row(row, report=report, episodes=episodes))
-        log.write("done\n")
-    except BaseException:
-        log.write(traceback.format_exc())
-        raise SystemExit(1) from None
+        failures = run_jobs([*jobs.values()], results.path / "logs", on="local", workers=workers, watch=watch)
+    for failure in failures:
+        say(f"{jobs[failure.name].row}: failed: {failure.said}")
+    return [jobs[failure.name].row for failure in failures]
 
 
-def _log(results: Results, row: PaperRow) -> Path:
-    """Return where the process that runs a row writes what it says."""
-    return results.path / "logs" / f"{row.stem}.log"
+def _runs(each: Standing) -> bool:
+    return each.state in ("running", "elsewhere")
+
+
+def _trained(each: Standing) -> float:
+    """Return the part of a row that is done; to evaluate takes next to nothing."""
+    return each.share if each.figures.get("what") == "training" else float(each.state == "done")
+
+
+def say(line: str) -> None:
+    """Print a line as it is."""
+    console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def _names(text: str) -> tuple[str, str | None]:

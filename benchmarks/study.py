@@ -11,9 +11,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,6 +29,7 @@ from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.evaluation import Comparison, Row, compare, yardstick
 from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes, over_seeds
+from cirl_marl.jobs import Standing, Tell, raise_first, run_jobs
 from cirl_marl.learners import RunDirectory, train_seeds
 from cirl_marl.learners.launch import prepared
 from cirl_marl.network import Floats
@@ -98,26 +97,35 @@ class Job:
         if not all(_note(run).is_file() for run in self.runs):
             return False
         now = prepared(self.network, self.recipe, seed=self.seeds[0], **dict(self.options))
-        kept = {"seed", "data_sha256", "region"}
+        kept = {"seed", "definition_sha256", "data_sha256", "region"}  # the network is compared itself
         wanted = now.config.model_dump(exclude=kept)
         return all(
             run.config.model_dump(exclude=kept) == wanted and run.network() == load_network(self.network)
             for run in self.runs
         )
 
-    def run(self) -> float:
-        """Train, unless it is done; return the minutes that it took."""
-        if self.is_done():
-            return 0.0
+    @property
+    def name(self) -> str:
+        """Name of its log."""
+        return f"{self.network}-{self.recipe}"
+
+    def run(self, tell: Tell) -> None:
+        """Train from the beginning."""
         for run in self.runs:
             shutil.rmtree(run.path, ignore_errors=True)
         began, spent = time.perf_counter(), time.process_time()
-        train_seeds(self.network, self.recipe, seeds=self.seeds, directory=self.directory, **dict(self.options))
+        train_seeds(
+            self.network,
+            self.recipe,
+            seeds=self.seeds,
+            directory=self.directory,
+            report=lambda now: tell("training", now.env_steps, max(now.total, 1)),
+            **dict(self.options),
+        )
         minutes = (time.perf_counter() - began) / 60
         for run in self.runs:
             each = (time.process_time() - spent) / 60 / len(self.seeds)
             write_json(_note(run), {"minutes": minutes / len(self.seeds), "cpu_minutes": each})
-        return minutes
 
 
 def _note(run: RunDirectory) -> Path:
@@ -156,7 +164,7 @@ def main(
             raise CirlError(unknown("part of the study", name, known))
     planned = [job for name in names for job in _jobs(out, name, chosen, seeds, steps)]
     if not table:
-        _train(planned, jobs)
+        _train(planned, out / "jobs", jobs)
     sections = {}
     for name in names:
         runs = [run.path for job in planned if job.network == name and job.is_done() for run in job.runs]
@@ -178,17 +186,15 @@ def _jobs(out: Path, network: str, recipes: Sequence[str], seeds: int, steps: in
         yield Job(network, recipe, which, tuple(options.items()), out / network / recipe)
 
 
-def _train(jobs: Sequence[Job], workers: int) -> None:
-    """Run what is missing, several at a time."""
-    missing = [job for job in jobs if not job.is_done()]
+def _train(jobs: Sequence[Job], folder: Path, workers: int) -> None:
+    """Run what is missing, several at a time; what fails is raised when the others are done."""
     with Progress(console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("training", total=len(missing))
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            running = {pool.submit(job.run): job for job in missing}
-            for future in as_completed(running):
-                job = running[future]
-                console.print(f"{job.directory}: {future.result():.1f} min", soft_wrap=True, highlight=False)
-                progress.advance(task)
+        task = progress.add_task("training", total=len(jobs))
+
+        def watch(standings: Sequence[Standing]) -> None:
+            progress.update(task, completed=sum(each.share for each in standings))
+
+        raise_first(run_jobs(jobs, folder, on="local", workers=workers, watch=watch))
 
 
 def _compare(network: str, runs: Sequence[Path], episodes: int) -> Comparison:

@@ -12,6 +12,7 @@ import typer
 from benchmarks import paper, study
 from cirl_marl import load_network
 from cirl_marl.controllers.lqr import LinearSystem
+from cirl_marl.jobs import run_jobs
 
 pytestmark = pytest.mark.medium
 
@@ -24,10 +25,12 @@ def test_done_is_what_answers_the_same_question(tmp_path: Path, monkeypatch: pyt
     options = (("steps", 320), ("reward", "team"))
     job = study.Job("copper_net", "independent_a2c", (0, 1), options, tmp_path / "run")
     assert not job.is_done()
-    assert job.run() > 0
+    assert run_jobs([job], tmp_path / "jobs") == []
     assert job.is_done()
+    stamps = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("status.json")}
     assert [run.config.seed for run in job.runs] == [0, 1]
-    assert job.run() == 0
+    assert run_jobs([job], tmp_path / "jobs") == []
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("status.json")} == stamps
     assert not replace(job, seeds=(0, 1, 2)).is_done()
     assert not replace(job, options=(("steps", 640), ("reward", "team"))).is_done()
     assert not replace(job, options=options[:1]).is_done()

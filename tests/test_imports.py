@@ -15,13 +15,13 @@ LAYERS = (
     ("network",),
     ("compartments", "drawing"),
     ("definitions",),
-    ("dynamics",),
+    ("dynamics", "jobs"),
     ("environments",),
     ("controllers", "testing"),
     ("importing", "optimum"),
     ("learners",),
     ("__init__", "evaluation", "paper"),
-    ("report",),
+    ("report", "sweeps"),
     ("cli",),
 )
 """From the ground up; a room imports from layers below its own, and from itself."""

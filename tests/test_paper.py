@@ -124,7 +124,7 @@ def test_row_is_trained_kept_and_not_run_again(
     begun, _, shown = capsys.readouterr().out.partition("\n")
     assert begun.startswith("rows: 1, done: 0, to go by the paper's training times: 0 min; results in ")
     assert f"{steps} of 200,000" in shown
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("*.json")
     kept = json.loads(path.read_text())
     assert kept["row"] == {
         "environment": "CopperNet",

@@ -25,6 +25,7 @@ from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.controllers.shortages import shortages, unsupplied
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
+from cirl_marl.jobs import PLACES, Standing, run_jobs
 from cirl_marl.network import Network
 from cirl_marl.network.elements import OBSERVE, REWARDS
 
@@ -165,6 +166,8 @@ def paper(
     episodes: Annotated[
         int | None, typer.Option(min=1, help="Evaluation episodes; default: 100, where successes count the paper's.")
     ] = None,
+    on: Annotated[str, typer.Option(help=f"Where rows are run: {', '.join(PLACES)}.")] = "here",
+    workers: Annotated[int | None, typer.Option(min=1, help="Rows at a time; default: all that can be.")] = None,
     out: Annotated[Path, typer.Option(help="Results, one file a row; a row that is done is not run again.")] = Path(
         "runs/paper"
     ),
@@ -185,20 +188,16 @@ def paper(
     changed = {row: outdated(results.read(row), episodes) for row in rows if results.has(row)}
     left = [row for row in rows if row not in changed or changed[row]]
     say(f"{overview(rows, left)}; results in {results.path}")
-    failed = False
-    for i, row in enumerate(rows):
+    for row in rows:
         if changed.get(row):
             say(f"{row}: once more, as {changed[row]}")
-        try:
-            if row in left:
-                _run_row(row, f"{i + 1} of {len(rows)}", results, episodes)
+        elif row in changed:
             say(result_line(results.read(row)))
-        except CirlError as error:
-            failed = True
-            say(f"{row}: failed: {error}")
-        except KeyboardInterrupt:
-            say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
-            raise typer.Exit(130) from None
+    try:
+        failed = _run_rows(left, results, episodes, on, workers)
+    except KeyboardInterrupt:
+        say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
+        raise typer.Exit(130) from None
     kept, asked = results.all(), {(row.environment, row.algorithm, row.settings) for row in rows}
     for found in environments:
         fit = [r for r in kept if r.row in rows or (r.row.environment, r.row.algorithm, r.row.settings) not in asked]
@@ -207,15 +206,29 @@ def paper(
         raise typer.Exit(1)
 
 
-def _run_row(row: PaperRow, place: str, results: Results, episodes: int | None) -> None:
-    """Train and evaluate a row of the paper's tables and keep the result."""
-    from cirl_marl.paper.running import run_row
+def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, on: str, workers: int | None) -> bool:
+    """Train and evaluate rows of the paper's tables, keep the results, and return whether any has failed."""
+    from cirl_marl.paper.running import RowJob
+    from cirl_marl.paper.table import result_line
 
-    title = f"{place}: {row.environment} {row.algorithm}, seed {row.seed}"
+    jobs = {row.stem: RowJob(row, results.path, episodes) for row in rows}
+    shown: set[str] = set()
     with shares() as told:
-        results.write(
-            run_row(row, report=lambda what, n, total: told(f"{title}: {what}", n / total), episodes=episodes)
-        )
+
+        def watch(standings: Sequence[Standing]) -> None:
+            for each in standings:
+                if each.state == "done" and each.name not in shown:
+                    shown.add(each.name)
+                    say(result_line(results.read(jobs[each.name].row)))
+                elif each.state == "running":
+                    place = f"{len(shown) + 1} of {len(rows)}"
+                    told(f"{place}: {jobs[each.name].row}: {each.figures.get('what', '')}", each.share)
+
+        failures = run_jobs([*jobs.values()], results.path / "logs", on=on, workers=workers, watch=watch)
+    for failure in failures:
+        said = failure.error if isinstance(failure.error, CirlError) else failure.said
+        say(f"{jobs[failure.name].row}: failed: {said}")
+    return bool(failures)
 
 
 def _only_resume(context: typer.Context) -> None:

@@ -107,7 +107,7 @@ def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStanding]], None]]
     printer = errors if on_stderr else console
     if printer.is_terminal:
         with Live(console=printer, transient=True, auto_refresh=False) as live:
-            yield lambda standings: live.update(_table(standings), refresh=True)
+            yield lambda standings: live.update(table_of(standings), refresh=True)
         return
     before: dict[str, str] = {}
 
@@ -124,7 +124,7 @@ def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStanding]], None]]
     yield tell
 
 
-def _table(standings: Sequence[CellStanding]) -> Table:
+def table_of(standings: Sequence[CellStanding]) -> Table:
     """Draw who is how far."""
     counts = {state: sum(each.standing.state == state for each in standings) for state in ORDER}
     title = ", ".join(f"{count} {state}" for state, count in counts.items() if count)

@@ -14,12 +14,14 @@ from filelock import Timeout
 
 from cirl_marl.definitions.permission import is_code_allowed
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.jobs.places import Place, Worker, place_of
+from cirl_marl.jobs.places import Worker, Workplace, place_of
 from cirl_marl.jobs.work import Job, JobFiles, Work, do
 
-State = Literal["waiting", "running", "elsewhere", "done", "failed"]
+JobState = Literal["waiting", "running", "elsewhere", "done", "failed"]
 POLL, WATCH = 0.1, 1.0
 """Seconds between two looks at the workers, and between two calls of who watches."""
+EACH = 0.002
+"""Seconds more for every worker, so that thousands in a queue are not asked all the time."""
 PATIENCE = 60.0
 """Seconds for workers that are told to stop to save what they have."""
 
@@ -48,7 +50,7 @@ class Standing:
     """
 
     name: str
-    state: State
+    state: JobState
     figures: Mapping[str, Any]
 
     @property
@@ -98,7 +100,7 @@ def run_jobs(
     driver = _Driver(jobs, folder, watch)
     try:
         while driver.goes_on(place):
-            time.sleep(POLL)
+            time.sleep(POLL + EACH * driver.at_work)
     finally:
         driver.stop()
     return driver.failures
@@ -122,14 +124,19 @@ class _Driver:
         self._files = {job.name: JobFiles(folder, job.name) for job in jobs}
         if len(self._files) != len(jobs):
             raise CirlError("jobs must have distinct names")
-        self._states: dict[str, State] = {job.name: "done" if job.is_done() else "waiting" for job in jobs}
+        self._states: dict[str, JobState] = {job.name: "done" if job.is_done() else "waiting" for job in jobs}
         self._waiting = [job for job in jobs if self._states[job.name] == "waiting"]
         self._running: dict[str, tuple[Job, Worker]] = {}
         self._told: dict[str, Mapping[str, Any]] = {}
         self._watch, self._watched = watch, -WATCH
         self.failures: list[Failure] = []
 
-    def goes_on(self, place: Place | None) -> bool:
+    @property
+    def at_work(self) -> int:
+        """How many work at the moment."""
+        return len(self._running)
+
+    def goes_on(self, place: Workplace | None) -> bool:
         """Look after those at work, start others, and return whether anything is left to be done."""
         for job, worker in list(self._running.values()):
             if (how := worker.ended()) is not None:
@@ -190,7 +197,7 @@ class _Driver:
         else:
             self._settle(job, "done")
 
-    def _settle(self, job: Job, state: State, failure: Failure | None = None) -> None:
+    def _settle(self, job: Job, state: JobState, failure: Failure | None = None) -> None:
         if job in self._waiting:
             self._waiting.remove(job)
         self._states[job.name] = state

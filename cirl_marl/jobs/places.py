@@ -32,7 +32,7 @@ class Worker(Protocol):
         """Ask for the end; what was learnt is saved first, if that can be done."""
 
 
-class Place(Protocol):
+class Workplace(Protocol):
     """Where jobs are done. ``workers`` work at a time, and ``said`` tells the user where that is."""
 
     workers: int
@@ -241,7 +241,7 @@ def _settings(settings: Mapping[str, str]) -> str:
 PLACES: tuple[str, ...] = ("here", "local", "slurm", "ray")
 
 
-def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, str]) -> Place | None:
+def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, str]) -> Workplace | None:
     """Return a place by its name; None is this process.
 
     Raises:
@@ -255,7 +255,7 @@ def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, 
         raise CirlError(f"workers must be at least 1, got {workers}")
     if on == "here" and workers not in (None, 1):
         raise CirlError(f"in this process there is one worker, not {workers}; use --on local")
-    makers: dict[str, Callable[[], Place]] = {
+    makers: dict[str, Callable[[], Workplace]] = {
         "local": lambda: Local(workers),
         "slurm": lambda: Slurm(folder, workers, settings),
         "ray": lambda: Ray(workers),

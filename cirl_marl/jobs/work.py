@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import pickle
+import platform
 import sys
 import time
 import traceback
@@ -137,7 +138,7 @@ def do(job: Callable[[], Job], files: JobFiles, listen: Callable[[], None]) -> N
         if what == told.get("what") and time.monotonic() - last < APART:
             return
         last = time.monotonic()
-        now = {"what": what, "done": done, "total": total, "said": ""}
+        now = {"what": what, "done": done, "total": total, "said": "", "host": platform.node(), "pid": os.getpid()}
         told = {**told, **figures(), **now, "cpu_seconds": earlier + time.process_time() - began}
         write_json(files.told, told)
         listen()

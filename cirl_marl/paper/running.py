@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -16,10 +18,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING
 from cirl_marl.errors import CirlError, RunError
+from cirl_marl.jobs import Tell
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.training import one_torch_thread
 from cirl_marl.paper.published import PaperEnvironment, environment_of
-from cirl_marl.paper.results import WINDOW, Evaluation, PaperRow, Result, thinned
+from cirl_marl.paper.results import WINDOW, Evaluation, PaperRow, Result, Results, thinned
 from cirl_marl.paper.selection import tuned_recipe
 from cirl_marl.paper.training import Predict, Report, check_registered, described, train_published, train_tuned
 from cirl_marl.records.machine import processor, versions
@@ -72,6 +75,29 @@ def run_row(row: PaperRow, *, report: Report = lambda what, done, total: None, e
         cpu_seconds=trained.cpu_seconds,
         published_ends=published_ends,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class RowJob:
+    """A row as a job, whose result is kept in a folder."""
+
+    row: PaperRow
+    folder: Path
+    episodes: int | None
+
+    @property
+    def name(self) -> str:
+        """Name of its files."""
+        return self.row.stem
+
+    def is_done(self) -> bool:
+        """Return whether a result is kept that ``run_row`` would give today."""
+        results = Results(self.folder)
+        return results.has(self.row) and not outdated(results.read(self.row), self.episodes)
+
+    def run(self, tell: Tell) -> None:
+        """Train and evaluate from the beginning, and keep the result."""
+        Results(self.folder).write(run_row(self.row, report=tell, episodes=self.episodes))
 
 
 def outdated(result: Result, episodes: int | None = None) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, ValidationError
+from pydantic_core import PydanticCustomError
 
 from cirl_marl.definitions.catalogue import file_and_region, load_network, networks, recipes
 from cirl_marl.definitions.mistakes import mistakes_of
@@ -17,23 +18,23 @@ from cirl_marl.learners.recipe import Count, EngineName, Recipe, Settings, load_
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Observe, Reward
 
-Value = TypeVar("Value")
+Listed = TypeVar("Listed")
 Level = Annotated[Number, Field(ge=0, le=1)]
-Seed = Annotated[StrictInt, Field(ge=0)]
+SeedNumber = Annotated[StrictInt, Field(ge=0)]
 
 
 def _several(value: Any) -> Any:
     """Return a value as the list of one that it stands for; of what is listed, nothing may stand there twice."""
     listed = value if isinstance(value, list) else [value]
     if not listed:
-        raise ValueError("lists nothing")
+        raise PydanticCustomError("nothing", "lists nothing")
     twice = [each for i, each in enumerate(listed) if each in listed[:i]]
     if twice:
-        raise ValueError(f"lists {twice[0]!r} twice")
+        raise PydanticCustomError("twice", "lists {value} twice", {"value": repr(twice[0])})
     return listed
 
 
-Several = Annotated[list[Value], BeforeValidator(_several)]
+Several = Annotated[list[Listed], BeforeValidator(_several)]
 
 
 class SweepOptions(Settings):
@@ -55,7 +56,7 @@ class SweepEvaluation(Settings):
     """The fresh episodes in which every cell is measured: how many, from which seed, and whether to the bound."""
 
     episodes: Annotated[int, Field(strict=True, ge=2)] = 64
-    seed: Seed = 0
+    seed: SeedNumber = 0
     bounds: StrictBool = True
 
 
@@ -71,7 +72,7 @@ class SweepFile(Settings):
     networks: Several[StrictStr]
     recipes: Several[StrictStr] = Field(["independent_ars"])
     scenarios: Several[StrictStr] | None = None
-    seeds: Several[Seed] = Field([0])
+    seeds: Several[SeedNumber] = Field([0])
     options: SweepOptions = SweepOptions()
     evaluation: SweepEvaluation = SweepEvaluation()
 

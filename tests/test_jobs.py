@@ -1,0 +1,249 @@
+"""Jobs are done once, at whatever place; who dies is named, and the others go on."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from written_jobs import written
+
+from cirl_marl.definitions.permission import code_allowed
+from cirl_marl.errors import CirlError, RunError
+from cirl_marl.jobs import Standing, places, raise_first, run_jobs
+from cirl_marl.jobs.work import JobFiles
+
+TESTS = Path(__file__).parent
+
+
+def installed(package: str) -> pytest.MarkDecorator:
+    """Skip where a package of an extra is not installed."""
+    return pytest.mark.skipif(importlib.util.find_spec(package) is None, reason=f"{package} is not installed")
+
+
+def test_jobs_are_done_once(tmp_path: Path) -> None:
+    """What is there is left alone, what is missing is done, in order, and who watches sees the end of it."""
+    jobs = written(tmp_path)
+    jobs[1].file.write_text("0")
+    seen: list[Sequence[Standing]] = []
+    assert run_jobs(jobs, tmp_path / "jobs", watch=seen.append) == []
+    assert [job.file.read_text() for job in jobs] == ["1", "0", "1"]
+    assert [(each.name, each.state, each.share) for each in seen[-1]] == [(name, "done", 1.0) for name in "abc"]
+    assert run_jobs(jobs, tmp_path / "jobs") == []
+    assert [job.file.read_text() for job in jobs] == ["1", "0", "1"]
+
+
+def test_who_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
+    """In this process too; what was raised can be raised again. Who ends without being done has failed."""
+    jobs = written(tmp_path, a="raise", b="forget")
+    failures = run_jobs(jobs, tmp_path / "jobs")
+    assert [str(each) for each in failures] == [
+        "a: ValueError: paper is out",
+        "b: RunError: b: came to its end without being done",
+    ]
+    assert jobs[2].is_done()
+    with pytest.raises(ValueError, match="paper is out"):
+        raise_first(failures)
+    assert run_jobs(written(tmp_path), tmp_path / "jobs") == []
+    assert jobs[0].file.read_text() == "2"
+
+
+def test_what_is_claimed_is_waited_for(tmp_path: Path) -> None:
+    """It is left to whoever has it; if that one leaves it undone, it is done here."""
+    jobs = written(tmp_path)
+    lock = JobFiles(tmp_path / "jobs", "a").lock()
+    (tmp_path / "jobs").mkdir()
+    lock.acquire()
+    seen: list[dict[str, str]] = []
+
+    def watch(standings: Sequence[Standing]) -> None:
+        seen.append({each.name: each.state for each in standings})
+        if seen[-1]["c"] == "done" and lock.is_locked:
+            assert not jobs[0].is_done()
+            lock.release()
+
+    assert run_jobs(jobs, tmp_path / "jobs", watch=watch) == []
+    assert {"a": "elsewhere", "b": "done", "c": "done"} in seen
+    assert jobs[0].file.read_text() == "1"
+
+
+@pytest.mark.medium
+def test_a_worker_that_dies_is_named_with_what_it_said(tmp_path: Path) -> None:
+    """Its job alone is not done; an exception elsewhere is reported in its own words."""
+    jobs = written(tmp_path, a="die", b="raise")
+    said: list[str] = []
+    failures = run_jobs(jobs, tmp_path / "jobs", on="local", workers=2, say=said.append)
+    assert said == ["2 at a time on this machine"]
+    found = {each.name: each.said for each in failures}
+    assert found == {"a": "killed by SIGKILL: the pen breaks", "b": "ValueError: paper is out"}
+    assert 'raise ValueError("paper is out")' in (tmp_path / "jobs" / "b.log").read_text()
+    assert jobs[2].is_done()
+    with pytest.raises(RunError, match=r"killed by SIGKILL: the pen breaks \(log: .*a.log\)|paper is out"):
+        raise_first(failures)
+    assert [(tmp_path / f"{name}.begun").is_file() for name in "abc"] == [True] * 3
+    assert run_jobs(written(tmp_path), tmp_path / "jobs") == []
+
+
+DRIVE = """
+import sys
+from pathlib import Path
+from written_jobs import written
+from cirl_marl.jobs import run_jobs
+folder = Path(sys.argv[1])
+if __name__ == "__main__":
+    run_jobs(written(folder, a="wait"), folder / "jobs", on="local", workers=1)
+"""
+
+
+@pytest.mark.medium
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)], ids=["killed", "interrupted"]
+)
+def test_workers_end_with_their_driver(how: signal.Signals, tmp_path: Path) -> None:
+    """Nobody works on for a driver that is gone, and what it had claimed is free."""
+    script = tmp_path / "drive.py"
+    script.write_text(DRIVE)
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
+    driver = subprocess.Popen(
+        [sys.executable, script, tmp_path], env=os.environ | {"PYTHONPATH": paths}, stderr=subprocess.DEVNULL
+    )
+    begun, files = tmp_path / "a.begun", JobFiles(tmp_path / "jobs", "a")
+    wait_until(lambda: begun.is_file() and bool(begun.read_text()))
+    worker = int(begun.read_text())
+    driver.send_signal(how)
+    driver.wait()
+    wait_until(lambda: not is_alive(worker))
+    assert not files.is_claimed()
+    assert run_jobs(written(tmp_path), tmp_path / "jobs") == []
+    assert (tmp_path / "a.txt").read_text() == "2"
+
+
+def wait_until(true: object) -> None:
+    """Wait a minute at most."""
+    late = time.monotonic() + 60
+    while not true():  # type: ignore[operator]
+        assert time.monotonic() < late
+        time.sleep(0.05)
+
+
+def is_alive(process: int) -> bool:
+    """Return whether a process of another parent runs; nobody may have asked a dead one for its exit code."""
+    status = Path(f"/proc/{process}/stat")
+    if status.parent.parent.is_dir():
+        return status.is_file() and status.read_text().rpartition(")")[2].split()[0] != "Z"
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"on": "locl"}, r"unknown place 'locl'. Did you mean 'local'\? Known: here, local, slurm, ray."),
+        ({"on": "here", "workers": 2}, "there is one worker, not 2; use --on local"),
+        ({"on": "local", "workers": 0}, "workers must be at least 1, got 0"),
+        (
+            {"on": "local", "settings": {"slurm_partition": "long"}},
+            "--slurm slurm_partition=long: goes with --on slurm",
+        ),
+        ({"on": "slurm"}, r"--on slurm needs the package submitit, .* pip install 'cirl-marl\[slurm\]'"),
+        ({"on": "ray"}, r"--on ray needs the package ray, .* pip install 'cirl-marl\[ray\]'"),
+    ],
+)
+def test_places_that_cannot_be(
+    options: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is begun, and the words say what to do."""
+
+    def missing(package: str) -> None:
+        raise ModuleNotFoundError(package, name=package)
+
+    monkeypatch.setattr(places, "import_module", missing)
+    with pytest.raises(CirlError, match=message):
+        run_jobs(written(tmp_path), tmp_path / "jobs", **options)  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@installed("submitit")
+def test_slurm_through_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without Slurm it says that it is none, and does the same; what submitit does not take is refused."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(TESTS), str(TESTS.parent)]))
+    jobs = written(tmp_path, a="die", b="raise")
+    with pytest.raises(CirlError, match="--slurm slurm_partitoin=long: submitit says: "):
+        run_jobs(jobs, tmp_path / "jobs", on="slurm", settings={"slurm_partitoin": "long"})
+    said: list[str] = []
+    failures = run_jobs(jobs, tmp_path / "jobs", on="slurm", workers=3, say=said.append)
+    assert said == ["3 at a time on this machine, as there is no Slurm here (no sbatch): submitit runs them"]
+    found = {each.name: each.said for each in failures}
+    assert found["b"] == "ValueError: paper is out"
+    assert found["a"].endswith(": the pen breaks")
+    assert jobs[2].is_done()
+    assert run_jobs(written(tmp_path), tmp_path / "jobs", on="slurm", settings={"timeout_min": "5"}) == []
+
+
+@pytest.mark.slow
+@installed("ray")
+def test_ray(tmp_path: Path) -> None:
+    """A cluster of this machine does the same, in processes of their own."""
+    script = tmp_path / "ray.py"
+    script.write_text(RAY)
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
+    done = subprocess.run(
+        [sys.executable, script, tmp_path],
+        env=os.environ | {"PYTHONPATH": paths},
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    first, *lines = [line for line in done.stdout.splitlines() if "(raylet)" not in line]
+    assert "at a time on the Ray cluster, which has" in first
+    assert lines[:2] == ["a: the pen breaks", "b: ValueError: paper is out"], done.stderr
+    assert lines[2:] == ["[]"], done.stderr
+    assert [(tmp_path / f"{name}.txt").read_text() for name in "abc"] == ["2", "2", "1"]
+    assert len(set((tmp_path / "a.begun").read_text().splitlines())) == 2
+
+
+RAY = """
+import sys
+from pathlib import Path
+sys.path.remove(str(Path(__file__).parent))  # it has the name of the package
+from written_jobs import written
+from cirl_marl.jobs import run_jobs
+folder = Path(sys.argv[1])
+failures = run_jobs(written(folder, a="die", b="raise"), folder / "jobs", on="ray", say=print)
+for each in sorted(failures, key=lambda each: each.name):
+    print(f"{each.name}: {each.said.rpartition(': ')[2] if each.name == 'a' else each.said}")
+print(run_jobs(written(folder), folder / "jobs", on="ray"), flush=True)
+"""
+
+
+def test_the_leave_to_import_goes_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers may import what their driver may, and count paths from where it is."""
+    from cirl_marl.jobs import driver
+
+    sent = []
+
+    class Post:
+        workers, said = 1, "by post"
+
+        def start(self, work: object) -> object:
+            sent.append(work)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(driver, "place_of", lambda *_: Post())
+    monkeypatch.chdir(tmp_path)
+    for allowed in (False, True):
+        with code_allowed(allowed), pytest.raises(KeyboardInterrupt):
+            run_jobs(written(tmp_path), tmp_path / "jobs", on="local")
+    assert [each.allow_code for each in sent] == [False, True]  # type: ignore[attr-defined]
+    assert {each.directory for each in sent} == {str(tmp_path)}  # type: ignore[attr-defined]
