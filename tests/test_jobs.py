@@ -16,7 +16,7 @@ from written_jobs import written
 
 from cirl_marl.definitions.permission import code_allowed
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.jobs import Standing, places, raise_first, run_jobs
+from cirl_marl.jobs import Standing, driver, places, raise_first, run_jobs
 from cirl_marl.jobs.work import JobFiles
 
 TESTS = Path(__file__).parent
@@ -73,6 +73,29 @@ def test_what_is_claimed_is_waited_for(tmp_path: Path) -> None:
     assert jobs[0].file.read_text() == "1"
 
 
+def test_nobody_is_sent_for_what_is_claimed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process or a place in a queue would come for nothing; what was done elsewhere meanwhile needs none, either."""
+    jobs = written(tmp_path)[:1]
+    lock = JobFiles(tmp_path / "jobs", "a").lock()
+    (tmp_path / "jobs").mkdir()
+    lock.acquire()
+
+    class Nowhere:
+        workers, said = 1, "nowhere"
+
+        def start(self, work: object) -> object:
+            raise AssertionError("somebody was sent")
+
+    def watch(standings: Sequence[Standing]) -> None:
+        if standings[0].state == "elsewhere" and lock.is_locked:
+            jobs[0].file.write_text("by another")
+            lock.release()
+
+    monkeypatch.setattr(driver, "place_of", lambda *_: Nowhere())
+    assert run_jobs(jobs, tmp_path / "jobs", watch=watch) == []
+    assert jobs[0].file.read_text() == "by another"
+
+
 @pytest.mark.medium
 def test_a_worker_that_dies_is_named_with_what_it_said(tmp_path: Path) -> None:
     """Its job alone is not done; an exception elsewhere is reported in its own words."""
@@ -111,14 +134,14 @@ def test_workers_end_with_their_driver(how: signal.Signals, tmp_path: Path) -> N
     script = tmp_path / "drive.py"
     script.write_text(DRIVE)
     paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
-    driver = subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, script, tmp_path], env=os.environ | {"PYTHONPATH": paths}, stderr=subprocess.DEVNULL
     )
     begun, files = tmp_path / "a.begun", JobFiles(tmp_path / "jobs", "a")
     wait_until(lambda: begun.is_file() and bool(begun.read_text()))
     worker = int(begun.read_text())
-    driver.send_signal(how)
-    driver.wait()
+    process.send_signal(how)
+    process.wait()
     wait_until(lambda: not is_alive(worker))
     assert not files.is_claimed()
     assert run_jobs(written(tmp_path), tmp_path / "jobs") == []
@@ -229,8 +252,6 @@ print(run_jobs(written(folder), folder / "jobs", on="ray"), flush=True)
 
 def test_the_leave_to_import_goes_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Workers may import what their driver may, and count paths from where it is."""
-    from cirl_marl.jobs import driver
-
     sent = []
 
     class Post:

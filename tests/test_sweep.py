@@ -23,6 +23,7 @@ from cirl_marl import cli, load_network
 from cirl_marl.errors import CirlError, DefinitionError, RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.statistics import over_episodes
+from cirl_marl.evaluation.sweep import pareto
 from cirl_marl.jobs import Standing
 from cirl_marl.learners import train
 from cirl_marl.network import Network
@@ -114,6 +115,25 @@ def test_what_cannot_be_trained_is_refused_before_anything_is(asked: Path) -> No
     changed(Path("quick.toml"), "learner =", 'match = [{ agents = ["quarri"], algorithm = "A2C" }]\nlearner =')
     with pytest.raises(CirlError, match=r"unknown agent 'quarri'\. Did you mean 'quarry'"):
         sweep(asked, on="here")
+    assert not Path("runs").exists()
+
+
+def test_a_place_that_cannot_be_is_refused_before_anything_is_written(
+    asked: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The exit code is 2."""
+    for arguments, said in (
+        (("--on", "slrm"), "unknown place 'slrm'. Did you mean 'slurm'?"),
+        (
+            ("--slurm", "slurm_partition=long"),
+            "--slurm slurm_partition=long: goes with --on slurm, not with --on local",
+        ),
+        (("--on", "slurm", "--slurm", "long"), "--slurm long: must be NAME=VALUE"),
+    ):
+        assert command(monkeypatch, "sweep", str(asked), *arguments) == 2
+        assert said in capsys.readouterr().err
+    with pytest.raises(CirlError, match="unknown place 'slrm'"):
+        pareto("bottles.toml", "quick.toml", directory=Path("runs"), on="slrm")
     assert not Path("runs").exists()
 
 

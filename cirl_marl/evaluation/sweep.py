@@ -16,7 +16,7 @@ from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.evaluation.contenders import differences
 from cirl_marl.evaluation.yardsticks import FRONT
-from cirl_marl.jobs import Standing, Tell, raise_first, run_jobs
+from cirl_marl.jobs import Standing, Tell, check_place, raise_first, run_jobs
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.learners.completion import completed
 from cirl_marl.network import Floats, Network
@@ -105,6 +105,7 @@ def pareto(
         NoCertificate: if there is no bound and nothing to train either.
         RunError: if ``directory`` holds the runs of something else, or a training fails elsewhere.
     """
+    check_place(on, workers)
     if points < 2 or seeds < 1:
         raise CirlError(f"points must be at least 2 and seeds at least 1, got {points} and {seeds}")
     found = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)

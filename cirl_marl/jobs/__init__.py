@@ -5,7 +5,7 @@ a *place*; whoever works on a job holds its file lock, so any number of drivers 
 """
 
 from cirl_marl.jobs.driver import Failure, Standing, raise_first, run_jobs
-from cirl_marl.jobs.places import PLACES
+from cirl_marl.jobs.places import PLACES, check_place
 from cirl_marl.jobs.work import Job, Tell
 
-__all__ = ["PLACES", "Failure", "Job", "Standing", "Tell", "raise_first", "run_jobs"]
+__all__ = ["PLACES", "Failure", "Job", "Standing", "Tell", "check_place", "raise_first", "run_jobs"]

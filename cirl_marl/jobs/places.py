@@ -241,11 +241,11 @@ def _settings(settings: Mapping[str, str]) -> str:
 PLACES: tuple[str, ...] = ("here", "local", "slurm", "ray")
 
 
-def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, str]) -> Workplace | None:
-    """Return a place by its name; None is this process.
+def check_place(on: str, workers: int | None = None, settings: Mapping[str, str] | None = None) -> None:
+    """Refuse a place that cannot be, before anything is begun.
 
     Raises:
-        CirlError: for an unknown place, settings that it does not take, or a package that is missing.
+        CirlError: for an unknown place, workers or settings that it does not take, or a package that is missing.
     """
     if on not in PLACES:
         raise CirlError(unknown("place", on, PLACES))
@@ -255,6 +255,18 @@ def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, 
         raise CirlError(f"workers must be at least 1, got {workers}")
     if on == "here" and workers not in (None, 1):
         raise CirlError(f"in this process there is one worker, not {workers}; use --on local")
+    for package, extra in EXTRAS.items():
+        if on == extra:
+            _wanted(package)
+
+
+def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, str]) -> Workplace | None:
+    """Return a place by its name; None is this process.
+
+    Raises:
+        CirlError: if ``check_place`` refuses it, or submitit its settings, or there is no Ray where there should be.
+    """
+    check_place(on, workers, settings)
     makers: dict[str, Callable[[], Workplace]] = {
         "local": lambda: Local(workers),
         "slurm": lambda: Slurm(folder, workers, settings),

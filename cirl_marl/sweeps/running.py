@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cirl_marl.jobs import Failure, Job, Standing, run_jobs
+from cirl_marl.jobs import Failure, Job, Standing, check_place, run_jobs
 from cirl_marl.sweeps.cells import Cell, cells_of
 from cirl_marl.sweeps.folder import SweepFolder, jobs_of
 from cirl_marl.sweeps.fronts import FrontJob
@@ -73,6 +73,7 @@ def sweep(
         CirlError: for input that cannot be used, before anything is trained; the folder of another sweep among it.
         KeyboardInterrupt: after Ctrl-C; what was learnt is saved.
     """
+    check_place(on, workers, settings)
     path = Path(file)
     asked = load_sweep(path)
     cells = cells_of(asked)
