@@ -355,7 +355,7 @@ def outcome(folder: Path) -> dict[str, Any]:
 
 def training(folder: Path) -> list[int]:
     """Return the processes in which cells are being trained."""
-    told = [json.loads(path.read_text()) for path in (folder / "jobs").glob("*.json")]
+    told = [json.loads(path.read_text()) for path in (folder / "jobs").glob("[!.]*.json")]
     return [each["pid"] for each in told if each["what"] == "training" and is_alive(each["pid"])]
 
 
