@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -188,7 +187,7 @@ class _Driver:
         self._states[job.name] = "running"
         try:
             with files.lock():
-                do(lambda: job, files, self._look)
+                do(job, files, self._look)
         except Timeout:
             self._states[job.name] = "elsewhere"
         except Exception as error:  # of whatever kind: the others go on, and it is reported
@@ -206,7 +205,7 @@ class _Driver:
             self.failures.append(failure)
 
     def _work(self, job: Job) -> Work:
-        return Work(pickle.dumps(job), self._files[job.name], os.getcwd(), is_code_allowed())
+        return Work(job, self._files[job.name], os.getcwd(), is_code_allowed())
 
     def _look(self, at_once: bool = False) -> None:
         """Call who watches, unless that was a moment ago."""

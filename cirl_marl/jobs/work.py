@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import pickle
 import platform
 import sys
 import time
@@ -36,7 +35,7 @@ class Tell(Protocol):
 
 
 class Job(Protocol):
-    """Work that is done once. It is pickled on its way to where it is done."""
+    """Work that is done once. It is sent as it is to where it is done, so it must be importable there."""
 
     @property
     def name(self) -> str:
@@ -98,12 +97,11 @@ class Work:
     """A job on its way: it is called where it is done, in a process that may know nothing of who sent it.
 
     Attributes:
-        job: pickled, so that also what fails when it is read is said in its log.
         directory: the working directory, from which relative paths count.
         allow_code: whether definitions may import the models that they name.
     """
 
-    job: bytes
+    job: Job
     files: JobFiles
     directory: str
     allow_code: bool
@@ -118,13 +116,13 @@ class Work:
         try:
             with self.files.lock(), _redirected(self.files.log):
                 with code_allowed(self.allow_code):
-                    do(lambda: pickle.loads(self.job), self.files, lambda: None)
+                    do(self.job, self.files, lambda: None)
         except Timeout:
             return False
         return True
 
 
-def do(job: Callable[[], Job], files: JobFiles, listen: Callable[[], None]) -> None:
+def do(job: Job, files: JobFiles, listen: Callable[[], None]) -> None:
     """Do a job that is claimed, and ``listen`` whenever it has told how far it is.
 
     Raises:
@@ -144,12 +142,11 @@ def do(job: Callable[[], Job], files: JobFiles, listen: Callable[[], None]) -> N
         listen()
 
     try:
-        found = job()
         tell("beginning", 0, 1)
-        if not found.is_done():
-            found.run(tell)
-        if not found.is_done():
-            raise RunError(f"{found.name}: came to its end without being done")
+        if not job.is_done():
+            job.run(tell)
+        if not job.is_done():
+            raise RunError(f"{job.name}: came to its end without being done")
         tell("done", 1, 1)
     except Exception as error:
         write_json(files.told, told | {"said": f"{type(error).__name__}: {error}"})

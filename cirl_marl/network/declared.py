@@ -94,7 +94,7 @@ class Kinds(NamedTuple):
     otherwise: Kind
 
 
-SMALLEST, LARGEST = 1e-100, 1e100
+SMALLEST, LARGEST = 1e-50, 1e50
 """Sizes of numbers of which squares and quotients are finite."""
 
 
