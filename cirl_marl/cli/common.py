@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time as clock
 from collections.abc import Callable, Iterator
@@ -61,6 +62,11 @@ MinService = Annotated[
     typer.Option(min=0.0, max=1.0, help="Mean level of each service, for mpc and optimum; default: all there is."),
 ]
 
+Html = Annotated[
+    Path | None,
+    typer.Option("--html", help="Report for the browser to write as well: one .html file, which needs no server."),
+]
+
 
 def plain(error: BaseException) -> str:
     """Keep rich from reading brackets in a message as markup."""
@@ -87,6 +93,22 @@ def folder_for(path: Path, option: str) -> Path:
     """Return ``path``, which is or can become a folder; a ``CirlError`` names the option if it is something else."""
     if path.exists() and not path.is_dir():
         raise CirlError(f"{option} {path}: is a file, not a folder")
+    return path
+
+
+def page_for(path: Path | None) -> Path | None:
+    """Return where a report for the browser goes, if it is asked for; a ``CirlError`` says why it cannot go there."""
+    if path is None:
+        return None
+    if path.suffix != ".html":
+        raise CirlError(f"--html {path}: needs the name of an .html file")
+    if path.is_dir():
+        raise CirlError(f"--html {path}: is a folder, not a file")
+    folder = next(each for each in path.absolute().parents if each.exists())
+    if not folder.is_dir():
+        raise CirlError(f"--html {path}: {folder} is a file, not a folder")
+    if not os.access(folder, os.W_OK):
+        raise CirlError(f"--html {path}: nothing can be written in {folder}")
     return path
 
 

@@ -10,6 +10,7 @@ import typer
 from cirl_marl.cli import common
 from cirl_marl.cli.common import (
     EpisodeCount,
+    Html,
     MinService,
     NetworkName,
     Scenario,
@@ -45,6 +46,7 @@ def compare(
     out: Annotated[
         Path | None, typer.Option(help="Folder for episodes.csv, summary.csv, summary.json and comparison.png.")
     ] = None,
+    html: Html = None,
 ) -> None:
     """Compare trained runs and controllers on the same fresh episodes, and with the best possible.
 
@@ -57,7 +59,7 @@ def compare(
     from cirl_marl.report.comparison import comparison_notes, comparison_table, write_comparison
 
     names = common.listed(controllers)
-    folder = None if out is None else common.folder_for(out, "--out")
+    folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
     asked: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service, "uncertain": uncertain}
     with shares() as progress:
         found = compared(runs or [], names, network=network, scenario=scenario, progress=progress, **asked)
@@ -67,6 +69,11 @@ def compare(
     if folder is not None:
         for path in write_comparison(found, folder, controllers=names, **asked):
             say(f"wrote {path}")
+    if page is not None:
+        from cirl_marl.report.browser import write_page
+        from cirl_marl.report.scenes import of_comparison
+
+        say(f"wrote {write_page(page, of_comparison(found))}")
 
 
 @app.command()
@@ -88,6 +95,7 @@ def pareto(
         Path | None,
         typer.Option(help="Folder of pareto.csv, .json, .png and the runs; default: runs/pareto-NETWORK[_SCENARIO]."),
     ] = None,
+    html: Html = None,
 ) -> None:
     """Draw service against circularity: what is possible, what plans achieve, what learners reach.
 
@@ -97,6 +105,7 @@ def pareto(
     from cirl_marl.evaluation.sweep import pareto as swept
     from cirl_marl.report.sweep import write_sweep
 
+    page = common.page_for(html)
     folder = common.folder_for(
         out or Path("runs") / f"pareto-{common.stem(load_network(network, scenario=scenario))}", "--out"
     )
@@ -116,3 +125,8 @@ def pareto(
         say(f"no bound: {found.reason}")
     for path in write_sweep(found, folder, recipe=recipe, **asked):
         say(f"wrote {path}")
+    if page is not None:
+        from cirl_marl.report.browser import write_page
+        from cirl_marl.report.scenes import of_sweep
+
+        say(f"wrote {write_page(page, of_sweep(found))}")

@@ -9,7 +9,20 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from cirl_marl.cli.common import MinService, NetworkName, Scenario, StartSeed, app, bar, console, folder_for, say, stem
+from cirl_marl.cli.common import (
+    Html,
+    MinService,
+    NetworkName,
+    Scenario,
+    StartSeed,
+    app,
+    bar,
+    console,
+    folder_for,
+    page_for,
+    say,
+    stem,
+)
 from cirl_marl.controllers import Controller
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Beginning, Rollout
@@ -46,6 +59,7 @@ def simulate(
         int | None, typer.Option(min=2, help="Draws of the uncertain numbers, for bands and what causes them.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Directory of CSV and picture; default: here.")] = None,
+    html: Html = None,
 ) -> None:
     """Simulate a network under a controller without learning; write a CSV and a picture.
 
@@ -57,9 +71,9 @@ def simulate(
     With --samples the uncertain numbers of the network are drawn so many times: bands in a CSV and a picture.
     From 70 samples on a table says which number causes most of the spread.
     """
-    controls = control or ["neutral"]
+    controls, page = control or ["neutral"], page_for(html)
     if samples is not None:
-        _sample(network, scenario or [None], controls, steps, 0 if seed is None else seed, samples, out)
+        _sample(network, scenario or [None], controls, steps, 0 if seed is None else seed, samples, out, page)
         return
     held, folder = _held(controls, set_ or []), folder_for(out or Path(), "--out")
     with bar("simulating") as progress:
@@ -77,6 +91,11 @@ def simulate(
         _write_one(folder, files)
     else:
         _write_several(folder, files)
+    if page is not None:
+        from cirl_marl.report.browser import write_page
+        from cirl_marl.report.scenes import of_alternatives
+
+        say(f"wrote {write_page(page, of_alternatives(found))}")
 
 
 def _sample(
@@ -87,6 +106,7 @@ def _sample(
     seed: int,
     samples: int,
     out: Path | None,
+    page: Path | None,
 ) -> None:
     """Simulate draws of the uncertain numbers, and write and say what came of them."""
     from cirl_marl.evaluation.sampling import FEWEST, sampled, sensitivities
@@ -112,6 +132,11 @@ def _sample(
         console.print(sensitivity_table(found, causes))
     else:
         say(f"which number causes the spread is told from {FEWEST} samples on")
+    if page is not None:
+        from cirl_marl.report.browser import write_page
+        from cirl_marl.report.scenes import of_samples
+
+        written.append(write_page(page, of_samples(found, controls[0])))
     say(f"wrote {', '.join(map(str, written))}")
 
 
@@ -159,6 +184,7 @@ def plan(
     scenario: Scenario = None,
     seed: StartSeed = None,
     min_service: MinService = None,
+    html: Html = None,
 ) -> None:
     """Write what a policy or controller does in one episode, beside business as usual, and what that saves.
 
@@ -173,6 +199,7 @@ def plan(
 
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
+    page = page_for(html)
     env, controller = _actor(source, control, scenario, min_service)
     who = Path(source).resolve().name if control is None else stem(env.network, control)
     path = Path(f"plan_{who}.csv") if out is None else out
@@ -183,6 +210,12 @@ def plan(
     found.write(path)
     title = f"{env.network.title or env.network.name}: {'what was learnt' if control is None else control}"
     beside = write_decisions(path, found, title=title)
+    if page is not None:
+        from cirl_marl.report.browser import write_page
+        from cirl_marl.report.scenes import PLAN, of_schedule
+
+        name = "trained" if control is None else PLAN if control == "optimum" and not controller.note else control
+        beside.append(write_page(page, of_schedule(found, name, note=controller.note)))
     console.print(decisions_table(found))
     console.print(savings_table(found))
     _say_figures(found.rollout, env.network, found.begun)

@@ -10,6 +10,7 @@ import typer
 
 from cirl_marl.cli.common import (
     EpisodeCount,
+    Html,
     RunPath,
     Scenario,
     Seed,
@@ -17,6 +18,7 @@ from cirl_marl.cli.common import (
     app,
     console,
     listed,
+    page_for,
     say,
     shares,
     training_bar,
@@ -149,9 +151,12 @@ def export(
 
 
 @app.command()
-def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
-    """Evaluate a run and draw its pictures anew."""
-    _evaluate_and_draw(run, episodes, seed)
+def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0, html: Html = None) -> None:
+    """Evaluate a run and draw its pictures anew.
+
+    With --html the policies stand beside business as usual and the plan of the bound: as long as ``cirl evaluate``.
+    """
+    _evaluate_and_draw(run, episodes, seed, page_for(html))
 
 
 @app.command()
@@ -263,19 +268,26 @@ def _say_shortages(rollouts: Mapping[str, Rollout], network: Network) -> None:
             say(f"{name}: {said}")
 
 
-def _evaluate_and_draw(directory: Path, episodes: int, seed: int) -> None:
+def _evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | None = None) -> None:
     from cirl_marl.learners.run import RunDirectory
-    from cirl_marl.report.run import choice, draw_run, evaluate_run
+    from cirl_marl.report.run import choice, draw_run, evaluate_run, evaluate_story
     from cirl_marl.report.tables import evaluation_table
 
-    run = RunDirectory(directory)
+    run, story = RunDirectory(directory), None
     with shares() as progress:
-        figures, rollouts, env = evaluate_run(run, episodes=episodes, seed=seed, bounds=False, progress=progress)
+        if page is None:
+            figures, rollouts, env = evaluate_run(run, episodes=episodes, seed=seed, bounds=False, progress=progress)
+        else:
+            (figures, rollouts, env), story = evaluate_story(run, episodes=episodes, seed=seed, progress=progress)
     console.print(evaluation_table(figures))
     say(choice(run))
     _say_shortages(rollouts, env.network)
     for path in draw_run(run, rollouts, env):
         say(f"picture: {path}")
+    if page is not None and story is not None:
+        from cirl_marl.report.browser import write_page
+
+        say(f"wrote {write_page(page, story)}")
     if not run.metrics()["env_steps"]:
         needed = run.config.envs * env.network.episode.horizon
         say(f"no learning curves, as no episode ended: {run.config.envs} copies need {needed:,} steps")

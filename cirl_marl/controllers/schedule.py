@@ -23,7 +23,8 @@ from cirl_marl.records.files import write_atomically, write_table
 class Schedule:
     """One episode: the network, a header with units, columns of shape (columns, steps), its start, and the rollout.
 
-    ``usual`` is what becomes of the same start if nobody acts, ``agents`` are those who do.
+    ``usual`` is what becomes of the same start if nobody acts, ``agents`` are those who do. It begins with the stocks
+    ``start``, shape (stores,), mass.
     """
 
     network: Network
@@ -33,6 +34,7 @@ class Schedule:
     rollout: Rollout
     usual: Rollout
     agents: tuple[str, ...]
+    start: Floats
 
     def write(self, path: Path) -> None:
         """Write a CSV file, whole or not at all; a ``CirlError`` says so if its folder is not there.
@@ -82,6 +84,8 @@ def schedule(
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
     recorded, begun = _Recorded(controller, env), beginning(env, seed)
+    begun.reset(env)
+    start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     usual = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
     run = rollout(env, recorded, seed=begun.seed, start=begun.given, progress=progress)
     actuators = Actuators(env.dynamics, env.agents, len(recorded.actions))
@@ -97,7 +101,7 @@ def schedule(
         ("service level (1)", run.service[0]),
     ]
     header, found = zip(*columns, strict=True)
-    return Schedule(network, header, np.array(found), begun, run, usual, env.agents)
+    return Schedule(network, header, np.array(found), begun, run, usual, env.agents, start)
 
 
 def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:

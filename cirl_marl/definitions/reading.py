@@ -38,6 +38,7 @@ class Definition:
         names: of the scenarios, ``default`` first.
         regions: by id the texts of the regions, each of which is a network of its own; empty if it is one network.
         files: the data files that it names.
+        sha256: hash of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -48,7 +49,7 @@ class Definition:
         """
         self.path, self.files = path, DataFiles(path.parent)
         self._document = read_toml(path)
-        self._sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        self.sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         overrides = self._document.get("scenarios", {})
         if not isinstance(overrides, dict) or not all(isinstance(each, dict) for each in overrides.values()):
             raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
@@ -82,19 +83,24 @@ class Definition:
             mistakes = list(_strangers(self._document, override, where))
             if mistakes:
                 raise DefinitionError(str(self.path), mistakes)
-            told = {key: value for key, value in override.items() if key != "without"}
             try:
                 self._built[name, region] = _build(
-                    _merge(_without(self._document, override), told),
+                    self.document(name),
                     (self.files, region),
                     scenario_name=name,
                     scenarios=_Others(self, name, region),
                     source=self.path,
-                    source_sha256=self._sha256,
+                    source_sha256=self.sha256,
                 )
             except NetworkError as error:
                 raise DefinitionError(str(self.path), [where + problem for problem in error.problems]) from None
         return self._built[name, region]
+
+    def document(self, name: str = DEFAULT) -> dict[str, Any]:
+        """Return what the file says under a scenario whose paths are those of the file."""
+        override = self._overrides[name]
+        told = {key: value for key, value in override.items() if key != "without"}
+        return _merge(_without(self._document, override), told)
 
     def check(self, region: str = "") -> None:
         """Build every scenario.

@@ -72,11 +72,11 @@ def yardstick(
             progress((row + solved / SOLVES) / len(services))
 
         tell(0)
-        demanded = _rounded(service)
-        level = tuple(np.rint(demanded.mean(axis=0) / STEP).astype(int).tolist())
+        asked = demanded(service)
+        level = tuple(np.rint(asked.mean(axis=0) / STEP).astype(int).tolist())
         if level not in members:
             found = envelope(
-                network, starts, solves=SOLVES, min_service=demanded, agents=agents or None, near=near, progress=tell
+                network, starts, solves=SOLVES, min_service=asked, agents=agents or None, near=near, progress=tell
             )
             members[level] = found.members
             near = found.members[0]
@@ -117,12 +117,12 @@ def bounds_of_draws(
     for i, (start, row) in enumerate(zip(starts, factors.tolist(), strict=True)):
         certain, near = drawn(network, row), None
         for k, levels in enumerate(services):
-            near = bound(certain, start, min_service=_rounded(levels[i]), agents=agents or None, near=near)
+            near = bound(certain, start, min_service=demanded(levels[i]), agents=agents or None, near=near)
             found[k, i] = near.objective
             progress((i + (k + 1) / len(services)) / len(starts))
     return [*found]
 
 
-def _rounded(levels: Floats) -> Floats:
+def demanded(levels: Floats) -> Floats:
     """Return the levels that programs demand of episodes that delivered ``levels``."""
     return np.asarray(np.maximum(np.floor((levels - MARGIN) / STEP) * STEP, 0.0))

@@ -58,23 +58,48 @@ class Lever:
         return f"{number(value)} {self.unit}{change}".rstrip()
 
 
-def levers(found: Schedule) -> list[Lever]:
-    """Return what the agents of a plan set, first what differs most from business as usual."""
-    network = found.network
-    every: list[Lever] = []
-    for agent in found.agents:
+@itemised
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One thing that an agent sets."""
+
+    agent: Annotated[str, "id of the agent"]
+    name: Annotated[str, "title of the agent, with what it sets if it is an input of a model"]
+    kind: Annotated[ControlKind, "what is set"]
+    of: Annotated[str, "what a share is of"]
+    unit: Annotated[str, "of the values"]
+    row: Annotated[int, "place among all controls"]
+
+
+def settings(network: Network, agents: Sequence[str]) -> Iterator[Setting]:
+    """Yield what agents set, agent by agent."""
+    for agent in agents:
         compartment, rows = network.compartments[agent], network.control_rows[agent]
         control, model = compartment.control, compartment.model
         assert control is not None
-        low, _, high = network.control_bounds[:, rows]
         names = model.input_names if control.kind is ControlKind.INPUT and model is not None else ("",)
         flow = f"{network.mass_unit}/{network.time_unit}"
         unit = {ControlKind.FLOW: flow, ControlKind.INPUT: ""}.get(control.kind, "1")
-        for entry, (name, row) in enumerate(zip(names, range(rows.start, rows.stop), strict=True)):
+        for name, row in zip(names, range(rows.start, rows.stop), strict=True):
             title = _title(network, compartment) + (f", {name}" if name else "")
-            planned, usual = found.rollout.controls[:, row], found.usual.controls[:, row]
-            width = float((high[entry] - low[entry]).max())
-            every.append(Lever(title, control.kind, _donor(network, compartment), unit, planned, usual, width))
+            yield Setting(agent, title, control.kind, _donor(network, compartment), unit, row)
+
+
+def levers(found: Schedule) -> list[Lever]:
+    """Return what the agents of a plan set, first what differs most from business as usual."""
+    low, _, high = found.network.control_bounds
+    every = [
+        Lever(
+            each.name,
+            each.kind,
+            each.of,
+            each.unit,
+            found.rollout.controls[:, each.row],
+            found.usual.controls[:, each.row],
+            float((high[each.row] - low[each.row]).max()),
+        )
+        for each in settings(found.network, found.agents)
+    ]
     return sorted(every, key=lambda each: -each.change)
 
 

@@ -14,11 +14,18 @@ from cirl_marl.drawing.digraph import save_before_after
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.comparison import Comparison, part_of
 from cirl_marl.evaluation.figures import summary
 from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.records.files import write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
+from cirl_marl.report.scenes import PLAN, Story, of_comparison, with_plan
+
+CONTROLLERS = ("neutral", "random")
+"""Whom a run is compared with."""
+EVALUATED = 0.6
+"""Share of the evaluation in the work on a page; the rest is to plan."""
 
 
 def evaluate_run(
@@ -42,7 +49,27 @@ def evaluate_run(
         CirlError: if ``episodes`` or ``seed`` cannot be used.
         RunError: if the run is incomplete.
     """
-    comparison = compare([run], ("neutral", "random"), episodes=episodes, seed=seed, bounds=bounds, progress=progress)
+    comparison = compare([run], CONTROLLERS, episodes=episodes, seed=seed, bounds=bounds, progress=progress)
+    return figures_of(run, comparison, bounds=bounds)
+
+
+def evaluate_story(
+    run: RunDirectory, *, episodes: int, seed: int, progress: Callable[[str, float], None]
+) -> tuple[tuple[dict[str, Any], dict[str, Rollout], VectorEnv], Story]:
+    """Return what ``evaluate_run`` does, and the page: business as usual, the policies, and the plan of the bound."""
+    comparison = compare(
+        [run], CONTROLLERS, episodes=episodes, seed=seed, progress=lambda what, share: progress(what, EVALUATED * share)
+    )
+    found = figures_of(run, comparison, bounds=True)
+    story = of_comparison(comparison, without=CONTROLLERS[1:])
+    return found, with_plan(story, comparison, run.make_env(1), part_of(progress, PLAN, EVALUATED, 1 - EVALUATED))
+
+
+def figures_of(
+    run: RunDirectory, comparison: Comparison, *, bounds: bool
+) -> tuple[dict[str, Any], dict[str, Rollout], VectorEnv]:
+    """Return, and write, what ``evaluate_run`` does of a comparison of the run with ``CONTROLLERS``."""
+    episodes = comparison.episodes
     entries = dict(zip(("trained", "neutral", "random"), comparison.entries, strict=True))
     rollouts = {name: entry.rollout for name, entry in entries.items()}
     env = run.make_env(episodes)

@@ -1,0 +1,71 @@
+"""Large networks folded by group: the whole as groups and what runs between them, and the inside of each."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+
+from cirl_marl.drawing.sketch import Box, Ribbon, Sketch, placed, sketch
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Role
+
+FOLDED_NODES = 60
+"""Networks with more nodes open folded, if their titles tell groups."""
+LEAST_GROUPS, LEAST_MEMBERS = 3, 4
+MARK = ": "
+"""What stands between the group and the rest of a title, as in ``Japan: Scrap``."""
+
+
+def groups(network: Network) -> Mapping[str, list[int]]:
+    """Return the nodes of each group, by its name; none of a network that is small or whose titles tell no groups.
+
+    A group is what titles of nodes have before a colon, if four or more share it.
+    """
+    found: dict[str, list[int]] = defaultdict(list)
+    for i, node in enumerate(network.nodes):
+        name, mark, _ = node.label.partition(MARK)
+        if mark:
+            found[name].append(i)
+    kept = {name: members for name, members in found.items() if len(members) >= LEAST_MEMBERS}
+    return kept if len(network.nodes) > FOLDED_NODES and len(kept) >= LEAST_GROUPS else {}
+
+
+def sketches(network: Network, peaks: Floats) -> list[Sketch]:
+    """Return the diagrams of a network whose arcs carry at most ``peaks``: one, or one of groups and each inside."""
+    folded = groups(network)
+    if not folded:
+        return [sketch(network, peaks)]
+    return [_sketch(network, folded, "", peaks), *(_sketch(network, folded, name, peaks) for name in folded)]
+
+
+def _sketch(network: Network, folded: Mapping[str, list[int]], unfolded: str, peaks: Floats) -> Sketch:
+    """Return the diagram with one group unfolded, and of the rest only what it has to do with."""
+    inside = set(folded.get(unfolded, ()))
+    group = {i: name for name, members in folded.items() if name != unfolded for i in members}
+    ends = list(zip(network.donors.tolist(), network.recipients.tolist(), strict=True))
+    if unfolded:
+        near = {i for pair in ends if inside & set(pair) for i in pair}
+        near |= {i for name in {group[i] for i in near if i in group} for i in folded[name]}
+    else:
+        near = set(range(len(network.nodes)))
+    boxes: list[Box] = []
+    box_of: dict[int, int] = {}
+    for i, node in enumerate(network.nodes):
+        if i not in near or i in box_of:
+            continue
+        if (name := group.get(i, "")) == "":
+            box_of[i] = len(boxes)
+            label = node.label.partition(MARK)[2] if i in inside else node.label
+            boxes.append(Box(label, (i,), node.role, node.stores))
+        else:
+            box_of |= dict.fromkeys(folded[name], len(boxes))
+            stores = tuple(each for each in folded[name] if network.nodes[each].stores)
+            boxes.append(Box(name, stores, Role.TECHNOSPHERE, bool(stores), opens=name))
+    between: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for k, (donor, recipient) in enumerate(ends):
+        if donor not in box_of or recipient not in box_of or (unfolded and not inside & {donor, recipient}):
+            continue
+        if (pair := (box_of[donor], box_of[recipient])) and pair[0] != pair[1]:
+            between[pair].append(k)
+    ribbons = [Ribbon(tuple(members), *pair) for pair, members in between.items()]
+    return placed(unfolded, boxes, ribbons, peaks)

@@ -1,0 +1,241 @@
+"""What a report in the browser shows: scenes of one network, each what became of it under somebody's control."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+from scipy.special import stdtrit
+
+from cirl_marl.controllers.basic import Watched
+from cirl_marl.controllers.rollout import Rollout, rollout
+from cirl_marl.controllers.schedule import Schedule
+from cirl_marl.drawing.style import spoken
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.evaluation.alternatives import Alternative
+from cirl_marl.evaluation.comparison import FIGURES, Comparison
+from cirl_marl.evaluation.sampling import SampledEpisodes
+from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
+from cirl_marl.evaluation.sweep import Sweep
+from cirl_marl.evaluation.yardsticks import demanded
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.declared import itemised
+from cirl_marl.optimum.controller import Optimum
+from cirl_marl.optimum.mpc import SERVICE_FIRST
+
+QUANTILES = (0.025, 0.5, 0.975)
+USUAL, PLAN = "business as usual", "plan of the bound"
+CONFIDENCE = "mean of {} episodes, with its 95 % interval"
+SAMPLES = "median of {} samples, and what 95 % of them lie within"
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A figure over time, with the ends of an interval if there is one."""
+
+    value: Annotated[Floats, "shape (steps,)"]
+    low: Annotated[Floats | None, "likewise; None without an interval"] = None
+    high: Annotated[Floats | None, "likewise"] = None
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """One course of a network: who acts, and what became of it."""
+
+    name: Annotated[str, "who acts, or under which scenario"]
+    network: Annotated[Network, "the network under its scenario"]
+    agents: Annotated[tuple[str, ...], "who acts"]
+    start: Annotated[Floats | None, "stocks at the start, shape (stores,), mass; None if there are several"]
+    stock: Annotated[Floats, "stocks at the end of each interval, shape (steps, stores), mass"]
+    flow: Annotated[Floats, "mean flows of each interval, shape (steps, arcs), mass/time"]
+    controls: Annotated[Floats | None, "values of all controls, shape (steps, controls); None if they are not known"]
+    circularity: Annotated[Band, "mean of λ over each interval, mass"]
+    levels: Annotated[tuple[Band, ...], "level of each service"]
+    about: Annotated[str, "what the bands are; empty if there are none"] = ""
+    figures: Annotated[Mapping[str, Aggregate | None], "figures of whole episodes, of ``comparison.FIGURES``"] = field(
+        default_factory=dict
+    )
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class PlanePoint:
+    """A point in the plane of service and circularity."""
+
+    name: Annotated[str, "of which series it is one"]
+    service: Annotated[float, "mean level of the service that lacks most"]
+    circularity: Annotated[float, "λ̄, mass"]
+    about: Annotated[str, "what it is, further"] = ""
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class Story:
+    """All that one page shows."""
+
+    title: Annotated[str, "heading"]
+    network: Annotated[Network, "the network that it is about"]
+    scenes: Annotated[tuple[Scene, ...], "the first is what the others are compared with; none for points alone"] = ()
+    points: Annotated[tuple[PlanePoint, ...], "what is drawn in the plane of service and circularity"] = ()
+    front: Annotated[Floats, "levels of every service and the bound on λ̄ there, shape (levels, 2)"] = field(
+        default_factory=lambda: np.empty((0, 2))
+    )
+    notes: Annotated[tuple[str, ...], "what a reader has to know"] = ()
+
+
+def of_alternatives(found: Sequence[Alternative]) -> Story:
+    """Return the page of ``cirl simulate``."""
+    scenes = [
+        _scene(each.name or spoken(each.control), each.network, each.env.agents, each.start, each.rollout)
+        for each in found
+    ]
+    network = found[0].network
+    return Story(_title(network), network, tuple(scenes), notes=(f"Start: {found[0].begun.said}.",))
+
+
+def of_samples(found: SampledEpisodes, control: str) -> Story:
+    """Return the page of ``cirl simulate --samples``: flows and stocks are means, which balance as medians do not."""
+    network, count = found.network, len(found.circularity)
+    scene = Scene(
+        spoken(control),
+        network,
+        network.agents,
+        None,
+        found.stock.mean(axis=0),
+        found.flow.mean(axis=0),
+        None,
+        _quantiles(found.circularity),
+        tuple(_quantiles(found.levels[:, s]) for s in range(len(network.services))),
+        SAMPLES.format(count),
+    )
+    note = f"Flows and stocks are means of {count} samples of the uncertain numbers."
+    return Story(_title(network), network, (scene,), notes=(note,))
+
+
+def of_schedule(found: Schedule, name: str, *, note: str = "") -> Story:
+    """Return the page of ``cirl plan``: business as usual, and what is planned."""
+    network, start = found.network, found.start
+    scenes = (
+        _scene(USUAL, network, found.agents, start, found.usual),
+        _scene(name, network, found.agents, start, found.rollout),
+    )
+    notes = [f"Start: {found.begun.said}.", *([note] if note else [])]
+    return Story(_title(network), network, scenes, notes=tuple(notes))
+
+
+def of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> Story:
+    """Return the page of ``cirl compare``, neutral control first, but for the rows ``without`` whom it shall be."""
+    start = _first_start(found)
+    scenes, points = [], []
+    for row in sorted(found.rows, key=lambda row: row.name != "neutral"):
+        if row.name in without:
+            continue
+        figures = {which: row.figure(which) for which in FIGURES}
+        shown = USUAL if row.name == "neutral" else spoken(row.name)
+        for entry in row.entries:
+            name = shown if len(row.entries) == 1 else f"{shown}, seed {entry.seed}"
+            scenes.append(_scene(name, found.network, found.agents, start, entry.rollout, figures))
+            service, circularity = float(entry.rollout.least_service.mean()), float(entry.circularity.mean())
+            points.append(PlanePoint(shown, service, circularity, "" if entry.seed is None else f"seed {entry.seed}"))
+    notes = [f"Flows, stocks and actions are those of the first of {found.episodes} episodes."]
+    notes += [f"No bound: {found.yardstick.reason}."] if found.yardstick.reason else []
+    return Story(
+        _title(found.network), found.network, tuple(scenes), tuple(points), found.yardstick.front, tuple(notes)
+    )
+
+
+def with_plan(
+    story: Story, found: Comparison, env: VectorEnv, progress: Callable[[float], None] = lambda share: None
+) -> Story:
+    """Return the page with the best plan for the first episode.
+
+    It serves as well as the first policy did there; where numbers are drawn, of which a plan knows nothing, as well as
+    can be. ``env`` is one copy of what was compared in.
+
+    Raises:
+        CirlError: if a solver fails, or nobody acts.
+    """
+    level = None if env.uncertain else demanded(found.entries[0].rollout.episode_levels[0])
+    controller = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
+    watched = Watched(controller, progress)
+    run = rollout(env, watched, seed=found.first_seed, progress=watched.acted)
+    scene = _scene(PLAN, found.network, found.agents, _first_start(found), run)
+    point = PlanePoint(PLAN, float(run.least_service[0]), float(run.episode_circularity[0]), "of the first episode")
+    serving = "serving as well as can be" if level is None else "with no less service than the policies gave there"
+    notes = [*story.notes, f"{PLAN.capitalize()}: for the first episode, {serving}."]
+    notes += [f"{controller.note}."] if controller.note else []
+    return replace(story, scenes=(*story.scenes, scene), points=(*story.points, point), notes=tuple(notes))
+
+
+def of_sweep(found: Sweep) -> Story:
+    """Return the page of ``cirl pareto``: points alone, as nothing else of its episodes is kept."""
+    names = {"plan": "plans", "trained": "trained", "neutral": USUAL}
+    points = [
+        PlanePoint(names[each.kind], each.service, each.circularity, _weighed(each.weight, each.seed))
+        for each in found.points
+        if each.kind in names
+    ]
+    notes = [f"No bound: {found.reason}."] if found.reason else []
+    return Story(_title(found.network), found.network, points=tuple(points), front=found.front, notes=tuple(notes))
+
+
+def _weighed(weight: float | None, seed: int | None) -> str:
+    return "" if weight is None else f"weight {weight:.3g}, seed {seed}"
+
+
+def _first_start(found: Comparison) -> Floats:
+    """Return the stocks with which the first episode begins, shape (stores,), mass."""
+    env = VectorEnv(found.network, num_envs=1, agents=found.agents)
+    env.reset(seed=found.first_seed)
+    start: Floats = env.rows.stocks(env.physical.stock)[:, 0].copy()
+    return start
+
+
+def _scene(
+    name: str,
+    network: Network,
+    agents: tuple[str, ...],
+    start: Floats,
+    run: Rollout,
+    figures: Mapping[str, Aggregate | None] | None = None,
+) -> Scene:
+    episodes = len(run.circularity_mean)
+    figures = figures or {
+        "circularity": over_episodes(run.episode_circularity),
+        "service": over_episodes(run.episode_service, SHARE),
+    }
+    return Scene(
+        name,
+        network,
+        agents,
+        start,
+        run.stock,
+        run.flow,
+        run.controls,
+        _mean(run.circularity_mean, np.inf),
+        tuple(_mean(run.levels[:, s], 1.0) for s in range(len(network.services))),
+        CONFIDENCE.format(episodes) if episodes > 1 else "",
+        figures,
+    )
+
+
+def _mean(values: Floats, top: float) -> Band:
+    """Return the mean over episodes, shape (episodes, steps), with its 95 % interval (Student's t)."""
+    mean, count = values.mean(axis=0), len(values)
+    if count < 2:
+        return Band(mean)
+    error = values.std(axis=0, ddof=1) / np.sqrt(count) * float(stdtrit(count - 1, 0.975))
+    return Band(mean, mean - error, np.minimum(mean + error, np.maximum(top, mean)))
+
+
+def _quantiles(values: Floats) -> Band:
+    low, middle, high = np.quantile(values, QUANTILES, axis=0)
+    return Band(middle, low, high)
+
+
+def _title(network: Network) -> str:
+    return network.title or spoken(network.name)
