@@ -70,7 +70,7 @@ $(VENV)/.runtime: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[dev,human]'
+	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[dev,human,browser]'
 	touch $@ $(VENV)/.runtime
 
 clean:  ## what these commands made, but for runs

@@ -6,7 +6,7 @@ import os
 import random
 import shutil
 import signal
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -67,8 +67,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the seed, which repeats the sample."""
+    """Print the seed, which repeats the sample, and what had to be left out for want of something on this machine."""
     terminalreporter.write_line(f"{SEED}={os.environ[SEED]} drew the parameters of tests marked 'sample'")
+    missing = Counter(
+        str(report.longrepr[2]).removeprefix("Skipped: ")
+        for report in terminalreporter.getreports("skipped")
+        if isinstance(report.longrepr, tuple)
+    )
+    for reason, count in missing.items():
+        terminalreporter.write_line(f"left out {count} test{'s' if count > 1 else ''}: {reason}")
 
 
 @pytest.fixture(scope="session")

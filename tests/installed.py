@@ -25,10 +25,11 @@ def main(environment: Path) -> None:
             if network not in run(cirl, "networks"):
                 raise SystemExit(f"the installed catalogue lacks {network}")
         run(cirl, "show", "copper_net")
-        run(cirl, "simulate", "carbo_net", "--control", "random")
+        run(cirl, "simulate", "carbo_net", "--control", "random", "--html", "page.html")
         run(cirl, "train", "copper_net", "--steps", "6000", "--envs", "32", "--out", "run")
         run(cirl, "evaluate", "run")
-        for name in ("copper_net.png", "carbo_net_random.csv", "run/evaluation.json", "run/pictures/circularity.png"):
+        written = ("copper_net.png", "carbo_net_random.csv", "page.html")
+        for name in (*written, "run/evaluation.json", "run/pictures/circularity.png"):
             if not (Path(folder) / name).is_file():
                 raise SystemExit(f"{name} was not written")
 

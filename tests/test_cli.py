@@ -17,6 +17,7 @@ from typing import Any
 import highspy
 import numpy as np
 import pytest
+from pages import shown
 from small_networks import ONE_OF_EACH
 
 import cirl_marl
@@ -469,18 +470,28 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert run(monkeypatch, "evaluate", "run", "--episodes", "4", "--seed", "7") == 0
     printed = capsys.readouterr().out
     assert "local return of each agent" in printed and "gap to bound" in printed
-    assert run(monkeypatch, "report", "run", "--episodes", "4") == 0
+    assert run(monkeypatch, "report", "run", "--episodes", "4", "--html", "pages/run.html") == 0
+    told = shown(Path("pages/run.html").read_text(encoding="utf-8"))
+    names = [scene["name"] for scene in told["scenes"]]
+    assert names == ["business as usual", "trained, independent ars", "plan of the bound"]
+    assert told["scenes"][1]["figures"]["gap"][0] > 0 and "mean of 4 episodes" in told["scenes"][1]["about"]
 
 
 @pytest.mark.medium
 def test_plan_and_compare(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A controller's plan has units in its columns; a comparison without runs writes its four files."""
-    assert run(monkeypatch, "plan", "carbo_net", "--control", "neutral", "--out", "plan.csv") == 0
+    asked = ("--control", "neutral", "--out", "plan.csv", "--html", "plan.html")
+    assert run(monkeypatch, "plan", "carbo_net", *asked) == 0
+    told = shown(Path("plan.html").read_text(encoding="utf-8"))
+    assert [scene["name"] for scene in told["scenes"]] == ["business as usual", "neutral"]
     header, *rows = Path("plan.csv").read_text().splitlines()
     assert header.startswith("from (day),to (day),")
     assert len(rows) == 160
     assert run(monkeypatch, "compare", "--network", "net_zero", "--controllers", "random", "--episodes", "2",
-               "--out", "out") == 0  # fmt: skip
+               "--out", "out", "--html", "compared.html") == 0  # fmt: skip
+    told = shown(Path("compared.html").read_text(encoding="utf-8"))
+    assert [scene["name"] for scene in told["scenes"]] == ["business as usual", "random"]
+    assert any("no bound is proved" in note for note in told["notes"])
     printed = capsys.readouterr().out
     assert "gap to bound: network 'net_zero'" in printed
     assert "no bound is proved" in printed
@@ -510,7 +521,10 @@ def test_pareto(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
     """Both fronts are printed, tabulated and drawn in one picture; the runs stay."""
     bottles()
     asked = ("--recipe", "independent_a2c", "--points", "2", "--steps", "320", "--episodes", "2", "--out", "out")
-    assert run(monkeypatch, "pareto", "bottles.toml", *asked) == 0
+    assert run(monkeypatch, "pareto", "bottles.toml", *asked, "--html", "front.html") == 0
+    told = shown(Path("front.html").read_text(encoding="utf-8"))
+    assert {point["name"] for point in told["points"]} == {"plans", "trained", "business as usual"}
+    assert len(told["front"]) > 2
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("bound    service", "plan     service", "(weight 1, seed 0)"))
     assert {path.name for path in Path("out").iterdir()} == {"pareto.csv", "pareto.json", "pareto.png", "runs"}
@@ -796,6 +810,12 @@ def test_simulate_with_inner_physics(
         (["train", "--resume", "nowhere", "--envs", "5", "--seed", "1"], "leave out --envs, --seed"),
         (["show", "copper_net", "--picture", "picture.pdf"], "needs the name of a .png file"),
         (["evaluate", "nowhere"], "no run in nowhere (it has no config.json)"),
+        (["report", "nowhere", "--html", "page.html"], "no run in nowhere (it has no config.json)"),
+        (["report", "nowhere", "--html", "page.pdf"], "--html page.pdf: needs the name of an .html file"),
+        (["simulate", "copper_net", "--html", "/dev/null/page.html"], "/dev/null is a file, not a folder"),
+        (["plan", "copper_net", "--control", "neutral", "--html", "page"], "needs the name of an .html file"),
+        (["compare", "--network", "copper_net", "--html", "/.html"], "needs the name of an .html file"),
+        (["pareto", "copper_net", "--html", "page.htm"], "needs the name of an .html file"),
         (["simulate", "copper_net", "--control", "nutral"], "Did you mean 'neutral'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mien=0"], "Did you mean 'mine'?"),
         (["simulate", "copper_net", "--control", "constant", "--set", "mine=nan"], "must lie in [-1, 1]"),

@@ -135,7 +135,7 @@ def of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> Story:
         if row.name in without:
             continue
         figures = {which: row.figure(which) for which in FIGURES}
-        shown = USUAL if row.name == "neutral" else spoken(row.name)
+        shown = USUAL if row.name == "neutral" else f"trained, {spoken(row.name)}" if row.seeds else spoken(row.name)
         for entry in row.entries:
             name = shown if len(row.entries) == 1 else f"{shown}, seed {entry.seed}"
             scenes.append(_scene(name, found.network, found.agents, start, entry.rollout, figures))

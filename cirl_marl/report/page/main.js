@@ -23,10 +23,10 @@ function heading() {
   const scenario = story.scenario === "default" ? "" : `, scenario ${story.scenario}`;
   part("kicker").textContent = `${story.name}${scenario} · ${story.material}`;
   part("title").textContent = story.title;
-  const { labels, to, from } = story.clock;
-  const span = labels.length ? `${labels[0]} to ${labels.at(-1)}, ${labels.length} steps. ` : "";
+  const { labels } = story.clock;
+  const span = labels.length ? `From ${labels[0]} to ${labels.at(-1)} in ${labels.length} steps. ` : "";
   const counted = `Circularity λ is a mass, in ${story.mass}: what is regained, minus what is extracted and lost. A closed loop has λ = 0.`;
-  part("standfirst").textContent = (to.length && from.length ? span : "") + counted;
+  part("standfirst").textContent = span + counted;
   const made = `${story.made.versions.join(", ")}; definition ${story.made.definition.slice(0, 12)}`;
   const about = story.scenes.find((scene) => scene.about)?.about;
   part("footer").append(
