@@ -17,6 +17,7 @@ from pages import COMPUTED, HOSTILE, bottles_at, world
 
 from cirl_marl import load_network
 from cirl_marl.evaluation.alternatives import Alternative, alternatives
+from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.report.browser import write_page
 from cirl_marl.report.scenes import PLAN, PlanePoint, Story, of_alternatives
 
@@ -217,18 +218,27 @@ def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
     points = (PlanePoint("plans", 0.9, -2.0, "first"), PlanePoint("plans", 0.95, -3.0))
     usual, plan = story.scenes
     front = np.array([[0.9, -1.0], [1.0, -1.5]])
-    tab = opened(
-        write_page(
-            tmp_path / "w.html", replace(story, scenes=(usual, replace(plan, name=PLAN)), points=points, front=front)
-        )
-    )
+    scenes = (replace(usual, figures={"bound": Aggregate(-0.5, -0.6, -0.4)}), replace(plan, name=PLAN))
+    path = write_page(tmp_path / "w.html", replace(story, scenes=scenes, points=points, front=front))
+    tab = opened(path)
     page = tab.page
     assert page.locator(".box").count() == 5
     page.locator(".box.folded").nth(2).press("Enter")
     assert page.locator(".box").count() == 17 and page.locator("#path").inner_text().endswith("Country 2")
     page.get_by_role("button", name="All groups").click()
     assert page.locator(".box").count() == 5
-    assert f"λ behind the {PLAN}" in tab.texts("figcaption strong")
+    assert tab.texts("figcaption strong")[:3] == [
+        "Circularity λ",
+        f"λ behind the {PLAN}",
+        "λ behind the bound on its mean",
+    ]
+    tab.page.locator("#time").press("End")
+    behind = [tab.texts(f"#curves figure:nth-of-type({i}) .values .figure") for i in (2, 3)]
+    last, best = float(usual.circularity.value[-1]), float(plan.circularity.value[-1])
+    assert [[float(text.replace("−", "-")) for text in each] for each in behind] == [
+        [pytest.approx(best - last, rel=0.01)],
+        [pytest.approx(-0.5 - last, rel=0.01)],
+    ]
     assert tab.texts("#plane-chart title") == [
         "plans, first: λ̄ −2 kg, service 90.0\u00a0%",
         "plans: λ̄ −3 kg, service 95.0\u00a0%",

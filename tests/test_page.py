@@ -19,7 +19,7 @@ from pages import HOSTILE, bottles_at, shown, world
 from cirl_marl import CirlError, Network, load_network
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.sources import stated
-from cirl_marl.drawing.folding import groups, sketches
+from cirl_marl.drawing.grouping import groups, sketches
 from cirl_marl.drawing.weave import NARROW, woven
 from cirl_marl.errors import DefinitionError
 from cirl_marl.evaluation import compare
@@ -103,6 +103,8 @@ def test_groups_fold_and_unfold() -> None:
     assert [each.group for each in inside] == list(groups(network))
     assert {box.label for box in inside[1].boxes} == {"World market", *(f"part {i}" for i in range(16))}
     assert all("c1_" in network.arcs[k].id for ribbon in inside[1].ribbons for k in ribbon.members)
+    object.__setattr__(network, "copies", {"north_sea": ["c0_0", "c0_1"], "south": ["c1_0", "c1_1"]})
+    assert groups(network) == {"North Sea": [1, 2], "South": [17, 18]}
 
 
 @pytest.mark.sample(2)

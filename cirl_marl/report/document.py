@@ -11,7 +11,7 @@ import numpy as np
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.definitions.sources import Stated, stated
 from cirl_marl.definitions.writing import fingerprint
-from cirl_marl.drawing.folding import sketches
+from cirl_marl.drawing.grouping import sketches
 from cirl_marl.drawing.sketch import Sketch, lines
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.statistics import Aggregate

@@ -71,6 +71,7 @@ function build() {
 
 function look(scene, sketch, kind, place) {
   state.chosen = { scene, sketch, kind, place };
+  part("details").setAttribute("aria-live", "polite");
   detail(story, scene.network, sketch, kind, place, state.step);
   diagrams.forEach(mark);
 }
@@ -162,10 +163,20 @@ function curves() {
     const behind = (scene) => (scene === plan ? null : { value: less(scene.lambda.value), low: less(scene.lambda.high), high: less(scene.lambda.low) });
     panels.push(panelOf(host, { title: `λ behind the ${plan.name}`, unit: story.mass, lines: of(behind), limits: [0], labels, go }));
   }
+  const bounded = of((scene) => {
+    const [most] = scene.figures.bound ?? [];
+    const less = (values) => values?.map((value) => (value === null ? null : most - value));
+    return most === undefined || most === null ? null : { value: less(scene.lambda.value), low: less(scene.lambda.high), high: less(scene.lambda.low) };
+  });
+  if (bounded.length) {
+    const title = "λ behind the bound on its mean";
+    panels.push(panelOf(host, { title, unit: `${story.mass}; the mean of this is the gap`, lines: bounded, limits: [0], labels, go }));
+  }
 }
 
 function moved(step) {
   state.step = step;
+  part("details").setAttribute("aria-live", "off"); // while time moves nobody wants every step read out
   for (const each of diagrams) each.drawn.update(step);
   for (const each of panels) each.update(step);
   redraws.forEach((each) => each(step));

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from cirl_marl.drawing.sketch import Box, Ribbon, Sketch, placed, sketch
+from cirl_marl.drawing.style import spoken
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Role
 
@@ -17,10 +18,14 @@ MARK = ": "
 
 
 def groups(network: Network) -> Mapping[str, list[int]]:
-    """Return the nodes of each group, by its name; none of a network that is small or whose titles tell no groups.
+    """Return the nodes of each group, by its name; none of a network without.
 
-    A group is what titles of nodes have before a colon, if four or more share it.
+    Groups are the copies of a network that is made of copies (``copies``, ids of nodes by name). Else, of a large one,
+    they are what titles of nodes have before a colon, if four or more share it.
     """
+    copies: Mapping[str, Sequence[str]] = getattr(network, "copies", {})
+    if copies:
+        return {spoken(name).title(): [network.node_index[id_] for id_ in ids] for name, ids in copies.items()}
     found: dict[str, list[int]] = defaultdict(list)
     for i, node in enumerate(network.nodes):
         name, mark, _ = node.label.partition(MARK)
@@ -55,7 +60,7 @@ def _sketch(network: Network, folded: Mapping[str, list[int]], unfolded: str, pe
             continue
         if (name := group.get(i, "")) == "":
             box_of[i] = len(boxes)
-            label = node.label.partition(MARK)[2] if i in inside else node.label
+            label = node.label.removeprefix(f"{unfolded}{MARK}")
             boxes.append(Box(label, (i,), node.role, node.stores))
         else:
             box_of |= dict.fromkeys(folded[name], len(boxes))
