@@ -100,6 +100,9 @@ def test_groups_fold_and_unfold() -> None:
     assert [box.label for box in whole.boxes] == ["World market", *groups(network)]
     assert sum(len(ribbon.members) for ribbon in whole.ribbons) == 2 * 4, "what stays in a country is not drawn"
     assert {box.opens for box in whole.boxes} == {"", *groups(network)}
+    weave = whole.weaves["lying"]
+    assert weave.layers.tolist() == [1, 2, 2, 2, 2], "the market stands beside who takes no less than he gives"
+    assert [course.back for course in weave.courses] == [weave.layers[each.donor] == 2 for each in whole.ribbons]
     assert [each.group for each in inside] == list(groups(network))
     assert {box.label for box in inside[1].boxes} == {"World market", *(f"part {i}" for i in range(16))}
     assert all("c1_" in network.arcs[k].id for ribbon in inside[1].ribbons for k in ribbon.members)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from cirl_marl.drawing.sketch import Box, Ribbon, Sketch, placed, sketch
 from cirl_marl.drawing.style import spoken
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Role
 
 FOLDED_NODES = 60
@@ -73,4 +75,25 @@ def _sketch(network: Network, folded: Mapping[str, list[int]], unfolded: str, pe
         if (pair := (box_of[donor], box_of[recipient])) and pair[0] != pair[1]:
             between[pair].append(k)
     ribbons = [Ribbon(tuple(members), *pair) for pair, members in between.items()]
-    return placed(unfolded, boxes, ribbons, peaks)
+    return placed(unfolded, boxes, ribbons, peaks, None if unfolded else _around_markets(boxes, ribbons, peaks))
+
+
+def _around_markets(boxes: Sequence[Box], ribbons: Sequence[Ribbon], peaks: Floats) -> Integers | None:
+    """Return layers in which markets stand between who gives them more and who takes more, shape (boxes,).
+
+    Markets are the boxes through which groups trade. None, where groups trade with each other too.
+    """
+    ends = [(each.donor, each.recipient) for each in ribbons]
+    near: dict[int, set[int]] = defaultdict(set)
+    for donor, recipient in ends:
+        near[donor].add(recipient)
+        near[recipient].add(donor)
+    markets = {i for i, box in enumerate(boxes) if not box.opens and sum(bool(boxes[k].opens) for k in near[i]) > 1}
+    if not markets or any(not markets & set(pair) for pair in ends):
+        return None
+    given = np.zeros(len(boxes))
+    for (donor, recipient), each in zip(ends, ribbons, strict=True):
+        mass = float(peaks[list(each.members)].sum())
+        given[donor] += mass
+        given[recipient] -= mass
+    return np.array([1 if i in markets else 0 if mass > 0 else 2 for i, mass in enumerate(given)], dtype=np.intp)

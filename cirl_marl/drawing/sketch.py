@@ -79,8 +79,10 @@ def sketch(network: Network, peaks: Floats) -> Sketch:
     return placed("", boxes, [Ribbon((k,), donor, recipient) for k, (donor, recipient) in enumerate(ends)], peaks)
 
 
-def placed(group: str, boxes: list[Box], ribbons: list[Ribbon], peaks: Floats) -> Sketch:
-    """Find the places of boxes and ribbons whose arcs carry at most ``peaks``."""
+def placed(
+    group: str, boxes: list[Box], ribbons: list[Ribbon], peaks: Floats, layers: Integers | None = None
+) -> Sketch:
+    """Find the places of boxes and ribbons whose arcs carry at most ``peaks``; in ``layers``, if they are given."""
     most = np.array([peaks[list(each.members)].sum() for each in ribbons])
     donors, recipients = (np.array([getattr(r, end) for r in ribbons], dtype=np.intp) for end in ("donor", "recipient"))
     caption = LINE * (1 + max((len(lines(box.label, LYING)) for box in boxes), default=0))
@@ -91,7 +93,7 @@ def placed(group: str, boxes: list[Box], ribbons: list[Ribbon], peaks: Floats) -
         scales[way] = widest / max(float(through.max(initial=0.0)), 1e-300)
         breadths[way] = np.maximum(scales[way] * through, LEAST[way])
         whole = breadths[way] + (caption if way == LYING else 0.0)
-        weaves[way] = woven(donors, recipients, scales[way] * most, whole, CLEARANCE[way])
+        weaves[way] = woven(donors, recipients, scales[way] * most, whole, CLEARANCE[way], layers)
     return Sketch(group, tuple(boxes), tuple(ribbons), weaves, breadths, scales, caption)
 
 

@@ -60,20 +60,32 @@ class Weave:
     breadth: float
 
 
-def woven(donors: Integers, recipients: Integers, widths: Floats, breadths: Floats, clearance: float) -> Weave:
+def woven(
+    donors: Integers,
+    recipients: Integers,
+    widths: Floats,
+    breadths: Floats,
+    clearance: float,
+    layers: Integers | None = None,
+) -> Weave:
     """Place nodes of some ``breadths``, shape (nodes,), between which ribbons of ``widths`` run, shape (arcs,).
 
-    ``clearance`` is kept free around a node.
+    ``clearance`` is kept free around a node. In ``layers`` that are given, shape (nodes,), only what stays in one is a
+    loop; what leads back runs back.
     """
-    weights = widths + 1e-6 * max(1.0, float(widths.max(initial=0.0)))
-    order = _forward(len(breadths), donors, recipients, weights)
-    place = np.empty(len(breadths), dtype=np.intp)
-    place[order] = np.arange(len(order))
-    ahead = place[donors] < place[recipients]
-    layers = _layers(order, donors[ahead], recipients[ahead])
-    ahead = layers[donors] < layers[recipients]
     pairs = list(zip(donors.tolist(), recipients.tolist(), strict=True))
-    back = _beside_others(pairs, ahead) if np.count_nonzero(~ahead) > MOST_LOOPS else np.zeros(len(pairs), dtype=bool)
+    if layers is None:
+        weights = widths + 1e-6 * max(1.0, float(widths.max(initial=0.0)))
+        order = _forward(len(breadths), donors, recipients, weights)
+        place = np.empty(len(breadths), dtype=np.intp)
+        place[order] = np.arange(len(order))
+        ahead = place[donors] < place[recipients]
+        layers = _layers(order, donors[ahead], recipients[ahead])
+        ahead = layers[donors] < layers[recipients]
+        crowded = np.count_nonzero(~ahead) > MOST_LOOPS
+        back = _beside_others(pairs, ahead) if crowded else np.zeros(len(pairs), dtype=bool)
+    else:
+        ahead, back = layers[donors] < layers[recipients], layers[donors] > layers[recipients]
     threads = _Threads(layers, breadths, clearance)
     links = [
         threads.link(*(pair if forward else pair[::-1]), float(width)) if forward or backward else ()

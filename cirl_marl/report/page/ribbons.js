@@ -1,7 +1,7 @@
 // Geometry of a flow diagram: along is the way of the flow, across is the other; a standing diagram exchanges the two.
 
 export const HEAD = 7;
-const LYING = { least: 84, most: 158, box: 0.32, margin: 10 };
+const LYING = { least: 84, most: 158, few: 4, far: 300, box: 0.32, margin: 10 };
 const STANDING = { gap: 46, line: 12.5, margin: 16 };
 const APART = 2;
 
@@ -12,7 +12,7 @@ export function frameOf(sketch, way, room) {
   const lying = way === "lying";
   const lines = Math.max(1, ...plan.labels.map((label) => label.length));
   const pitch = lying
-    ? Math.min(LYING.most, Math.max(LYING.least, (room - 2 * LYING.margin) / layers))
+    ? Math.min(layers > LYING.few ? LYING.most : LYING.far, Math.max(LYING.least, (room - 2 * LYING.margin) / layers))
     : STANDING.gap + STANDING.line * (lines + 1) + 10;
   const box = lying ? Math.min(44, LYING.box * pitch) : pitch - STANDING.gap;
   const margin = lying ? LYING.margin : STANDING.margin;
