@@ -46,14 +46,16 @@ def bottles_at(folder: Path, *, hostile: bool = False, days: int = 12) -> Networ
 
 
 def world(countries: int = 4, members: int = 16, horizon: int = 3) -> Network:
-    """Return countries, each a chain with a loop, that trade through a market; titles name the country first."""
-    nodes, arcs = [Node(id="market", title="World market", initial=(50.0, 50.0), scale=50.0)], []
+    """Return countries, each a chain with a loop, that trade through markets; titles name the country first."""
+    markets = {"market": "World market", "store": "World store"}
+    nodes = [Node(id=id_, title=title, initial=(50.0, 50.0), scale=50.0) for id_, title in markets.items()]
+    arcs = [Arc(id="stored", donor="market", recipient="store", rate=0.1)]
     for c in range(countries):
         ids = [f"c{c}_{i}" for i in range(members)]
         for i, id_ in enumerate(ids):
             role = {0: Role.NONRENEWABLE_RESERVOIR, members - 1: Role.LANDFILL}.get(i, Role.TECHNOSPHERE)
             nodes.append(Node(id=id_, title=f"Country {c}: part {i}", role=role, initial=(9.0, 11.0), scale=10.0))
-        ends = [*pairwise(ids), (ids[-3], ids[2]), (ids[3], "market"), ("market", ids[3])]
+        ends = [*pairwise(ids), (ids[-3], ids[2]), (ids[3], "market"), ("market", ids[3]), ("store", ids[4])]
         control = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
         arcs += [
             Arc(id=f"c{c}_flow{k}", donor=a, recipient=b, rate=0.1, control=control if k == 0 else None)

@@ -224,11 +224,11 @@ def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
     path = write_page(tmp_path / "w.html", replace(story, scenes=scenes, points=points, front=front))
     tab = opened(path)
     page = tab.page
-    assert page.locator(".box").count() == 5
+    assert page.locator(".box").count() == 6
     page.locator(".box.folded").nth(2).press("Enter")
-    assert page.locator(".box").count() == 17 and page.locator("#path").inner_text().endswith("Country 2")
+    assert page.locator(".box").count() == 18 and page.locator("#path").inner_text().endswith("Country 2")
     page.get_by_role("button", name="All groups").click()
-    assert page.locator(".box").count() == 5
+    assert page.locator(".box").count() == 6
     assert tab.texts("figcaption strong")[:3] == [
         "Circularity λ",
         f"λ behind the {PLAN}",
@@ -268,5 +268,5 @@ def test_a_world_is_light_enough(tmp_path: Path, opened: Any) -> None:
     """Five hundred nodes take less than 5 MB."""
     network = world(countries=31, horizon=26)
     path = write_page(tmp_path / "w.html", of_alternatives(alternatives(network, controls=["neutral", "random"])))
-    assert len(network.nodes) == 497 and path.stat().st_size < 5e6
-    assert opened(path).page.locator(".box").count() == 32
+    assert len(network.nodes) == 498 and path.stat().st_size < 5e6
+    assert opened(path).page.locator(".box").count() == 33

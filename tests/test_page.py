@@ -90,6 +90,7 @@ def test_the_larger_flow_leads_forward() -> None:
     assert [course.side != 0 for course in found.courses] == [False, False, False, True]
 
 
+@pytest.mark.medium
 def test_groups_fold_and_unfold() -> None:
     """A large network whose titles name groups opens on these; inside one, the rest is what it trades with."""
     network = world()
@@ -97,19 +98,21 @@ def test_groups_fold_and_unfold() -> None:
     assert groups(world(countries=3)) == {}, "small"
     assert groups(load_network("steel_japan")) == {}
     whole, *inside = sketches(network, np.ones(len(network.arcs)))
-    assert [box.label for box in whole.boxes] == ["World market", *groups(network)]
-    assert sum(len(ribbon.members) for ribbon in whole.ribbons) == 2 * 4, "what stays in a country is not drawn"
+    assert [box.label for box in whole.boxes] == ["World market", "World store", *groups(network)]
+    assert sum(len(ribbon.members) for ribbon in whole.ribbons) == 3 * 4 + 1, "what stays in a country is not drawn"
     assert {box.opens for box in whole.boxes} == {"", *groups(network)}
     weave = whole.weaves["lying"]
-    assert weave.layers.tolist() == [1, 2, 2, 2, 2], "the market stands beside who takes no less than he gives"
+    assert weave.layers.tolist() == [1, 1, 2, 2, 2, 2], "the markets stand beside who takes more than he gives"
     assert [course.back for course in weave.courses] == [weave.layers[each.donor] == 2 for each in whole.ribbons]
+    assert [course.side != 0 for course in weave.courses] == [each.members == (0,) for each in whole.ribbons]
     assert [each.group for each in inside] == list(groups(network))
-    assert {box.label for box in inside[1].boxes} == {"World market", *(f"part {i}" for i in range(16))}
+    assert {box.label for box in inside[1].boxes} == {"World market", "World store", *(f"part {i}" for i in range(16))}
     assert all("c1_" in network.arcs[k].id for ribbon in inside[1].ribbons for k in ribbon.members)
     object.__setattr__(network, "copies", {"north_sea": ["c0_0", "c0_1"], "south": ["c1_0", "c1_1"]})
-    assert groups(network) == {"North Sea": [1, 2], "South": [17, 18]}
+    assert groups(network) == {"North Sea": [2, 3], "South": [18, 19]}
 
 
+@pytest.mark.medium
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("name", [names[0] for names in families().values()])
 def test_every_number_has_its_source(name: str) -> None:

@@ -139,7 +139,7 @@ function legend() {
       ...Object.entries(effects).filter(([sign]) => arcs.some((arc) => arc.sign === Number(sign))).map(([, [look, name]]) => item(look, name)),
       ...roles.map((role) => item(role, role.replaceAll("_", " ").replace("nonrenewable", "non-renewable"))),
     ),
-    make("p", {}, `Ribbons are as wide as their flows, in ${story.mass}/${story.time}; the largest is ${measured(most, `${story.mass}/${story.time}`)}. Boxes fill with their stocks, in ${story.mass}: half full is the reference stock. Dashed boxes store nothing.`),
+    make("p", {}, `Ribbons are as wide as their flows, in ${story.mass}/${story.time}; the largest is ${measured(most, `${story.mass}/${story.time}`)}. Boxes fill with their stocks, in ${story.mass}: half full is the reference stock.`, nodes.every((node) => node.stores) ? "" : " Dashed boxes store nothing."),
   );
 }
 

@@ -11,7 +11,7 @@ const HEIGHT = 340;
 export function planeOf(host, story) {
   const names = [...new Set(story.points.map((point) => point.name))];
   const key = make("ul", { class: "values" }, ...names.map((name, i) => make("li", {}, markOf(i), name)));
-  if (story.front.length) key.append(make("li", {}, ruleOf(), "bound: nothing reaches above it"));
+  if (story.front.length) key.append(make("li", {}, ruleOf(), "bound: from a middle start nothing reaches above it"));
   const stage = make("div", { class: "chart" });
   host.append(key, stage);
   const spread = (values, least) => {
