@@ -6,15 +6,16 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network.calendar import When
 
+T = TypeVar("T")
 LARGEST = 200_000_000
 """Bytes of the largest file that is read."""
 YEAR = "year"
@@ -37,6 +38,7 @@ class DataFiles:
         """Look for files in ``folder``, that of the definition, and below it."""
         self._folder = folder.resolve()
         self._tables: dict[str, _Table] = {}
+        self._others: dict[str, str] = {}
         self._stamps: dict[Path, int] = {}
 
     @property
@@ -46,7 +48,22 @@ class DataFiles:
 
     def sha256(self, name: str) -> str:
         """Return the hash of a file as it was read."""
-        return self._table(name).sha256
+        return self._others.get(name) or self._table(name).sha256
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """The files that are no tables."""
+        return tuple(self._others)
+
+    def other(self, name: str) -> Path:
+        """Return where a file is that is no table, and note its hash.
+
+        Raises:
+            CirlError: naming the file and what is wrong with it.
+        """
+        path = self._refusing(name, self._found)
+        self._others[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        return path
 
     def column(self, name: str, column: str, where: Mapping[str, str], times: str | None) -> Column:
         """Return the numbers of ``column`` in the rows whose columns have the texts of ``where``.
@@ -59,8 +76,11 @@ class DataFiles:
         return self._table(name).column(column, where, times)
 
     def _table(self, name: str) -> _Table:
+        return self._refusing(name, self._read)
+
+    def _refusing(self, name: str, read: Callable[[str], T]) -> T:
         try:
-            return self._read(name)
+            return read(name)
         except CirlError:
             raise
         except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: links in a circle; ValueError: odd names
@@ -68,19 +88,23 @@ class DataFiles:
 
     def _read(self, name: str) -> _Table:
         if name not in self._tables:
-            path, told = self._folder / name, f"file '{name}'"
-            if Path(name).is_absolute() or ".." in Path(name).parts or not path.resolve().is_relative_to(self._folder):
-                raise CirlError(f"{told}: must lie in {self._folder}, the folder of the definition, or below it")
-            if not path.is_file():
-                if path.exists() or path.is_symlink():
-                    raise CirlError(f"{told}: is no file")
-                beside = sorted(each.name for each in path.parent.glob("*.csv"))
-                raise CirlError(f"{told}: is not there; {unknown(f'file in {path.parent}', path.name, beside)}")
-            if path.stat().st_size > LARGEST:
-                raise CirlError(f"{told}: is larger than {LARGEST // 10**6} MB; leave out rows that no 'where' chooses")
-            self._stamps[path] = path.stat().st_mtime_ns
-            self._tables[name] = _Table(name, path.read_bytes())
+            self._tables[name] = _Table(name, self._found(name).read_bytes())
         return self._tables[name]
+
+    def _found(self, name: str) -> Path:
+        """Return where a file is, which is not read again unless it is edited."""
+        path, told = self._folder / name, f"file '{name}'"
+        if Path(name).is_absolute() or ".." in Path(name).parts or not path.resolve().is_relative_to(self._folder):
+            raise CirlError(f"{told}: must lie in {self._folder}, the folder of the definition, or below it")
+        if not path.is_file():
+            if path.exists() or path.is_symlink():
+                raise CirlError(f"{told}: is no file")
+            beside = sorted(each.name for each in path.parent.glob(f"*{path.suffix or '.csv'}"))
+            raise CirlError(f"{told}: is not there; {unknown(f'file in {path.parent}', path.name, beside)}")
+        if path.stat().st_size > LARGEST:
+            raise CirlError(f"{told}: is larger than {LARGEST // 10**6} MB; leave out rows that no 'where' chooses")
+        self._stamps[path] = path.stat().st_mtime_ns
+        return path
 
 
 class _Table:

@@ -90,7 +90,7 @@ class Converter:
             mass_unit=table.units.mass,
             time_unit=table.units.time,
             region=self.region,
-            data_sha256={name: self.files.sha256(name) for name in sorted(self.used)},
+            data_sha256={name: self.files.sha256(name) for name in sorted({*self.used, *self.files.others})},
             acting=tuple(table.agents),
             uncertain=self.uncertain,
             **parts,

@@ -14,6 +14,7 @@ from cirl_marl.definitions import quantities, schema
 
 PARTS: dict[str, tuple[Any, str]] = {
     "network": (schema.NetworkTable, "The file itself"),
+    "copies": (schema.CopiesTable, "`[copies]`, and, without `of` and `regions`, `copies` of a scenario"),
     "units": (schema.UnitsTable, "`[units]`"),
     "scales": (schema.ScalesTable, "`[scales]`"),
     "episode": (schema.EpisodeTable, "`[episode]`"),

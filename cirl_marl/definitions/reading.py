@@ -14,11 +14,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from cirl_marl.definitions.columns import DataFiles
+from cirl_marl.definitions.composition import composed, copied_file
 from cirl_marl.definitions.conversion import Converter
+from cirl_marl.definitions.laying import FIXED, laid_over, left_out, lost
 from cirl_marl.definitions.mistakes import choices, mistakes_of, toml_mistake
 from cirl_marl.definitions.quantities import FORMS
 from cirl_marl.definitions.schema import NetworkTable
-from cirl_marl.errors import DefinitionError, NetworkError, unknown
+from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown
 from cirl_marl.network import Network
 from cirl_marl.records.files import write_atomically
 
@@ -26,8 +28,6 @@ DEFAULT = "default"
 """The scenario that stands outside ``[scenarios]``."""
 LARGEST = 64 * 2**20
 """Bytes of the largest definition that is read."""
-FIXED = ("name", "regions", "scenarios")
-"""What is the same in every scenario."""
 
 
 class Definition:
@@ -75,12 +75,13 @@ class Definition:
             example = f"as in {self.path.name}:{next(iter(self.regions), 'japan')}"
             which = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
             raise DefinitionError(str(self.path), [unknown("region", region, self.regions) if region else which])
-        if (name, region) not in self._built and name != DEFAULT and not self._overrides[name]:
+        if (name, region) not in self._built and name != DEFAULT and not self._changes(name):
             like = self.network(DEFAULT, region)
             self._built[name, region] = replace(like, scenario_name=name, scenarios=_Others(self, name, region))
         if (name, region) not in self._built:
             override, where = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
-            mistakes = list(_strangers(self._document, override, where))
+            document = self._whole(name)
+            mistakes = list(_strangers(document, override, where))
             if mistakes:
                 raise DefinitionError(str(self.path), mistakes)
             try:
@@ -97,10 +98,26 @@ class Definition:
         return self._built[name, region]
 
     def document(self, name: str = DEFAULT) -> dict[str, Any]:
-        """Return what the file says under a scenario whose paths are those of the file."""
+        """Return what the file says under a scenario whose paths are those of the file, copies written out."""
         override = self._overrides[name]
-        told = {key: value for key, value in override.items() if key != "without"}
-        return _merge(_without(self._document, override), told)
+        told = {key: value for key, value in override.items() if key not in ("without", "copies")}
+        return laid_over(left_out(self._whole(name), override), told)
+
+    def _changes(self, name: str) -> bool:
+        """Whether a scenario may differ from the default one."""
+        return bool(self._overrides[name]) or "copies" in self._document
+
+    def _whole(self, name: str) -> dict[str, Any]:
+        """Return the document, under a scenario with the copies of another one that it asks for."""
+        if "copies" not in self._document:
+            return self._document
+        try:
+            copied = read_toml(self.files.other(copied_file(self._document)))
+            return composed(self._document, copied, name)
+        except NetworkError as error:
+            raise DefinitionError(str(self.path), error.problems) from None
+        except CirlError as error:
+            raise DefinitionError(str(self.path), [f"copies.of: {error}"]) from None
 
     def check(self, region: str = "") -> None:
         """Build every scenario.
@@ -178,63 +195,9 @@ def _too_long(value: Any, where: str) -> Iterator[str]:
         yield f"{where}: is an integer of {len(str(value))} digits; more than 18 are not possible"
 
 
-def _merge(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``base`` with the tables of ``override`` laid over it, key by key, where they do not take its place."""
-    merged = {key: value for key, value in base.items() if key != "scenarios"}
-    for key, value in override.items():
-        old = merged.get(key)
-        if isinstance(old, Mapping) and isinstance(value, Mapping) and not _takes_its_place(value, old):
-            merged[key] = _merge(old, value)
-        else:
-            merged[key] = value
-    return merged
-
-
-def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
-    """Whether a scenario's table replaces the old one whole: a quantity, or a model or control of another kind."""
-    kind = old.get("kind")
-    if isinstance(kind, str):
-        return bool(new.get("kind", kind) != kind)
-    return any(isinstance(old.get(key), str | list) for key in ("source", "file", "times"))
-
-
-def _without(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of ``document`` less the tables at the dotted paths in ``override["without"]``, which exist."""
-    kept = copy.deepcopy(dict(document))
-    for path in override.get("without", []):
-        *parents, last = path.split(".")
-        table = kept
-        for key in parents:
-            table = table[key]
-        del table[last]
-    return kept
-
-
-def _lost(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
-    """Yield what is wrong with the dotted paths of a scenario's ``without``."""
-    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-        yield f"{where}without: must be a list of dotted paths, such as ['nodes.digester.model']"
-        return
-    if len(set(paths)) != len(paths):
-        yield f"{where}without: names a path twice"
-    for path in paths:
-        if path.partition(".")[0] in FIXED:
-            yield f"{where}without: '{path}': a scenario cannot set it"
-        for other in paths:
-            if path.startswith(f"{other}."):
-                yield f"{where}without: '{path}' lies in '{other}', which goes as a whole"
-        table: Any = document
-        for key in path.split("."):
-            if not isinstance(table, Mapping) or key not in table:
-                known = list(table) if isinstance(table, Mapping) else []
-                yield f"{where}without: '{path}': {unknown('key', key, known)}"
-                break
-            table = table[key]
-
-
 def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> Iterator[str]:
     """Yield the compartments and services that a scenario names but the network does not have."""
-    yield from _lost(document, override.get("without", []), where)
+    yield from lost(document, override.get("without", []), where)
     for table in ("nodes", "arcs", "services"):
         known = document.get(table, {})
         given = override.get(table, {})

@@ -148,6 +148,21 @@ class ScalesTable(Table):
     flow: FixedQuantity  # type: ignore[valid-type]
 
 
+Changes = Annotated[dict[Identifier, dict[str, Any]], Field(default_factory=dict)]
+
+
+class CopiesTable(Table):
+    """Copies of another definition, side by side in this one."""
+
+    of: str = Field(description="the definition that is copied, a file in the same folder or below it, with regions")
+    regions: list[Identifier] = Field([], description="which of its regions; default: all")
+    without: list[str] = Field([], description="what is left out of each copy first, as dotted paths")
+    agents: list[str] = Field([], description="who acts in each copy, by the names there; default: those who do there")
+    nodes: Changes = Field(description="tables laid over those of each copy, key by key, as in scenarios")
+    arcs: Changes = Field(description="likewise; ends that are no node of the copy are nodes of this definition")
+    services: Changes = Field(description="likewise")
+
+
 class NetworkTable(Table):
     """A material network."""
 
@@ -166,6 +181,10 @@ class NetworkTable(Table):
     objective: ObjectiveTable  # type: ignore[valid-type]
     observation: ObservationTable  # type: ignore[valid-type]
     agents: list[str] = Field([], description="who acts; default: every compartment with a control")
+    copies: CopiesTable | None = Field(
+        None,
+        description="if it has copies of another definition: each name in a copy then begins with its region and '_'",
+    )
     nodes: dict[Identifier, NodeTable]  # type: ignore[valid-type]
     arcs: dict[Identifier, ArcTable]  # type: ignore[valid-type]
     services: dict[Identifier, ServiceTable] = Field({})  # type: ignore[valid-type]

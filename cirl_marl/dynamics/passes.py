@@ -7,7 +7,9 @@ v = 1 + max_s P(s) v, by policy iteration (Howard 1960).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy import sparse
@@ -15,12 +17,57 @@ from scipy.sparse.linalg import splu
 
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Floats, Integers, Network
+from cirl_marl.network.declared import itemised
 from cirl_marl.network.splits import Split, splits
 
 MOST_ROUNDS = 100
 """Policies that are tried; a handful is enough."""
 SLACK = 1e-8
 """Relative widening that makes up for what the solution of the linear systems leaves open."""
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class _Alike:
+    """Splits of as many controlled arcs and as many others, whose choices are made together."""
+
+    donors: Annotated[Integers, "the nodes, shape (splits,)"]
+    ends: Annotated[Integers, "what the arcs enter, the controlled ones first, negative at stocks, (splits, arcs)"]
+    low: Annotated[Floats, "least shares of the controlled arcs, shape (splits, controlled, horizon)"]
+    high: Annotated[Floats, "and the greatest"]
+    proportions: Annotated[Floats, "of the other arcs in what is left, shape (splits, others, horizon)"]
+
+    @classmethod
+    def of(cls, found: Sequence[tuple[int, Split, Integers]]) -> _Alike:
+        """Stack splits, each with its node and what its arcs enter."""
+        bounds = np.stack([split.bounds for _, split, _ in found])
+        return cls(
+            donors=np.array([i for i, _, _ in found], dtype=np.intp),
+            ends=np.stack([ends for _, _, ends in found]),
+            low=bounds[:, 0],
+            high=bounds[:, 2],
+            proportions=np.stack([split.proportions for _, split, _ in found]),
+        )
+
+    def valued(self, values: Floats) -> Floats:
+        """Return the values at the ends of the arcs, 0 at stocks, shape (splits, arcs, n)."""
+        return np.where(self.ends[..., None] >= 0, values[np.maximum(self.ends, 0)], 0.0)
+
+    def chosen(self, values: Floats, step: int) -> Floats:
+        """Return the shares that are best for ``values`` in one interval, shape (splits, arcs, n)."""
+        low, high, proportions = (each[:, :, step, None] for each in (self.low, self.high, self.proportions))
+        gains, others = np.split(self.valued(values), [low.shape[1]], axis=1)
+        # what is left to the arcs without control counts as one choice without bounds, of their mean value
+        gains = np.concatenate([gains, (others * proportions).sum(axis=1, keepdims=True)], axis=1)
+        room = np.ones_like(gains)
+        room[:, :-1] = high - low
+        order = np.argsort(-gains, axis=1, kind="stable")
+        sorted_room = np.take_along_axis(room, order, axis=1)
+        before = np.cumsum(sorted_room, axis=1) - sorted_room
+        taken = np.empty_like(room)
+        left = 1.0 - low.sum(axis=1, keepdims=True)
+        np.put_along_axis(taken, order, np.clip(left - before, 0.0, sorted_room), axis=1)
+        return np.concatenate([low + taken[:, :-1], proportions * taken[:, -1:]], axis=1)
 
 
 class Passes:
@@ -35,10 +82,13 @@ class Passes:
         stores, self._network = len(network.stores), network
         self._nodes = len(network.nodes) - stores
         found = [(network.node_index[split.donor] - stores, split) for split in splits(network)]
-        self._splits: list[tuple[int, Split, Integers]] = [
-            (i, split, network.recipients[[*split.controlled, *split.others]] - stores) for i, split in found if i >= 0
-        ]
-        tables = [table for _, split, _ in self._splits if (table := split.table).shape[1] > 1]
+        alike: dict[tuple[int, int], list[tuple[int, Split, Integers]]] = {}
+        for i, split in found:
+            if i >= 0:
+                ends = network.recipients[[*split.controlled, *split.others]] - stores
+                alike.setdefault((len(split.controlled), len(split.others)), []).append((i, split, ends))
+        self._splits = [_Alike.of(each) for each in alike.values()]
+        tables = [table for i, split in found if i >= 0 and (table := split.table).shape[1] > 1]
         self.kinds: Sequence[int] = [0]
         if tables:
             self.kinds = np.unique(np.concatenate(tables), axis=1, return_index=True)[1].tolist()
@@ -46,22 +96,15 @@ class Passes:
     def best(self, values: Floats, step: int) -> Floats:
         """Return max_s Σ_j s_ij V_j of each node i in one interval, V being 0 at stocks; shapes (nodes, n)."""
         found = np.empty_like(values)
-        for i, split, ends in self._splits:
-            found[i] = (self._chosen(split, ends, values, step) * _valued(values, ends)).sum(axis=0)
+        for each in self._splits:
+            found[each.donors] = (each.chosen(values, step) * each.valued(values)).sum(axis=1)
         return found
 
     def total(self, step: int) -> Floats:
         """Return the most passes in all of mass that enters each node, in one interval, shape (nodes,)."""
         passes = np.ones(self._nodes)
         for _ in range(MOST_ROUNDS):
-            entries = [
-                (i, int(j), share)
-                for i, split, ends in self._splits
-                for j, share in zip(ends, self._chosen(split, ends, passes[:, None], step)[:, 0], strict=True)
-                if j >= 0
-            ]
-            rows, columns, shares = zip(*entries, strict=True) if entries else ((), (), ())
-            kept = sparse.csc_array((shares, (rows, columns)), shape=(self._nodes, self._nodes))
+            kept = self._among(passes, step)
             try:
                 better = splu(sparse.eye_array(self._nodes, format="csc") - kept).solve(np.ones(self._nodes))
             except RuntimeError:  # singular: so little leaves a loop that nothing is left of it in a sum with 1
@@ -81,22 +124,14 @@ class Passes:
             ["nodes that store nothing pass mass round so often that it cannot be told how much goes through them"],
         )
 
-    def _chosen(self, split: Split, ends: Integers, values: Floats, step: int) -> Floats:
-        """Return the shares that are best for ``values``, first of controlled arcs, shape (arcs of the split, n)."""
-        low, _, high = split.bounds[:, :, step, None]
-        gains, others = np.split(_valued(values, ends), [len(split.controlled)])
-        proportions = split.proportions[:, step, None]
-        # what is left to the arcs without control counts as one choice without bounds, of their mean value
-        gains = np.concatenate([gains, (others * proportions).sum(axis=0, keepdims=True)])
-        room = np.concatenate([np.broadcast_to(high - low, (len(low), values.shape[1])), np.ones((1, values.shape[1]))])
-        order = np.argsort(-gains, axis=0, kind="stable")
-        sorted_room = np.take_along_axis(room, order, axis=0)
-        before = np.cumsum(sorted_room, axis=0) - sorted_room
-        taken = np.empty_like(room)
-        np.put_along_axis(taken, order, np.clip(1.0 - low.sum() - before, 0.0, sorted_room), axis=0)
-        return np.concatenate([low + taken[:-1], proportions * taken[-1]])
+    def _among(self, values: Floats, step: int) -> sparse.csc_array:
+        """Return the shares that are best for ``values``, shape (nodes,), of what goes on to nodes without stock."""
+        rows, columns, shares = (np.concatenate(each) for each in zip(*self._entries(values, step), strict=True))
+        on = columns >= 0
+        return sparse.csc_array((shares[on], (rows[on], columns[on])), shape=(self._nodes, self._nodes))
 
-
-def _valued(values: Floats, ends: Integers) -> Floats:
-    """Return the values at the ends of arcs, 0 at stocks, shape (arcs, n)."""
-    return np.where(ends[:, None] >= 0, values[np.maximum(ends, 0)], 0.0)
+    def _entries(self, values: Floats, step: int) -> Iterator[tuple[Integers, Integers, Floats]]:
+        yield np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), np.empty(0)
+        for each in self._splits:
+            shares = each.chosen(values[:, None], step)
+            yield np.repeat(each.donors, each.ends.shape[1]), each.ends.ravel(), shares.ravel()

@@ -6,9 +6,12 @@ A, and then V solves ::
 
     V_s = 0 where q_s ≥ D_s,    V_s at its most where q_s ≤ D_s,    q_s = D_s elsewhere,
 
-with D the lower ends of the services' bands: a linear complementarity problem, by projected Gauss-Seidel sweeps. Where
-an arc is at its bound, or a donor delivers less, the map bends; it is then solved again from there. What others do in
-the interval is known. Nothing is said about a service whose supply cannot be enough: its level falls short.
+with D the lower ends of the services' bands: a linear complementarity problem. Where an arc is at its bound, or a donor
+delivers less, the map bends; it is then solved again from there. What others do in the interval is known. Nothing is
+said about a service whose supply cannot be enough: its level falls short.
+
+Where more than ``PROBED`` services are made up for, A is not measured but what arrives at once (``arrivals``), with a
+factor for each service: how much of what was expected of the last correction has come about.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from collections.abc import Container
 
 import numpy as np
 
+from cirl_marl.dynamics.arrivals import Arrivals
 from cirl_marl.dynamics.factors import Scaled
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network import Floats, Integers, RowSum
@@ -29,8 +33,15 @@ CLOSE = 1e-12
 """Distance of what is measured from what is demanded, relative to that, at which nothing lacks."""
 PROBE, LEAST = 1e-3, 1e-6
 """Parts of what lacks, and of what is demanded, by the larger of which the columns of A are found."""
-ROUNDS, SWEEPS = 8, 500
-"""Most times that the map is followed where it bends, and Gauss-Seidel sweeps each time."""
+ROUNDS, SWEEPS, CHANGES = 12, 500, 30
+"""Most times that the map is followed where it bends; and each time Gauss-Seidel sweeps, and changes of which supplies
+are at their bounds."""
+PROBED = 4
+"""Most services for each of which an interval is tried to find a column of A."""
+CELLS = 80_000
+"""Most masses of all copies together that are worked on at once; more do not stay in a cache."""
+SEEN = 1e-7
+"""Part of what is demanded, beyond which what a correction has brought about tells how the next one will do."""
 
 
 class Supply:
@@ -65,6 +76,10 @@ class Supply:
             rows += [row] * len(read)
             columns += read
         self._measure = RowSum(rows, columns, 1.0, (len(services), stores + len(network.arcs)))
+        indices = np.array([network.arc_index[arc] for arc in self.arcs], dtype=np.intp)
+        self._arrivals = Arrivals(dynamics, services, indices, self._of)
+        interval = network.episode.control_interval
+        self._lasting = np.array([interval if each.quantity == "stock" else 1.0 for each in services])[:, None, None]
 
     def idle(self, agents: Container[str]) -> Bools:
         """Return which of ``arcs`` nobody acts on, shape (arcs, 1)."""
@@ -91,16 +106,31 @@ class Supply:
         """
         if not idle.any():
             return controls
+        batch, idle = controls.shape[1], np.broadcast_to(idle, (len(self.arcs), controls.shape[1]))
+        block = max(1, CELLS // self._dynamics.rows.masses)
+        if batch <= block:
+            return self._supplied(stock, inner, controls, step, idle, factors)
+        parts = []
+        for first in range(0, batch, block):
+            some = slice(first, first + block)
+            each = [np.ascontiguousarray(given[:, some]) for given in (stock, inner, controls)]
+            drawn = None if factors is None else np.ascontiguousarray(factors[:, some])
+            parts.append(self._supplied(each[0], each[1], each[2], step[some], idle[:, some], drawn))
+        return np.concatenate(parts, axis=1)
+
+    def _supplied(
+        self, stock: Floats, inner: Floats, controls: Floats, step: Integers, idle: Bools, factors: Floats | None
+    ) -> Floats:
+        """Return what ``__call__`` does, for copies so few that all they take stays in a cache."""
         batch, count = controls.shape[1], len(self._demand)
-        idle = np.broadcast_to(idle, (len(self.arcs), batch))
         low, high = (
             table[self._rows].take(step, axis=1) for table in (self._dynamics.control_low, self._dynamics.control_high)
         )
         demand = self._drawn(self._demand.take(step, axis=1), factors)
         most = np.zeros((count, batch))
         weights = np.broadcast_to(self._weights, low.shape)
-        room = np.divide(high - low, weights, out=np.zeros_like(low), where=idle & (weights > 0))
-        np.maximum.at(most, self._of, room)
+        asked = np.divide(high - low, weights, out=np.zeros_like(low), where=idle & (weights > 0))
+        np.maximum.at(most, self._of, asked)
 
         def supplied(supply: Floats) -> Floats:
             """Return all controls for V, shape (services, B), shape (controls, B)."""
@@ -109,23 +139,51 @@ class Supply:
             found[self._rows] = np.where(idle, wanted, controls[self._rows])
             return found
 
+        def measured(supply: Floats, times: int = 1) -> Floats:
+            return self._measured(stock, inner, supplied(supply), step, times, factors)
+
+        def probed(supply: Floats, base: Floats) -> Floats:
+            """Return A, shape (services, services, B), from an interval for each column."""
+            # small beside what lacks, as a donor may hold little more than that, and not lost in rounding
+            probe = np.minimum(np.maximum(PROBE * np.abs(demand - base), LEAST * demand) / interval, PROBE * most)
+            tried = [supplied(supply + probe * (np.arange(count) == s)[:, None]) for s in range(count)]
+            found = self._measured(stock, inner, np.concatenate(tried, axis=1), step, count, factors)
+            more = found.reshape(count, count, batch) - base[:, None]
+            return np.divide(more, probe, out=np.zeros_like(more), where=probe > 0)
+
+        def room(supply: Floats) -> Bools:
+            """Return which arcs can supply more, shape (arcs, B)."""
+            found: Bools = idle & (low + self._weights * supply[self._of] < high)
+            return found
+
+        def arriving(supply: Floats) -> Floats:
+            """Return A, but for a factor in each row."""
+            rate = self._dynamics.rate(supplied(supply), step, factors)
+            return self._arrivals(rate, np.where(room(supply), self._weights, 0.0)) * self._lasting
+
         supply, interval = np.zeros((count, batch)), self._dynamics.network.episode.control_interval
-        open_ = np.ones(batch, dtype=bool)
+        open_, factor = np.ones(batch, dtype=bool), np.ones((count, batch))
+        before: tuple[Floats, Floats, Floats] | None = None
         for _ in range(ROUNDS):
-            base = self._measured(stock, inner, supplied(supply), step, 1, factors)
+            base = measured(supply)
             lacking = demand - base
             lacks = (lacking > CLOSE * demand) & (supply < most) | (lacking < -CLOSE * demand) & (supply > 0)
             open_ &= lacks.any(axis=0)
             if not open_.any():
                 break
-            # small beside what lacks, as a donor may hold little more than that, and not lost in rounding
-            probe = np.minimum(np.maximum(PROBE * np.abs(lacking), LEAST * demand) / interval, PROBE * most)
-            tried = [supplied(supply + probe * (np.arange(count) == s)[:, None]) for s in range(count)]
-            measured = self._measured(stock, inner, np.concatenate(tried, axis=1), step, count, factors)
-            more = measured.reshape(count, count, batch) - base[:, None]
-            slope = np.divide(more, probe, out=np.zeros_like(more), where=probe > 0)
-            better = _complementary(slope, lacking, supply, most, interval)
-            supply = np.where(open_, better, supply)
+            if count <= PROBED:
+                slope = _by_copy(probed(supply, base))
+            else:
+                if before is None or (room(supply) != room(before[0])).any():
+                    arrivals = _by_copy(arriving(supply))
+                if before is not None:
+                    told = np.abs(before[2]) > SEEN * demand
+                    came = np.divide(base - before[1], before[2], out=np.ones_like(base), where=told)
+                    factor *= np.clip(came, 0.1, 10.0)
+                slope = arrivals * factor.T[..., None]
+            better = np.where(open_, _complementary(slope, lacking, supply, most, interval), supply)
+            before = supply, base, (slope * np.ascontiguousarray((better - supply).T)[:, None]).sum(axis=2).T
+            supply = better
         return supplied(supply)
 
     def _measured(
@@ -141,29 +199,80 @@ class Supply:
         return self._measure(np.concatenate([dynamics.rows.stocks(done.stock), flow]))
 
 
+def _by_copy(slope: Floats) -> Floats:
+    """Return A copy by copy, shape (B, services, services), so that sums have the same order whatever the batch."""
+    return np.ascontiguousarray(np.moveaxis(slope, 2, 0))
+
+
 def _complementary(slope: Floats, lacking: Floats, supply: Floats, most: Floats, interval: float) -> Floats:
     """Return V, shape (services, B), at which nothing lacks that can be supplied, for q linear around ``supply``.
 
     Each copy goes its own way, whatever the others in the batch do.
 
     Args:
-        slope: A, shape (services, services, B).
+        slope: A, shape (B, services, services).
         lacking: D − q at ``supply``, shape (services, B).
         supply: V.
         most: largest V.
         interval: length of an interval, by which a flow becomes a stock.
     """
-    count, found = len(lacking), supply.copy()
-    open_ = np.ones(lacking.shape[1], dtype=bool)
+    short, now, high = (np.ascontiguousarray(each.T) for each in (lacking, supply, most))
+    # more of what does not arrive is not supplied
+    arrives = np.diagonal(slope, axis1=1, axis2=2) > TINY * min(1.0, interval)
+    if len(lacking) == 1:
+        return _swept(slope, short, now, high, arrives).T
+    found, solved = _at_once(slope, short, now, high, arrives)
+    if not solved.all():
+        found = np.where(solved[:, None], found, _swept(slope, short, now, high, arrives))
+    return np.ascontiguousarray(found.T)
+
+
+def _at_once(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arrives: Bools) -> tuple[Floats, Bools]:
+    """Return V as ``_complementary`` does, shape (B, services), and in which copies it is found.
+
+    All supplies between their bounds are solved for together; then it is changed which these are. A copy for which that
+    comes to no end is left to others.
+    """
+    wanted = lacking + (slope * supply[:, None]).sum(axis=2)
+    free, held = arrives & (most > 0), np.where(arrives, 0.0, supply)
+    found, solved, unit = supply.copy(), np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
+    for _ in range(CHANGES):
+        tried = _solved(np.where(free[..., None], slope, unit), np.where(free, wanted, held))
+        excess = wanted - (slope * tried[:, None]).sum(axis=2)  # what lacks still
+        under, over = free & (tried < 0), free & (tried > most)
+        back = ~free & arrives & (most > 0) & np.where(held > 0, excess < 0, excess > 0)
+        settled = ~(under | over | back).any(axis=1) & np.isfinite(tried).all(axis=1)
+        found = np.where((settled & ~solved)[:, None], tried, found)
+        solved |= settled
+        if solved.all():
+            break
+        held = np.where(under, 0.0, np.where(over, most, held))
+        free = (free & ~under & ~over) | back
+    return found, solved
+
+
+def _solved(matrix: Floats, wanted: Floats) -> Floats:
+    """Return the solutions of linear systems, shape (B, services); NaN where one is singular."""
+    try:
+        found: Floats = np.linalg.solve(matrix, wanted[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        if len(matrix) == 1:
+            return np.full_like(wanted, np.nan)
+        return np.concatenate([_solved(matrix[i : i + 1], wanted[i : i + 1]) for i in range(len(matrix))])
+    return found
+
+
+def _swept(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arrives: Bools) -> Floats:
+    """Return V as ``_complementary`` does, shape (B, services), by projected Gauss-Seidel sweeps."""
+    count, found = lacking.shape[1], supply.copy()
+    open_ = np.ones(len(lacking), dtype=bool)
     for _ in range(SWEEPS):
         before = found.copy()
         for s in range(count):
-            short = lacking[s] - (slope[s] * (found - supply)).sum(axis=0)
-            arrives = slope[s, s] > TINY * min(1.0, interval)
-            # more of what does not arrive is not supplied
-            step = np.divide(short, slope[s, s], out=np.zeros_like(short), where=arrives)
-            found[s] = np.where(open_, np.clip(found[s] + step, 0.0, most[s]), found[s])
-        open_ &= (np.abs(found - before) > 1e-15 * found).any(axis=0)
+            short = lacking[:, s] - (slope[:, s] * (found - supply)).sum(axis=1)
+            step = np.divide(short, slope[:, s, s], out=np.zeros_like(short), where=arrives[:, s])
+            found[:, s] = np.where(open_, np.clip(found[:, s] + step, 0.0, most[:, s]), found[:, s])
+        open_ &= (np.abs(found - before) > 1e-15 * found).any(axis=1)
         if count == 1 or not open_.any():
             break
     return found

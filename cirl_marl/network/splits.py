@@ -60,7 +60,8 @@ class Split:
         low, _, high = self.bounds[:, :, step]
         sure = float(low[out].sum())
         left = max(0.0, 1.0 - sure - float(high[~out].sum()))
-        return sure + left * float(self.proportions[other, step].sum())
+        parts = proportions(self.given[:, step], 1.0 - self.bounds[1, :, step].sum(axis=0))
+        return sure + left * float(parts[other].sum())
 
     def problems(self) -> Iterator[str]:
         """Yield why these are no shares of a whole in some interval."""

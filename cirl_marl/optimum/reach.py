@@ -79,6 +79,10 @@ class ComparisonSystem:
         self.substeps, self.substep = dynamics.substeps, dynamics.substep
         self._passes = Passes(admissible.network)
         self._routes: dict[bytes, RouteBounds] = {}
+        self._passed_on = self.network.donors >= len(self.network.stores)
+        kinds = np.unique(admissible.kinds).tolist()
+        ranges = [np.diff(admissible.rate(kind)[:, self._passed_on], axis=0).sum() for kind in kinds]
+        self._widest = kinds[int(np.argmax(ranges))]
         self._linear: dict[int, Linear] = {}
 
     def reach(self, initial: Floats, intervals: range, delayed: Sequence[Delayed] = ()) -> Reach:
@@ -137,12 +141,16 @@ class ComparisonSystem:
     def of_kind(self, kind: int) -> Linear:
         """Return what is proportional to stocks in a kind of interval."""
         if kind not in self._linear:
-            passed_on = self.network.donors >= len(self.network.stores)
-            key = self.admissible.rate(kind)[:, passed_on].tobytes()
-            if key not in self._routes:
-                self._routes[key] = RouteBounds(self.admissible, self._passes, kind)
-            self._linear[kind] = Linear(self.admissible, kind, self._routes[key], self.substep)
+            self._linear[kind] = Linear(self.admissible, kind, self._routes_of(kind), self.substep)
         return self._linear[kind]
+
+    def _routes_of(self, kind: int) -> RouteBounds:
+        """Return what holds in a kind of interval, found from what holds where ranges are widest."""
+        key = self.admissible.rate(kind)[:, self._passed_on].tobytes()
+        if key not in self._routes:
+            wider = None if kind == self._widest else self._routes_of(self._widest)
+            self._routes[key] = RouteBounds(self.admissible, self._passes, kind, wider)
+        return self._routes[key]
 
 
 class Linear:

@@ -30,10 +30,11 @@ class RouteBounds:
 
     Attributes:
         longest: most visits of all nodes together, at least 1.
+        visits: V, shape (nodes, nodes).
     """
 
-    def __init__(self, admissible: Admissible, passes: Passes, step: int) -> None:
-        """Take the ranges of shares in interval ``step``."""
+    def __init__(self, admissible: Admissible, passes: Passes, step: int, wider: RouteBounds | None = None) -> None:
+        """Take the ranges of shares in interval ``step``; the visits of ``wider`` ranges are where to begin from."""
         network = admissible.network
         stores, nodes = len(network.stores), len(network.nodes)
         self._stores, inner = stores, nodes - stores
@@ -49,7 +50,11 @@ class RouteBounds:
                 break
         total = passes.total(step)
         self.longest = float(total.max(initial=1.0))
-        visits = np.repeat(total[:, None], inner, axis=1)
+        visits, fewer = np.repeat(total[:, None], inner, axis=1), np.empty(0)
+        if wider is not None:
+            fewer = np.eye(inner) + passes.best(wider.visits, step)
+            if (fewer <= wider.visits * (1 + ROUNDING)).all():  # a bound: V ≥ I + max_s P(s) V
+                visits = np.minimum(visits, wider.visits * (1 + ROUNDING))
         for _ in range(ROUNDS if inner else 0):
             fewer = np.minimum(visits, np.eye(inner) + passes.best(visits, step))
             fallen = (visits - fewer).max()
@@ -59,6 +64,7 @@ class RouteBounds:
         most = np.minimum(visits @ high[:, :stores], 1.0)
         self._least = sparse.csr_array(arrives.T * (1 - ROUNDING))
         self._most = sparse.csr_array(most.T * (1 + ROUNDING))
+        self.visits = visits
         self._visits = sparse.csr_array(visits.T * (1 + ROUNDING))
 
     def least(self, entering: Any) -> Any:

@@ -1,0 +1,66 @@
+"""What a scenario changes in a definition: tables laid over those of the default one, and what is left out first."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from cirl_marl.errors import unknown
+
+FIXED = ("name", "regions", "scenarios")
+"""What is the same in every scenario."""
+
+
+def laid_over(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with the tables of ``override`` laid over it, key by key, where they do not take its place."""
+    merged = {key: value for key, value in base.items() if key != "scenarios"}
+    for key, value in override.items():
+        old = merged.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping) and not _takes_its_place(value, old):
+            merged[key] = laid_over(old, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
+    """Whether a scenario's table replaces the old one whole: a quantity, or a model or control of another kind."""
+    kind = old.get("kind")
+    if isinstance(kind, str):
+        return bool(new.get("kind", kind) != kind)
+    return any(isinstance(old.get(key), str | list) for key in ("source", "file", "times"))
+
+
+def left_out(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy of ``document`` less the tables at the dotted paths in ``override["without"]``, which exist."""
+    kept = copy.deepcopy(dict(document))
+    for path in override.get("without", []):
+        *parents, last = path.split(".")
+        table = kept
+        for key in parents:
+            table = table[key]
+        del table[last]
+    return kept
+
+
+def lost(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
+    """Yield what is wrong with the dotted paths of a scenario's ``without``."""
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        yield f"{where}without: must be a list of dotted paths, such as ['nodes.digester.model']"
+        return
+    if len(set(paths)) != len(paths):
+        yield f"{where}without: names a path twice"
+    for path in paths:
+        if path.partition(".")[0] in FIXED:
+            yield f"{where}without: '{path}': a scenario cannot set it"
+        for other in paths:
+            if path.startswith(f"{other}."):
+                yield f"{where}without: '{path}' lies in '{other}', which goes as a whole"
+        table: Any = document
+        for key in path.split("."):
+            if not isinstance(table, Mapping) or key not in table:
+                known = list(table) if isinstance(table, Mapping) else []
+                yield f"{where}without: '{path}': {unknown('key', key, known)}"
+                break
+            table = table[key]

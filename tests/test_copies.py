@@ -1,0 +1,169 @@
+"""Copies of a definition with regions, side by side in one network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from series_definition import SOURCE, column, definition, written
+
+from cirl_marl import DefinitionError, Network, VectorEnv, load_network
+from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.rollout import rollout
+from cirl_marl.definitions.reading import Definition, write_network
+
+ONE = f'unit = "1", {SOURCE}'
+REGIONS = '[regions]\njapan = "Japan"\nchina = "China"\n'
+SERVICE = f"""
+[services.in_use]
+title = "ore in use"
+provider = "use"
+quantity = "stock"
+low = {{ value = 1, unit = "kt", {SOURCE} }}
+weight = {{ value = 1, {ONE} }}
+"""
+SCENARIOS = f"""
+[scenarios.more]
+without = ["services.in_use"]
+
+[scenarios.more.arcs.ore]
+flow = {{ value = 8, unit = "kt/year", {SOURCE} }}
+"""
+COPIED = definition(column('where = { country = "{region}" }'), start="2000", more=REGIONS + SERVICE + SCENARIOS)
+COPIES = '[copies]\nof = "ores.toml"\n'
+CHANGED = '[copies.arcs.lost]\nto = "port"\n'
+PORT = f"""
+[nodes.port]
+role = "technosphere"
+stores = false
+
+[nodes.sea]
+role = "landfill"
+initial = {{ low = 0, high = 0, unit = "kt", {SOURCE} }}
+
+[arcs.landed]
+from = "port"
+to = "china_market"
+law = "share"
+share = {{ value = 0.25, {ONE} }}
+
+[arcs.sunk]
+from = "port"
+to = "sea"
+law = "share"
+share = "rest"
+"""
+MORE = "[scenarios.more]\n"
+TEXT = COPIED.partition("[nodes.mine]")[0].replace('"ores"', '"trade"') + COPIES + CHANGED + PORT + MORE
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with the definition that is copied."""
+    written(tmp_path, COPIED)
+    return tmp_path
+
+
+def network(folder: Path, text: str = TEXT, scenario: str | None = None) -> Network:
+    """Return the network of a definition beside it."""
+    (folder / "trade.toml").write_text(text, encoding="utf-8")
+    return load_network(folder / "trade.toml", scenario=scenario)
+
+
+def test_a_copy_stands_for_each_region(folder: Path) -> None:
+    """With names that begin with it, numbers of its own, and ends where the others are, or are common."""
+    found = network(folder)
+    assert found.name == "trade" and found.region == ""
+    assert [arc.id for arc in found.arcs if arc.donor == "china_market"] == ["china_sold", "china_lost"]
+    assert {arc.recipient for arc in found.arcs if arc.id.endswith("_lost")} == {"port"}
+    assert [(each.id, each.provider, each.title) for each in found.services] == [
+        ("japan_in_use", "japan_use", "Japan: ore in use"),
+        ("china_in_use", "china_use", "China: ore in use"),
+    ]
+    assert "dump" not in found.node_index and "japan_dump" in found.node_index
+    run = rollout(VectorEnv(found, num_envs=1), Neutral())
+    flow = {arc.id: run.flow[:, k] for k, arc in enumerate(found.arcs)}
+    np.testing.assert_allclose(flow["japan_ore"], [10, 20, 30, 40])
+    np.testing.assert_allclose(flow["china_ore"], [1, 1, 3, 3])
+    np.testing.assert_allclose(flow["landed"], flow["china_sold"] * 2 - flow["china_ore"])
+    np.testing.assert_allclose(flow["landed"], (flow["japan_lost"] + flow["china_lost"]) / 4)
+
+
+def test_a_scenario_is_that_of_the_copies_too(folder: Path) -> None:
+    """Then what it says of the copies here, then its own tables, of copies and of what joins them."""
+    found = network(folder, scenario="more")
+    assert not found.services and [arc.flow for arc in found.arcs if arc.id.endswith("_ore")] == [8.0, 8.0]
+    half = f"[scenarios.more.copies.arcs.sold]\nshare = {{ value = 0.2, {ONE} }}\n"
+    one = f"[scenarios.more.arcs.japan_sold]\nshare = {{ value = 0.1, {ONE} }}\n"
+    found = network(folder, TEXT + half + one, "more")
+    assert [arc.share for arc in found.arcs if arc.id.endswith("_sold")] == [0.1, 0.2]
+    assert [arc.share for arc in network(folder, TEXT + half + one).arcs if arc.id.endswith("_sold")] == [0.5, 0.5]
+
+
+def test_some_regions_and_less_of_each(folder: Path) -> None:
+    """What is left out of the copies need not be left out again by their scenarios."""
+    text = TEXT.replace(COPIES, COPIES + 'regions = ["china"]\nwithout = ["services.in_use", "nodes.dump"]\n')
+    for scenario in (None, "more"):
+        found = network(folder, text, scenario)
+        assert {node.id for node in found.nodes} == {"china_mine", "china_market", "china_use", "port", "sea"}
+        assert not found.services
+
+
+def test_scales_are_those_of_the_copied_file(folder: Path) -> None:
+    """Each compartment has that of its region, unless it states one."""
+    scale = (
+        f'stock = {{ file = "ores.csv", column = "kt", where = {{ country = "{{region}}", year = "2002" }}, {ONE} }}'
+    )
+    stock = next(line for line in COPIED.splitlines() if line.startswith("stock = "))
+    written(folder, COPIED.replace(stock, scale.replace('unit = "1"', 'unit = "kt"')))
+    found = network(folder)
+    assert [found.compartments[each].scale for each in ("japan_use", "china_use", "sea")] == [30.0, 3.0, 1.0]
+
+
+def test_it_is_read_again(folder: Path) -> None:
+    """After it was written out in full, and when the copied file is edited, whose hash is kept."""
+    found = network(folder)
+    assert set(found.data_sha256) == {"ores.toml", "ores.csv"}
+    write_network(found, folder / "full.toml")
+    assert load_network(folder / "full.toml") == found
+    (folder / "ores.toml").write_text(COPIED.replace("value = 0.5", "value = 0.25"), encoding="utf-8")
+    assert load_network(folder / "trade.toml").compartments["japan_sold"].share == 0.25
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('of = "ores.toml"', 'of = "ore.toml"', "copies.of: file 'ore.toml': is not there; unknown file"),
+        ('of = "ores.toml"', 'of = "../ores.toml"', "copies.of: file '../ores.toml': must lie in"),
+        ('of = "ores.toml"', 'off = "ores.toml"', "copies.off: unknown key 'off'. Did you mean 'of'?"),
+        ('of = "ores.toml"', 'of = "trade.toml"', "copies.of: 'trade.toml' has copies itself"),
+        (COPIES, COPIES + 'regions = ["jpan"]\n', "copies.regions: unknown region 'jpan'. Did you mean 'japan'?"),
+        (COPIES, COPIES + 'without = ["nodes.dmp"]\n', "copies.without: 'nodes.dmp': unknown key 'dmp'. Did you mean"),
+        (CHANGED, CHANGED.replace("lost", "los"), "copies.arcs: unknown arc 'los'. Did you mean 'lost'?"),
+        ('to = "port"', 'to = "prt"', "arc 'japan_lost'"),
+        ("[nodes.sea]", "[nodes.japan_use]", "nodes.japan_use: a copy of 'ores.toml' has the same name"),
+        (MORE, '[scenarios.more.copies]\nof = "ores.toml"\n', "scenarios.more.copies.of: a scenario cannot set it"),
+        (
+            MORE,
+            '[scenarios.more.copies.arcs.sld]\nto = "port"\n',
+            "scenarios.more.copies.arcs: unknown arc 'sld'. Did you mean 'sold'?",
+        ),
+    ],
+)
+def test_mistakes_are_named(folder: Path, old: str, new: str, said: str) -> None:
+    """By the keys of the file in which they are."""
+    assert old in TEXT
+    (folder / "trade.toml").write_text(TEXT.replace(old, new), encoding="utf-8")
+    with pytest.raises(DefinitionError) as refused:
+        Definition(folder / "trade.toml").check()
+    assert said in str(refused.value) and str(refused.value).startswith(str(folder / "trade.toml"))
+
+
+def test_a_copy_is_of_a_region(folder: Path) -> None:
+    """A definition without regions is not copied."""
+    (folder / "ores.toml").write_text(definition(), encoding="utf-8")
+    with pytest.raises(
+        DefinitionError, match=r"copies\.of: 'ores\.toml' has no \[regions\], and a copy is of a region"
+    ):
+        network(folder)
