@@ -50,6 +50,8 @@ LONE = 64
 ARCS = (10, 100, 1_000, 10_000, 100_000, 1_000_000)
 LEARNT, SEEDS = 10_240, 5
 """Environment steps of a training, two rollouts of the recipe, and seeds that learn together."""
+WORLDS = 256
+"""Copies of the steel of the world."""
 CELLS = 1_000_000
 """Arcs × copies at every size, so that every size has as much to compute and arrays of 8 MB each."""
 PACKAGES = ("numpy", "scipy", "torch", "stable-baselines3", "gymnasium", "pettingzoo", "greenlet", "vmas")
@@ -65,6 +67,7 @@ class Measurement(StrEnum):
     STACKED = "stacked"
     ARCS = "arcs"
     YEARLY = "yearly"
+    WORLD = "world"
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,8 +348,37 @@ def yearly() -> list[Figure]:
     ]
 
 
+def world() -> list[Figure]:
+    """Measure the steel of the world against that of Japan: every service is made up for, under random actions."""
+    found = {name: VectorEnv(name, num_envs=WORLDS) for name in ("steel_world", "steel_japan")}
+
+    def cost_of(env: VectorEnv, steps: int) -> Callable[[], float]:
+        env.reset(seed=0)
+        actions = _actions(env.agents, (WORLDS, 1))
+        return lambda: _seconds(lambda: env.step(actions), steps) / WORLDS
+
+    ours, theirs = _interleaved(5, *(cost_of(env, steps) for env, steps in zip(found.values(), (2, 26), strict=True)))
+    arcs = [len(env.network.arcs) for env in found.values()]
+    dearer = median((a / arcs[0]) / (b / arcs[1]) for a, b in zip(ours, theirs, strict=True))
+    per_arc = [f"{1e9 * min(costs) / count:,.0f} ns" for costs, count in zip((ours, theirs), arcs, strict=True)]
+    return [
+        Figure(
+            f"steel_world, {WORLDS} copies, {len(found['steel_world'].agents)} agents: years/s",
+            f"{1 / min(ours):,.0f} ({1 / median(ours):,.0f})",
+            remark="best of rounds (median)",
+        ),
+        Figure(
+            "cost per arc and copy, the same / steel_japan",
+            f"{dearer:.2f} ×",
+            "≤ 3 ×",
+            dearer <= 3,
+            f"{per_arc[0]} in {arcs[0]:,} arcs, {per_arc[1]} in {arcs[1]}",
+        ),
+    ]
+
+
 MEASURES: dict[Measurement, Callable[[], list[Figure]]] = dict(
-    zip(Measurement, (batched, single, share, lockstep, stacked, arcs, yearly), strict=True)
+    zip(Measurement, (batched, single, share, lockstep, stacked, arcs, yearly, world), strict=True)
 )
 
 

@@ -1,21 +1,24 @@
 """The data of ``envs/steel_world.toml``, and what was measured with it; ``docs/data.md`` has the sources.
 
 python -m benchmarks.steel_world           # writes envs/steel_world.csv and steel_world_rest.csv anew
+python -m benchmarks.steel_world --levers  # what single levers and countries bring, in docs/data.md
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from benchmarks import steel
+from benchmarks.document import write_sections
 from benchmarks.steel import ENVS, FUTURE, RECENT, TABLE, YEARS, Country, countries
 from cirl_marl import VectorEnv, load_network
 from cirl_marl.controllers import Neutral
+from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.tables import read_flows
@@ -28,6 +31,16 @@ STEEL = ("semis", "long", "flat", "goods")
 """The part of it that the rest of the world wants for its own sake."""
 RAW = ("ore", "pig_iron", "dri")
 """The part that counts where it is made into steel, from 2025 on, so that nothing of it is traded then."""
+LEVERS = {
+    "collection of old scrap": {"old_scrap": 1.0},
+    "losses in scrap preparation": {"scrap_losses": -1.0},
+    "losses of oxygen furnaces": {"bof_losses": -1.0},
+    "losses of electric furnaces": {"eaf_losses": -1.0},
+    "scrap of rolling and manufacturing": {"long_scrap": -1.0, "flat_scrap": -1.0, "goods_scrap": -1.0},
+}
+"""Levers that nothing speaks against, and the actions of their agents."""
+SHOWN = 8
+"""Countries that the table of levers has."""
 AT = {year: y for y, year in enumerate(YEARS)} | dict.fromkeys(FUTURE, len(YEARS))
 """Position of each year that files state."""
 
@@ -42,17 +55,20 @@ class Market:
     @property
     def sold(self) -> Floats:
         """What the rest of the world sells: what the countries import beyond their exports, shape (years,)."""
-        return np.maximum((self.imports - self.exports).sum(axis=1), 0.0)
+        found: Floats = np.maximum((self.imports - self.exports).sum(axis=1), 0.0)
+        return found
 
     @property
     def bought(self) -> Floats:
         """What the rest of the world buys: what they export beyond their imports, shape (years,)."""
-        return np.maximum((self.exports - self.imports).sum(axis=1), 0.0)
+        found: Floats = np.maximum((self.exports - self.imports).sum(axis=1), 0.0)
+        return found
 
     @property
     def shares(self) -> Floats:
         """What part of all that is for sale each country buys, shape (years, countries)."""
-        return shares_of(np.column_stack([self.imports, self.bought])[None])[0][:, :-1]
+        found: Floats = shares_of(np.column_stack([self.imports, self.bought])[None])[0][:, :-1]
+        return found
 
 
 def markets(everyone: Sequence[Country]) -> dict[str, Market]:
@@ -73,12 +89,13 @@ def markets(everyone: Sequence[Country]) -> dict[str, Market]:
 
 def write_trade(everyone: Sequence[Country], found: Mapping[str, Market], supply: float) -> None:
     """Write the share of each country in each world market, and what the rest of the world sells and wants there."""
+    shares = {good: market.shares for good, market in found.items()}
     rows: list[list[object]] = []
     for n, country in enumerate(everyone):
         for year, y in AT.items():
-            rows.append([country.name, year, *(_said(found[good].shares[y, n]) for good in GOODS)])
+            rows.append([country.name, year, *(_said(shares[good][y, n]) for good in GOODS)])
     write_table(ENVS / "steel_world.csv", ["region", "year", *GOODS], rows)
-    wanted = sum(found[good].bought for good in STEEL)
+    wanted = np.sum([found[good].bought for good in STEEL], axis=0)
     wanted[-1] = supply
     rest = [[year, *(_said(found[good].sold[y]) for good in GOODS), _said(wanted[y])] for year, y in AT.items()]
     write_table(ENVS / "steel_world_rest.csv", ["year", *GOODS, "supply"], rest)
@@ -98,10 +115,53 @@ def simulated(scenario: str) -> tuple[dict[str, Floats], dict[str, Floats]]:
     return flows, {node.id: run.stock[:, i] for i, node in enumerate(network.stores)}
 
 
+class _Apart(Controller):
+    """Holds other actions in each copy, agent → action; agents that are not named stay neutral."""
+
+    def __init__(self, held: Sequence[Mapping[str, float]]) -> None:
+        self._held = held
+
+    def start(self, env: VectorEnv, seed: int) -> None:
+        self._env = env
+
+    def act(self, observations: Arrays) -> Arrays:
+        neutral = {agent: np.zeros((len(self._held), 1)) + action for agent, action in self._env.neutral_action.items()}
+        for copy, held in enumerate(self._held):
+            for agent, value in held.items():
+                neutral[agent][copy] = value
+        return neutral
+
+
+def lever_lines() -> Iterator[str]:
+    """Yield the table of what levers bring in all countries, and all levers in one country."""
+    network = load_network(ENVS / "steel_world.toml")
+    everybody, every = list(network.copies), [each for agents in LEVERS.values() for each in agents.items()]
+
+    def held(regions: Sequence[str], levers: Iterable[tuple[str, float]]) -> dict[str, float]:
+        return {f"{region}_{agent}": value for region in regions for agent, value in levers}
+
+    rows = [("nobody acts", held([], [])), ("all of these, in all countries", held(everybody, every))]
+    rows += [(f"{name}, in all countries", held(everybody, agents.items())) for name, agents in LEVERS.items()]
+    rows += [(f"all of these, in {region.replace('_', ' ').title()} alone", held([region], every)) for region in everybody]
+    env = VectorEnv(network, num_envs=len(rows))
+    begun = beginning(env)
+    run = rollout(env, _Apart([actions for _, actions in rows]), seed=begun.seed, start=begun.given)
+    reached, service = run.episode_circularity / 1e3, run.levels.min(axis=(1, 2))
+    gains = reached - reached[0]
+    best = sorted(range(2 + len(LEVERS), len(rows)), key=lambda i: -gains[i])[:SHOWN]
+    yield "| what is set to its best | λ̄, Mt/a | from as usual | lowest service |"
+    yield "|-|-|-|-|"
+    for i in [*range(2 + len(LEVERS)), *best]:
+        yield f"| {rows[i][0]} | {reached[i]:.1f} | {gains[i]:+.1f} | {service[i]:.3f} |"
+
+
 def main() -> None:
-    """Write the data files."""
+    """Write the data files, or the table of levers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.parse_args()
+    parser.add_argument("--levers", action="store_true", help="write the table of levers instead")
+    if parser.parse_args().levers:
+        write_sections(steel.DOCUMENT, {"levers": "\n".join(lever_lines())})
+        return
     everyone = sorted(countries(read_flows(TABLE)), key=lambda each: each.name)
     found = markets(everyone)
     write_trade(everyone, found, 1.0)

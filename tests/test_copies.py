@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from series_definition import SOURCE, column, definition, written
 
-from cirl_marl import DefinitionError, Network, VectorEnv, load_network
+from cirl_marl import CirlError, DefinitionError, Network, VectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import Definition, write_network
+from cirl_marl.drawing.digraph import save_network
+from cirl_marl.drawing.folding import folded
 
 ONE = f'unit = "1", {SOURCE}'
 REGIONS = '[regions]\njapan = "Japan"\nchina = "China"\n'
@@ -128,7 +130,8 @@ def test_it_is_read_again(folder: Path) -> None:
     write_network(found, folder / "full.toml")
     assert load_network(folder / "full.toml") == found
     (folder / "ores.toml").write_text(COPIED.replace("value = 0.5", "value = 0.25"), encoding="utf-8")
-    assert load_network(folder / "trade.toml").compartments["japan_sold"].share == 0.25
+    again = load_network(folder / "trade.toml")
+    assert again.arcs[again.arc_index["japan_sold"]].share == 0.25
 
 
 @pytest.mark.parametrize(
@@ -167,3 +170,35 @@ def test_a_copy_is_of_a_region(folder: Path) -> None:
         DefinitionError, match=r"copies\.of: 'ores\.toml' has no \[regions\], and a copy is of a region"
     ):
         network(folder)
+
+
+def test_copies_are_folded_in_pictures(folder: Path) -> None:
+    """Each is a box; what it takes and loses are boxes of all; stocks and flows add up; one may be shown as it is."""
+    found = network(folder)
+    run = rollout(VectorEnv(found, num_envs=1), Neutral())
+    stock, flow = run.stock[-1], run.flow[-1]
+    seen, held, moved = folded(found, stock, flow)
+    assert {node.id for node in seen.nodes} == {
+        "japan",
+        "china",
+        "all_nonrenewable_reservoir",
+        "between",
+        "sea",
+        "all_landfill",
+    }
+    at = {node.id: i for i, node in enumerate(seen.stores)}
+    assert held.sum() == pytest.approx(stock.sum())
+    assert held[at["japan"]] == pytest.approx(stock[found.node_index["japan_use"]])
+    arrows = {(arc.donor, arc.recipient): value for arc, value in zip(seen.arcs, moved.tolist(), strict=True)}
+    lost = {arc.id: float(flow[k]) for k, arc in enumerate(found.arcs)}
+    assert arrows["japan", "between"] == pytest.approx(lost["japan_lost"]) and len(arrows) == 6
+    assert float(seen.circularity(moved)) == pytest.approx(float(found.circularity(flow)))
+    open_, _, _ = folded(found, stock, flow, ["japan"])
+    shown = {arc.id for arc in open_.arcs}
+    assert {"japan_sold", "japan_ore", "china_to_between"} <= shown and "china_sold" not in shown
+    save_network(folder / "seen.png", found, stock, flow, unfolded=["japan"])
+    assert (folder / "seen.png").stat().st_size > 1000
+    with pytest.raises(CirlError, match=r"unknown copy to unfold 'jpan'\. Did you mean 'japan'\?"):
+        folded(found, stock, flow, ["jpan"])
+    plain = load_network("copper_net")
+    assert folded(plain, stock, flow)[0] is plain

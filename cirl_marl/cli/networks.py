@@ -42,9 +42,13 @@ def show(
     picture: Annotated[
         Path | None, typer.Option(help="Where to draw it; default: NETWORK[_SCENARIO].png here.")
     ] = None,
+    unfold: Annotated[
+        list[str] | None, typer.Option(help="A copy that is not shown as one box, such as japan in steel_world.")
+    ] = None,
 ) -> None:
     """Show the compartments, flows and circularity of a network at its start state, and draw it."""
     from cirl_marl.drawing.digraph import save_network
+    from cirl_marl.drawing.folding import folded
     from cirl_marl.report.tables import arcs_table, nodes_table
 
     found = load_network(network, scenario=scenario)
@@ -52,8 +56,9 @@ def show(
     begun = beginning(env, seed)
     begun.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0], env.physical.flow[:, 0]
-    console.print(nodes_table(found, stock))
-    console.print(arcs_table(found, flow))
+    shown = folded(found, stock, flow, unfold or ())
+    console.print(nodes_table(shown[0], shown[1]))
+    console.print(arcs_table(shown[0], shown[2]))
     for service in found.services:
         ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
         ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
@@ -66,7 +71,7 @@ def show(
     path = picture or Path(f"{stem(found)}.png")
     if path.suffix != ".png":
         raise CirlError(f"--picture {path}: needs the name of a .png file")
-    save_network(path, found, stock, flow, title=found.title, circularity=circularity)
+    save_network(path, found, stock, flow, title=found.title, circularity=circularity, unfolded=unfold or ())
     console.print(f"picture: {path}")
 
 

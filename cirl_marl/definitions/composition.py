@@ -36,8 +36,8 @@ def copied_file(document: Document) -> str:
     return str(_table(document["copies"], "copies").of)
 
 
-def composed(document: Document, copied: Document, scenario: str) -> dict[str, Any]:
-    """Return ``document`` under a scenario, with the copies of ``copied`` that it asks for in it.
+def composed(document: Document, copied: Document, scenario: str) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
+    """Return ``document`` under a scenario with the copies of ``copied`` in it, and the nodes of each by region.
 
     A copy is what the copied file says, then what ``[copies]`` changes, then what the scenario of the same name changes
     in the copied file, then what ``[scenarios.….copies]`` changes. The scenario's other tables are left to the caller.
@@ -53,6 +53,7 @@ def composed(document: Document, copied: Document, scenario: str) -> dict[str, A
     pattern = _pattern(document, copied, scenario)
     merged = {key: copy.deepcopy(value) for key, value in document.items() if key != "scenarios"}
     mistakes = [f"copies.regions: {unknown('region', each, known)}" for each in table.regions if each not in known]
+    nodes: dict[str, tuple[str, ...]] = {}
     for region in [] if mistakes else table.regions or known:
         made = _copy(pattern, region, str(known[region]))
         for part in NAMING:
@@ -60,9 +61,10 @@ def composed(document: Document, copied: Document, scenario: str) -> dict[str, A
             mistakes += [f"{part}.{id_}: a copy of '{table.of}' has the same name" for id_ in more if id_ in own]
             own.update(more)
         merged["agents"] = [*merged.get("agents", []), *made["agents"]]
+        nodes[region] = tuple(made["nodes"])
     if mistakes:
         raise NetworkError(table.of, mistakes)
-    return merged
+    return merged, nodes
 
 
 def _table(given: Any, where: str) -> Any:

@@ -80,7 +80,7 @@ class Definition:
             self._built[name, region] = replace(like, scenario_name=name, scenarios=_Others(self, name, region))
         if (name, region) not in self._built:
             override, where = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
-            document = self._whole(name)
+            document, copies = self._whole(name)
             mistakes = list(_strangers(document, override, where))
             if mistakes:
                 raise DefinitionError(str(self.path), mistakes)
@@ -88,6 +88,7 @@ class Definition:
                 self._built[name, region] = _build(
                     self.document(name),
                     (self.files, region),
+                    copies=copies,
                     scenario_name=name,
                     scenarios=_Others(self, name, region),
                     source=self.path,
@@ -107,10 +108,10 @@ class Definition:
         """Whether a scenario may differ from the default one."""
         return bool(self._overrides[name]) or "copies" in self._document
 
-    def _whole(self, name: str) -> dict[str, Any]:
-        """Return the document, under a scenario with the copies of another one that it asks for."""
+    def _whole(self, name: str) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
+        """Return the document, under a scenario with the copies that it asks for, and the nodes of each of these."""
         if "copies" not in self._document:
-            return self._document
+            return self._document, {}
         try:
             copied = read_toml(self.files.other(copied_file(self._document)))
             return composed(self._document, copied, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cirl_marl.drawing.folding import folded
 from cirl_marl.drawing.picture import draw_network, largest_flow, legend_of
 from cirl_marl.drawing.style import number, save, spoken
 from cirl_marl.errors import CirlError
@@ -76,7 +78,7 @@ class Canvas:
 
         ``time`` is that of the stocks, for the heading; for the others see ``draw_network``.
         """
-        network = self._network
+        network, stock, flow = folded(self._network, stock, flow)
         reference = max(self._reference, largest_flow(flow))
         calendar, dates = labels(network, time)
         when = [*calendar, *dates[0]] if dates else [network.time_unit, number(time)]
@@ -96,12 +98,20 @@ class Canvas:
 
 
 def save_network(
-    path: str | Path, network: Network, stock: Floats, flow: Floats, title: str = "", circularity: float | None = None
+    path: str | Path,
+    network: Network,
+    stock: Floats,
+    flow: Floats,
+    title: str = "",
+    circularity: float | None = None,
+    unfolded: Collection[str] = (),
 ) -> Path:
     """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide, and return its path.
 
-    Its folder is made; without a title it has that of the network. For the other arguments see ``draw_network``.
+    Its folder is made; without a title it has that of the network. Copies are folded, but for those ``unfolded``. For
+    the other arguments see ``draw_network``.
     """
+    network, stock, flow = folded(network, stock, flow, unfolded)
     figure = Figure(figsize=FRAME_INCHES)
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.87))
     draw_network(axes, network, stock, flow, title=title, circularity=circularity)
@@ -130,6 +140,7 @@ def save_before_after(
     reference = max(largest_flow(np.asarray(flow)) for _, flow in (before, after))
     for column, ((stock, flow), label, value) in enumerate(zip((before, after), labels, circularity, strict=True)):
         axes = figure.add_axes((0.005 + 0.5 * column, 0.1, 0.49, 0.78))
-        draw_network(axes, network, stock, flow, title=label, circularity=value, reference_flow=reference, legend=False)
+        shown, stock, flow = folded(network, stock, flow)
+        draw_network(axes, shown, stock, flow, title=label, circularity=value, reference_flow=reference, legend=False)
     figure.legend(**legend_of(network, reference), loc="lower center", ncols=3)
     return save(figure, path)

@@ -159,7 +159,8 @@ class Supply:
         def arriving(supply: Floats) -> Floats:
             """Return A, but for a factor in each row."""
             rate = self._dynamics.rate(supplied(supply), step, factors)
-            return self._arrivals(rate, np.where(room(supply), self._weights, 0.0)) * self._lasting
+            found: Floats = self._arrivals(rate, np.where(room(supply), self._weights, 0.0)) * self._lasting
+            return found
 
         supply, interval = np.zeros((count, batch)), self._dynamics.network.episode.control_interval
         open_, factor = np.ones(batch, dtype=bool), np.ones((count, batch))
@@ -174,12 +175,14 @@ class Supply:
             if count <= PROBED:
                 slope = _by_copy(probed(supply, base))
             else:
-                if before is None or (room(supply) != room(before[0])).any():
-                    arrivals = _by_copy(arriving(supply))
+                bent = np.ones((1, batch), dtype=bool)
                 if before is not None:
-                    told = np.abs(before[2]) > SEEN * demand
-                    came = np.divide(base - before[1], before[2], out=np.ones_like(base), where=told)
-                    factor *= np.clip(came, 0.1, 10.0)
+                    bent = (room(supply) != room(before[0])).any(axis=0, keepdims=True)
+                    # where an arc has come to its bound, less was to be expected
+                    told = (np.abs(before[2]) > SEEN * demand) & ~bent
+                    factor *= np.divide(base - before[1], before[2], out=np.ones_like(base), where=told)
+                if bent.any():
+                    arrivals = _by_copy(arriving(supply))
                 slope = arrivals * factor.T[..., None]
             better = np.where(open_, _complementary(slope, lacking, supply, most, interval), supply)
             before = supply, base, (slope * np.ascontiguousarray((better - supply).T)[:, None]).sum(axis=2).T
@@ -234,6 +237,7 @@ def _at_once(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arriv
     comes to no end is left to others.
     """
     wanted = lacking + (slope * supply[:, None]).sum(axis=2)
+    held: Floats
     free, held = arrives & (most > 0), np.where(arrives, 0.0, supply)
     found, solved, unit = supply.copy(), np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
     for _ in range(CHANGES):
@@ -242,19 +246,19 @@ def _at_once(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arriv
         under, over = free & (tried < 0), free & (tried > most)
         back = ~free & arrives & (most > 0) & np.where(held > 0, excess < 0, excess > 0)
         settled = ~(under | over | back).any(axis=1) & np.isfinite(tried).all(axis=1)
-        found = np.where((settled & ~solved)[:, None], tried, found)
+        found[settled & ~solved] = tried[settled & ~solved]
         solved |= settled
         if solved.all():
             break
         held = np.where(under, 0.0, np.where(over, most, held))
-        free = (free & ~under & ~over) | back
+        free = np.asarray((free & ~under & ~over) | back)
     return found, solved
 
 
 def _solved(matrix: Floats, wanted: Floats) -> Floats:
     """Return the solutions of linear systems, shape (B, services); NaN where one is singular."""
     try:
-        found: Floats = np.linalg.solve(matrix, wanted[..., None])[..., 0]
+        found: Floats = np.asarray(np.linalg.solve(matrix, wanted[..., None])[..., 0], dtype=np.float64)
     except np.linalg.LinAlgError:
         if len(matrix) == 1:
             return np.full_like(wanted, np.nan)

@@ -38,6 +38,7 @@ class Parts:
         source_sha256: hash of that file as it was then.
         data_sha256: hashes of the data files that the definition names, likewise, by the names that it gives them.
         region: the one of the regions of the definition that this is; empty if it has none.
+        copies: ids of the nodes of each copy in it, by region, if it has copies of another definition.
         scenario_name: the scenario that this network describes.
         scenarios: the other scenarios of the same definition, by name.
     """
@@ -60,6 +61,7 @@ class Parts:
     source_sha256: str | None = field(default=None, repr=False, compare=False)
     data_sha256: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
     region: str = field(default="", compare=False)
+    copies: Mapping[str, tuple[str, ...]] = field(default_factory=dict, repr=False, compare=False)
     scenario_name: str = "default"
     scenarios: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 

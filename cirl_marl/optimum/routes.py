@@ -8,6 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from cirl_marl.dynamics.passes import Passes
+from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
 
 ROUNDING = 1e-9
@@ -64,7 +65,7 @@ class RouteBounds:
         most = np.minimum(visits @ high[:, :stores], 1.0)
         self._least = sparse.csr_array(arrives.T * (1 - ROUNDING))
         self._most = sparse.csr_array(most.T * (1 + ROUNDING))
-        self.visits = visits
+        self.visits: Floats = visits
         self._visits = sparse.csr_array(visits.T * (1 + ROUNDING))
 
     def least(self, entering: Any) -> Any:

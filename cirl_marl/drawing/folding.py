@@ -1,0 +1,82 @@
+"""Networks of copies with the copies folded, so that a picture or a table of them can be read."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cirl_marl.drawing.style import spoken
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.elements import Arc, Law, Node, Role
+
+MARKETS = "between"
+"""What joins the copies and stores nothing, as one box."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoldedNetwork(Network):
+    """A network in which boxes stand for parts of another one; it is looked at and does not move."""
+
+    def __post_init__(self) -> None:
+        """Take it as it is: the network that it stands for was checked."""
+        object.__setattr__(self, "nodes", tuple(sorted(self.nodes, key=lambda node: not node.stores)))
+
+
+def folded(
+    network: Network, stock: Floats, flow: Floats, unfolded: Collection[str] = ()
+) -> tuple[Network, Floats, Floats]:
+    """Return a network with its stocks and flows in which each copy is one box; one without copies is left as it is.
+
+    Reservoirs and sinks of the folded copies are one box for each role, and so is all that joins the copies and stores
+    nothing. Flows between two boxes are one arrow; those within a box, and those of nothing, are left out.
+
+    Args:
+        network: the network.
+        stock: stocks, shape (stores,), mass.
+        flow: flows, shape (arcs,), mass/time.
+        unfolded: copies that are shown as they are.
+
+    Raises:
+        CirlError: if there is no copy of that name.
+    """
+    for region in unfolded:
+        if region not in network.copies:
+            raise CirlError(f"network '{network.name}': {unknown('copy to unfold', region, network.copies)}")
+    if not network.copies:
+        return network, stock, flow
+    regions = {node: region for region, nodes in network.copies.items() for node in nodes if region not in unfolded}
+    box_of = {node.id: _box(node, regions.get(node.id), network) for node in network.nodes}
+    boxes = {box.id: box for box in box_of.values()}
+    held, scales = dict.fromkeys(boxes, 0.0), dict.fromkeys(boxes, 0.0)
+    for node, amount in zip(network.stores, stock.tolist(), strict=True):
+        held[box_of[node.id].id] += amount
+        scales[box_of[node.id].id] += node.scale  # reference stocks add up as stocks do
+    nodes = tuple(replace(box, scale=scales[box.id] or box.scale) for box in boxes.values())
+    moved: dict[tuple[str, str], float] = {}
+    kept: list[tuple[Arc, float]] = []
+    for arc, value in zip(network.arcs, flow.tolist(), strict=True):
+        ends = box_of[arc.donor].id, box_of[arc.recipient].id
+        if ends == (arc.donor, arc.recipient):
+            kept.append((arc, value))
+        elif ends[0] != ends[1] and value != 0:
+            moved[ends] = moved.get(ends, 0.0) + value
+    arcs = [Arc(id=f"{a}_to_{b}", donor=a, recipient=b, law=Law.SHARE) for a, b in moved]
+    fields = {name: getattr(network, name) for name in network.__dataclass_fields__}
+    fields |= {"nodes": nodes, "arcs": (*(arc for arc, _ in kept), *arcs), "services": (), "copies": {}}
+    found = FoldedNetwork(**fields)
+    stocks = np.array([held[node.id] for node in found.stores])
+    return found, stocks, np.array([*(value for _, value in kept), *moved.values()])
+
+
+def _box(node: Node, region: str | None, network: Network) -> Node:
+    """Return the box that stands for a node of a folded region, or of none; itself if that is shown."""
+    if region is None:
+        own = any(node.id in nodes for nodes in network.copies.values())
+        return node if own or node.stores else Node(id=MARKETS, title="Markets", stores=False)
+    if node.role is Role.TECHNOSPHERE:
+        return Node(id=region, title=spoken(region).title())
+    name = {Role.NONRENEWABLE_RESERVOIR: "Reservoirs", Role.LANDFILL: "Landfills"}.get(node.role, spoken(node.role))
+    return Node(id=f"all_{node.role.value}", title=name, role=node.role)
