@@ -142,7 +142,8 @@ def lever_lines() -> Iterator[str]:
 
     rows = [("nobody acts", held([], [])), ("all of these, in all countries", held(everybody, every))]
     rows += [(f"{name}, in all countries", held(everybody, agents.items())) for name, agents in LEVERS.items()]
-    rows += [(f"all of these, in {region.replace('_', ' ').title()} alone", held([region], every)) for region in everybody]
+    names = {region: region.replace("_", " ").title() for region in everybody}
+    rows += [(f"all of these, in {name} alone", held([region], every)) for region, name in names.items()]
     env = VectorEnv(network, num_envs=len(rows))
     begun = beginning(env)
     run = rollout(env, _Apart([actions for _, actions in rows]), seed=begun.seed, start=begun.given)
