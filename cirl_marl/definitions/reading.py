@@ -86,7 +86,7 @@ class Definition:
                 raise DefinitionError(str(self.path), mistakes)
             try:
                 self._built[name, region] = _build(
-                    self.document(name),
+                    self._under(name, document),
                     (self.files, region),
                     copies=copies,
                     scenario_name=name,
@@ -100,9 +100,13 @@ class Definition:
 
     def document(self, name: str = DEFAULT) -> dict[str, Any]:
         """Return what the file says under a scenario whose paths are those of the file, copies written out."""
+        return self._under(name, self._whole(name)[0])
+
+    def _under(self, name: str, document: dict[str, Any]) -> dict[str, Any]:
+        """Return a document with what a scenario leaves out and changes."""
         override = self._overrides[name]
         told = {key: value for key, value in override.items() if key not in ("without", "copies")}
-        return laid_over(left_out(self._whole(name), override), told)
+        return laid_over(left_out(document, override), told)
 
     def _changes(self, name: str) -> bool:
         """Whether a scenario may differ from the default one."""

@@ -25,7 +25,7 @@ def groups(network: Network) -> Mapping[str, list[int]]:
     Groups are the copies of a network that is made of copies (``copies``, ids of nodes by name). Else, of a large one,
     they are what titles of nodes have before a colon, if four or more share it.
     """
-    copies: Mapping[str, Sequence[str]] = getattr(network, "copies", {})
+    copies: Mapping[str, Sequence[str]] = network.copies
     if copies:
         return {spoken(name).title(): [network.node_index[id_] for id_ in ids] for name, ids in copies.items()}
     found: dict[str, list[int]] = defaultdict(list)
