@@ -297,6 +297,19 @@ def test_evaluation_pays_what_the_environment_pays() -> None:
     assert paid["whole"].tolist() == [21, 10, 21, 10, 21]
 
 
+def test_evaluation_begins_every_episode_without_memory() -> None:
+    """A recurrent policy that always sees the same does the same in every episode."""
+    log: list[tuple[Any, ...]] = []
+    plain: dict[str, Any] = {"seen": spaces.Discrete(1), "does": spaces.Box(-2, 5, (2,)), "log": log}
+    team = cirl_marl.independent(lambda: Shifts(PAIR, 7, **plain), partial(RecurrentPPO, n_steps=8, batch_size=8))
+    team.evaluate(2)
+    for agent, steps in PAIR.items():
+        done = [action for who, *_, action in log if who == agent]
+        first, second = np.array(done[: len(steps)]), np.array(done[len(steps) :])
+        assert np.array_equal(first, second)
+        assert not np.array_equal(first[0], first[1])
+
+
 SEEN: dict[str, tuple[spaces.Space[Any], str]] = {
     "box": (spaces.Box(-1, 1, (2, 3)), "ActorCriticPolicy"),
     "discrete": (spaces.Discrete(4), "ActorCriticPolicy"),
