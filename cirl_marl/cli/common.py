@@ -19,10 +19,17 @@ from cirl_marl.definitions.reading import DEFAULT
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 
+NETWORKS, EPISODES, LEARNING, COMPARING = "Networks", "Episodes and plans", "Learners", "Comparisons"
+"""Groups of commands in ``cirl --help``."""
+EXAMPLES = """
+For example: cirl new my.toml · cirl plan my.toml --control optimum --min-service 1 ·
+cirl train copper_net --seed 0 · cirl report RUN --html page.html
+"""
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    rich_markup_mode="rich",
+    epilog=EXAMPLES,
 )
 # without emoji=False rich prints a flag or a map for the region of FILE.toml:japan:
 console = Console(width=None if sys.stdout.isatty() else 140, emoji=False)

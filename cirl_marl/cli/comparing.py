@@ -9,6 +9,7 @@ import typer
 
 from cirl_marl.cli import common
 from cirl_marl.cli.common import (
+    COMPARING,
     EpisodeCount,
     Html,
     MinService,
@@ -26,7 +27,7 @@ from cirl_marl.jobs import PLACES
 from cirl_marl.optimum.named import CONTROLLERS
 
 
-@app.command()
+@app.command(rich_help_panel=COMPARING)
 def compare(
     runs: Annotated[
         list[Path] | None, typer.Argument(metavar="RUN...", help="Training runs of one environment; may be left out.")
@@ -76,7 +77,7 @@ def compare(
         say(f"wrote {write_page(page, of_comparison(found))}")
 
 
-@app.command()
+@app.command(rich_help_panel=COMPARING)
 def pareto(
     network: NetworkName,
     recipe: Annotated[

@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from cirl_marl.cli.common import (
+    EPISODES,
     Html,
     MinService,
     NetworkName,
@@ -36,7 +37,7 @@ from cirl_marl.network import Network
 from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
 
 
-@app.command()
+@app.command(rich_help_panel=EPISODES)
 def simulate(
     network: NetworkName,
     control: Annotated[
@@ -169,7 +170,7 @@ def _write_several(folder: Path, files: Mapping[str, Alternative]) -> None:
         say(f"wrote {path}")
 
 
-@app.command()
+@app.command(rich_help_panel=EPISODES)
 def plan(
     source: Annotated[
         str, typer.Argument(metavar="RUN | NETWORK", help="Training run; or with --control a network, as elsewhere.")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cirl_marl.cli.common import app, bar, say
+from cirl_marl.cli.common import NETWORKS, app, bar, say
 from cirl_marl.network.elements import Role
 
 Patterns = list[str] | None
@@ -16,7 +16,7 @@ LISTED = 12
 """Most changes that are listed on screen."""
 
 
-@app.command("import")
+@app.command("import", rich_help_panel=NETWORKS)
 def import_(
     flows: Annotated[Path, typer.Argument(metavar="FLOWS", help="CSV or .xlsx: a long table, or a matrix.")],
     stocks: Annotated[

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cirl_marl.cli.common import (
+    LEARNING,
     EpisodeCount,
     Html,
     RunPath,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from cirl_marl.paper.results import PaperRow, Results
 
 
-@app.command()
+@app.command(rich_help_panel=LEARNING)
 def train(
     context: typer.Context,
     network: Annotated[
@@ -117,7 +118,7 @@ def _directories(out: Path | None, network: str, recipe: str, seeds: Sequence[in
     return [out] if out is not None and len(seeds) == 1 else [Path(f"{parent}-seed{seed}") for seed in seeds]
 
 
-@app.command()
+@app.command(rich_help_panel=LEARNING)
 def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     """Compare the trained policies with neutral and random control on fresh seeds, and with the best possible.
 
@@ -139,7 +140,7 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
         say(f"gap to bound: {figures['no_bound']}")
 
 
-@app.command()
+@app.command(rich_help_panel=LEARNING)
 def export(
     run: RunPath, out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
 ) -> None:
@@ -150,7 +151,7 @@ def export(
         say(f"{path}")
 
 
-@app.command()
+@app.command(rich_help_panel=LEARNING)
 def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0, html: Html = None) -> None:
     """Evaluate a run and draw its pictures anew.
 
@@ -159,7 +160,7 @@ def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0, html: Html
     _evaluate_and_draw(run, episodes, seed, page_for(html))
 
 
-@app.command()
+@app.command(rich_help_panel=LEARNING)
 def paper(
     environment: Annotated[str | None, typer.Argument(metavar="ENV", help="Such as CopperNet; default: all.")] = None,
     algorithm: Annotated[str | None, typer.Argument(metavar="ALGORITHM", help="Such as A2C; default: all.")] = None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from cirl_marl.cli.common import NetworkName, Scenario, StartSeed, app, console, errors, plain, say, stem
+from cirl_marl.cli.common import NETWORKS, NetworkName, Scenario, StartSeed, app, console, errors, plain, say, stem
 from cirl_marl.controllers.rollout import beginning
 from cirl_marl.definitions.catalogue import families, load_network, recipes
 from cirl_marl.definitions.reading import Definition
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from cirl_marl.learners import Recipe
 
 
-@app.command("networks")
+@app.command("networks", rich_help_panel=NETWORKS)
 def list_networks() -> None:
     """List the networks and the learner recipes of the catalogue."""
     from cirl_marl.report.tables import networks_table
@@ -34,7 +34,32 @@ def list_networks() -> None:
     console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
 
-@app.command()
+@app.command(rich_help_panel=NETWORKS)
+def new(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The definition to write, such as my.toml.")],
+    material: Annotated[str, typer.Option(prompt="Which material", help="What flows.")],
+    mass: Annotated[str, typer.Option(prompt="Unit of mass (such as t, kt, Mt)", help="Unit of mass.")],
+    in_use: Annotated[float, typer.Option(prompt="How much of it is in use", help="Mass in use at the start.")],
+    lifetime: Annotated[float, typer.Option(prompt="How many years it stays in use", help="Mean lifetime in years.")],
+    recycled: Annotated[
+        float, typer.Option(prompt="Share of discards that is recycled today (0 to 1)", help="Share that is recycled.")
+    ],
+    growth: Annotated[float, typer.Option(help="Growth of what is in use, percent a year.")] = 0.0,
+    start: Annotated[int, typer.Option(help="First year.")] = 2025,
+    years: Annotated[int, typer.Option(help="How many years the episode lasts.")] = 25,
+) -> None:
+    """Write a first network of your own: a material that is made, used for years, discarded, and recycled in part.
+
+    What is not given is asked for. Every number stands in the file with its source, to be changed.
+    """
+    from cirl_marl.definitions.template import FirstCycle, write_first
+
+    given = {"material": material, "mass": mass, "in_use": in_use, "lifetime": lifetime, "recycled": recycled}
+    write_first(FirstCycle(**given, growth=growth, start=start, years=years), file)  # type: ignore[arg-type]
+    say(f"wrote {file}; next: cirl plan {file} --control optimum --min-service 1, and cirl train {file}")
+
+
+@app.command(rich_help_panel=NETWORKS)
 def show(
     network: NetworkName,
     scenario: Scenario = None,
@@ -75,7 +100,7 @@ def show(
     console.print(f"picture: {path}")
 
 
-@app.command()
+@app.command(rich_help_panel=NETWORKS)
 def check(
     sources: Annotated[
         list[str], typer.Argument(metavar="FILE...", help="Networks and recipes: files, or names of the catalogue.")

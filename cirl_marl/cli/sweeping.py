@@ -13,7 +13,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from cirl_marl.cli.common import app, console, errors, folder_for
+from cirl_marl.cli.common import COMPARING, app, console, errors, folder_for
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES
 
@@ -36,7 +36,7 @@ OPTIONS_SHOWN += ("circularity_weight", "horizon", "uncertain")
 """Columns of the results that are shown if they differ between cells of one recipe."""
 
 
-@app.command()
+@app.command(rich_help_panel=COMPARING)
 def sweep(
     file: Annotated[Path, typer.Argument(metavar="SWEEP", help="Sweep file: networks, scenarios, recipes, seeds.")],
     on: Annotated[str, typer.Option(help=f"Where the cells are trained: {', '.join(PLACES)}.")] = "local",
