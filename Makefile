@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo check test test-all written lint types wheel fast unit every fuzz kill study planner speed clean
+.PHONY: demo check test test-all written lint types wheel fast unit every fuzz kill study planner speed peers clean
 
 demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
 	rm -rf runs/demo
@@ -61,6 +61,9 @@ planner: $(VENV)/.runtime  ## plans for 200 generated networks, and how far they
 speed: $(VENV)/.runtime  ## table of speed ratios
 	$(PIP) install --quiet -c constraints.txt -e '.[benchmarks]'
 	$(BIN)/python benchmarks/speed.py
+
+peers: $(VENV)/.runtime  ## RLlib, BenchMARL and TorchRL against ours on copper_net, each in its own environment (an hour)
+	$(BIN)/python -m benchmarks.peers.run
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
