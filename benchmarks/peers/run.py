@@ -20,7 +20,7 @@ from benchmarks.peers.contenders import CONTENDERS, Contender
 from benchmarks.peers.gaps import Reference
 from benchmarks.peers.installing import HOME, ROOT, python_of
 from benchmarks.peers.settings import NETWORK
-from benchmarks.peers.tables import figures, gap_table, speed_table, verdict
+from benchmarks.peers.tables import OURS, figures, gap_table, speed_table, verdict
 from benchmarks.peers.watch import Record
 from cirl_marl import load_network
 from cirl_marl.environments.vector import VectorEnv
@@ -36,6 +36,8 @@ EVERY = 12
 """Seconds of the processor after which a policy is judged."""
 RECIPES = ("independent_ppo", "independent_ars", "serving_ars")
 """Whose speed says nothing about peers."""
+LOCKSTEP = "lockstep"
+"""Learns what the stacked do, up to rounding, and so is not judged."""
 BATCHED = ("benchmarl", "torchrl")
 """Peers that step our batched environment."""
 console = Console()
@@ -62,7 +64,7 @@ def main(
         for turn in range(rounds):
             for name in fast:
                 _train(name, records / f"speed-{name}-{turn}.json", seconds, 0, turn)
-        for name in chosen:
+        for name in (name for name in chosen if name != LOCKSTEP):
             _train(name, records / f"gap-{name}.json", 60 * minutes, EVERY, SEED)
     _write(records, chosen)
 
@@ -93,28 +95,32 @@ def _surroundings(contender: Contender) -> dict[str, str]:
 
 
 def _write(records: Path, chosen: Sequence[str]) -> None:
-    """Write the figures of what is there, and the tables if it is all."""
-    speed = {
-        name: [Record.read(path) for path in sorted(records.glob(f"speed-{name}-[0-9]*.json"))]
-        for name in chosen
-        if name not in RECIPES
-    }
+    """Write figures and tables of what is there, and name what is not."""
+    found = {name: [Record.read(path) for path in sorted(records.glob(f"speed-{name}-[0-9]*.json"))] for name in chosen}
+    speed = {name: rounds for name, rounds in found.items() if rounds}
     trained = {name: Record.read(path) for name in chosen if (path := records / f"gap-{name}.json").is_file()}
-    lacking = [name for name in CONTENDERS if name not in trained or (name not in RECIPES and not speed.get(name))]
-    if lacking:
-        raise CirlError(f"{records}: no tables, as records of {', '.join(lacking)} are missing")
+    if OURS not in speed or not any(CONTENDERS[name].peer for name in speed):
+        raise CirlError(f"{records}: no tables without the speed of '{OURS}' and of a peer")
     reference = Reference.solved()
     standings = {name: [reference.standing(each) for each in record.judged] for name, record in trained.items()}
     setups = {name: record.setup for name, record in trained.items()}
     write_json(RESULTS, {"processor": processor(), **figures(speed, standings, setups)})
     agents = len(VectorEnv(load_network(NETWORK), num_envs=1).agents)
     peers = [name for name in speed if CONTENDERS[name].peer]
-    alone = [name for name in peers if name not in BATCHED]
-    said = f"With our batched environment: {verdict(speed, peers)}. Without: {verdict(speed, alone)}."
-    write_sections(
-        DOCUMENT,
-        {"peers_speed": f"{speed_table(speed, agents)}\n\n{said}", "peers_gap": gap_table(standings)},
-    )
+    groups = {"With": [name for name in peers if name in BATCHED], "Without": [n for n in peers if n not in BATCHED]}
+    said = [f"{how} our batched environment: {verdict(speed, names)}." for how, names in groups.items() if names]
+    said += _lacking("rate", [name for name in CONTENDERS if name not in speed and name not in RECIPES])
+    tables = {
+        "peers_speed": "\n\n".join([speed_table(speed, agents), " ".join(said)]),
+        "peers_gap": "\n\n".join(
+            [gap_table(standings), *_lacking("training", [n for n in CONTENDERS if n not in (*trained, LOCKSTEP)])]
+        ),
+    }
+    write_sections(DOCUMENT, tables)
+
+
+def _lacking(what: str, names: Sequence[str]) -> list[str]:
+    return [f"No {what} of {', '.join(CONTENDERS[name].title for name in names)} is recorded."] if names else []
 
 
 if __name__ == "__main__":
