@@ -71,8 +71,8 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
             r"0.25 day is 1.728e\+06 solver steps of 1.4.*e-07 day, more than 10,000. Is solver_step in the wrong unit",
         ),
         (
-            {"episode": Episode(control_interval=1e90, solver="euler", solver_step=1e-90)},
-            r"is 1e\+180 solver steps of 1e-90 day",
+            {"episode": Episode(control_interval=1e40, solver="euler", solver_step=1e-40)},
+            r"is 1e\+80 solver steps of 1e-40 day",
         ),
         (
             {"arcs": (replace(DELAYED, delay=86400.0),)},

@@ -106,7 +106,7 @@ def test_business_as_usual_is_served(world: Network, usual: Rollout, everyone: l
         np.testing.assert_allclose(bought, sold, rtol=1e-9)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_mass_is_conserved(world: Network) -> None:
     """Under any actions, in every copy, and a batch is what its copies are alone."""
     env = VectorEnv(world, num_envs=3, horizon=3)
@@ -125,7 +125,7 @@ def test_mass_is_conserved(world: Network) -> None:
         np.testing.assert_array_equal(lone.snapshot().state.stock[:, 0], after[:, 1])
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_what_stays_at_home_saves_ore_there_and_is_missed_elsewhere(world: Network, usual: Rollout) -> None:
     """Scrap that Japan does not export is melted in Japan; those who bought it take more ore."""
     env = VectorEnv(world, num_envs=1, agents=["japan_scrap_exports"])

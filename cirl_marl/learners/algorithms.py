@@ -213,7 +213,6 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
     try:
         model = algorithm_class(name)(POLICIES.get(policy, policy), env, **arguments, **fixed)
     except (TypeError, ValueError, AssertionError, KeyError, NotImplementedError) as error:
-        seen = f"for observations {env.observation_space} and actions {env.action_space}"
-        raise RecipeError(f"{name} refuses its parameters {dict(parameters)}, {seen}: {error}") from error
+        raise RecipeError(f"{name} refuses its parameters {dict(parameters)}: {error}") from error
     model.set_logger(Logger(None, []))  # left to itself it makes an empty temporary folder when it begins to learn
     return model
