@@ -34,7 +34,7 @@ from cirl_marl.network.elements import (
 from cirl_marl.network.series import Series
 
 if TYPE_CHECKING:
-    from cirl_marl.learners.teams.team import Team, independent, load_team
+    from cirl_marl.learners.teams.team import Team, independent
 
 __version__ = "0.1.0"
 
@@ -66,7 +66,6 @@ __all__ = [
     "aec_env",
     "independent",
     "load_network",
-    "load_team",
     "networks",
     "parallel_env",
     "recipes",
@@ -80,6 +79,6 @@ register()
 
 def __getattr__(name: str) -> Any:
     """Return what trains, which loads torch, when it is first asked for."""
-    if name not in ("Team", "independent", "load_team"):
+    if name not in ("Team", "independent"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module("cirl_marl.learners.teams.team"), name)

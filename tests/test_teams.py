@@ -385,7 +385,7 @@ def test_a_team_is_kept_and_goes_on(tmp_path: Path) -> None:
     team.learn(64)
     team.save(tmp_path / "kept")
     assert {path.suffix for path in (tmp_path / "kept").iterdir()} == {".json", ".safetensors"}
-    again = cirl_marl.load_team(tmp_path / "kept", make)
+    again = Team.load(tmp_path / "kept", make)
     assert again["early"].num_timesteps == team["early"].num_timesteps
     assert all(same(team[agent], again[agent]) for agent in team)
     assert all(np.array_equal(team.evaluate(3)[agent], paid) for agent, paid in again.evaluate(3).items())
@@ -394,12 +394,12 @@ def test_a_team_is_kept_and_goes_on(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="is there already"):
         team.save(tmp_path / "kept")
     with pytest.raises(RunError, match=r"of the agents \['early', 'whole'\], the environment has \['other'\]"):
-        cirl_marl.load_team(tmp_path / "kept", lambda: Shifts({"other": range(3)}, 3))
+        Team.load(tmp_path / "kept", lambda: Shifts({"other": range(3)}, 3))
     (tmp_path / "kept" / "early.state.safetensors").write_bytes(b"\x80\x04.")
     with pytest.raises(RunError, match=r"early\.state\.safetensors"):
-        cirl_marl.load_team(tmp_path / "kept", make)
+        Team.load(tmp_path / "kept", make)
     with pytest.raises(RunError, match=r"team.*cannot be read"):
-        cirl_marl.load_team(tmp_path / "nothing", make)
+        Team.load(tmp_path / "nothing", make)
 
 
 @pytest.mark.medium

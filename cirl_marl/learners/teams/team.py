@@ -238,31 +238,31 @@ class Team:
             raise RunError(f"{path}: parameters that are no plain values cannot be kept: {error}") from error
         partial_folder.replace(path)
 
+    @classmethod
+    def load(cls, folder: str | Path, make_env: MakeEnv, *, tensorboard_log: str | Path | None = None) -> Team:
+        """Return a team as ``Team.save`` wrote it, in fresh episodes of the environment.
+
+        Raises:
+            RunError: if a file is missing, cannot be read, or is of another environment.
+        """
+        path = Path(folder)
+        told = read_tree(path, "team")
+        try:
+            settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in told["agents"].items()}
+            copies = Copies(make_env, told["num_envs"])
+            seed = int(told["seed"])
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise RunError(f"{path / 'team.json'}: is not what a team wrote: {error}") from error
+        if set(settings) != set(copies.agents):
+            raise RunError(f"{path}: is of the agents {sorted(settings)}, the environment has {sorted(copies.agents)}")
+        team = cls(make_env, copies, settings, seed, tensorboard_log)
+        for learner in team.learners.values():
+            learner.load(path)
+        return team
+
     def close(self) -> None:
         """Close the copies of the environment."""
         self._copies.close()
-
-
-def load_team(folder: str | Path, make_env: MakeEnv, *, tensorboard_log: str | Path | None = None) -> Team:
-    """Return a team as ``Team.save`` wrote it, in fresh episodes of the environment.
-
-    Raises:
-        RunError: if a file is missing, cannot be read, or is of another environment.
-    """
-    path = Path(folder)
-    told = read_tree(path, "team")
-    try:
-        settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in told["agents"].items()}
-        copies = Copies(make_env, told["num_envs"])
-        seed = int(told["seed"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RunError(f"{path / 'team.json'}: is not what a team wrote: {error}") from error
-    if set(settings) != set(copies.agents):
-        raise RunError(f"{path}: is of the agents {sorted(settings)}, the environment has {sorted(copies.agents)}")
-    team = Team(make_env, copies, settings, seed, tensorboard_log)
-    for learner in team.learners.values():
-        learner.load(path)
-    return team
 
 
 def _settings(agent: str, algorithm: Algorithm, seen: spaces.Space[Any], normalise: bool) -> LearnerSettings:
