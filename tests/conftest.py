@@ -31,7 +31,7 @@ settings.register_profile(
     "cirl_marl",
     deadline=None,
     database=None,
-    max_examples=15,
+    max_examples=12,
     derandomize="CI" in os.environ,
     suppress_health_check=[HealthCheck.too_slow],
 )

@@ -145,7 +145,9 @@ plain_networks = st.from_type(Network).map(without_lifetimes)
 
 LARGE = ("steel_world",)
 """Networks of hundreds of agents, which have tests of their own; what these cost with all others is too much."""
-ONE_OF_EACH = [names[0] for names in families().values() if names[0] not in LARGE]
+ALIKE = ("aluminium_world",)
+"""Made like ``copper_world``, with other numbers, which ``test_world_cycles.py`` asserts."""
+ONE_OF_EACH = [names[0] for names in families().values() if names[0] not in (*LARGE, *ALIKE)]
 """A network of each other definition of the catalogue."""
 PLAYED = [
     (name, scenario)

@@ -299,7 +299,7 @@ def table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_files_of_scenarios(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Each CSV is that of the scenario by itself, and the table is of their figures."""
     scenarios = ("default", "crisis", "ban")

@@ -41,6 +41,8 @@ def test_levers_are_said_in_words() -> None:
     np.testing.assert_allclose(share.usual, share.usual[0])
 
 
+@pytest.mark.medium
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("network", [name for name in ONE_OF_EACH if name != "solids_net"])
 def test_savings_are_what_circularity_is_made_of(network: str) -> None:
     """Reservoirs, landfills and the environment add up to −λ̄, as planned and as usual."""

@@ -124,7 +124,7 @@ def test_a_delay_is_exact() -> None:
     np.testing.assert_allclose(found.stock[1:], run.stock, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_a_cycle_of_four_products_is_planned() -> None:
     """Within one per cent of the bound at the demanded service; from other starts too, and by MPC as well."""
     network = product_cycle(6)

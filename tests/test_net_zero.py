@@ -86,6 +86,7 @@ def uptake_after(days: float, light: float, form: str) -> tuple[float, float]:
     return float(per_biovolume), float(per_biovolume * end[0, 0] / 1000.0)
 
 
+@pytest.mark.slow
 def test_volume_ratios_of_net_zero() -> None:
     """248 with the misprint corrected, 648 with it (625 rounded), 4960, the definition's, with the units kept."""
     digester, none = model_class("digester")(), np.zeros((6, 1))
@@ -209,6 +210,7 @@ def test_against_scipy(scenario: str) -> None:
     assert found[-1] == pytest.approx(exact[-1], rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_convergence_with_the_solver_step(scenario: str) -> None:
     """The emission, by Runge-Kutta, converges with order 4, the biomass, by a step of its own, with order 2."""

@@ -384,7 +384,7 @@ def test_multipliers_of_one_level_bound_another() -> None:
     assert found.at(starts[:, None], levels[:, None]).shape == (4, 4)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_few_solutions_bound_many_starts() -> None:
     """Ten days of copper from 12 drawn starts: three solutions prove within 1 % of what twelve do."""
     env = VectorEnv("copper_net", num_envs=12, horizon=40)

@@ -151,7 +151,7 @@ def test_row_is_trained_kept_and_not_run_again(
     assert capsys.readouterr().out.partition("\n") == (f"rows: 1, done: 1; results in {tmp_path}", "\n", shown)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_same_seed_same_figures() -> None:
     """The seed decides model and environment."""
     first, second, other = (
@@ -547,7 +547,7 @@ def test_tuned_policy_is_measured_behind_its_normaliser(monkeypatch: pytest.Monk
     assert not np.array_equal(chosen, learner.model.predict(seen, deterministic=True)[0])
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_final_policies_play_their_quota_on_episodes_of_their_own() -> None:
     """23 episodes in 20 copies: one each and a second one for the last three, from the seed given on."""
     id_, first = ENVIRONMENTS["CO2MicroalgaeMonod"].id, 2**31 + 7

@@ -78,7 +78,7 @@ def test_residence_times_of_a_fraction_of_a_step(residence: float) -> None:
     assert 0.0 <= float(found.gap(episode.episode_circularity)[0]) < 0.01
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_the_unit_of_mass_does_not_matter(tmp_path: Path) -> None:
     """In kg, kt and Gt: the same bound, plan, and episodes of the plan and of MPC."""
     text = (folder("envs") / "copper_net.toml").read_text(encoding="utf-8")
@@ -187,7 +187,7 @@ def test_a_plan_lies_within_its_boxes_too() -> None:
     assert not feasible(plan)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_controllers_that_plan_set_shares() -> None:
     """MPC, the improved plan and the plan found by search beat neutral control where shares are set; none the bound."""
     network = cycle(hoarded=500.0)
