@@ -245,9 +245,14 @@ def test_others_hold_their_neutral_control(name: str) -> None:
         np.testing.assert_allclose(one.state(), many.state(), rtol=1e-6, atol=1e-6)
 
 
+def can_stop(name: str) -> bool:
+    """Whether agents can stop a network: not where a supply delivers what they leave out."""
+    return not any(arc.makes_up_for for arc in load_network(name).arcs)
+
+
 @pytest.mark.medium
 @pytest.mark.sample(2)
-@pytest.mark.parametrize("name", ONE_OF_EACH)
+@pytest.mark.parametrize("name", [*filter(can_stop, ONE_OF_EACH)])
 def test_zero_throughput_is_not_best(name: str) -> None:
     """Stopping everything is good for λ, but the service fails and the mixed reward falls.
 
