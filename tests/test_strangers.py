@@ -108,7 +108,7 @@ def test_hostile_files_run_nothing(form: str, stopped: Path, tmp_path: Path) -> 
         shutil.rmtree(run)
 
 
-@pytest.mark.parametrize("name", ["../../outside", "/tmp/outside", "..", "000000060-complete/../../../outside", ""])
+@pytest.mark.parametrize("name", ["../../outside", "/outside", "..", "000000060-complete/../../../outside", ""])
 def test_names_that_lead_out_are_refused(name: str, stopped: Path, tmp_path: Path) -> None:
     """Of checkpoints in the status, whoever reads it."""
     run = tmp_path / "run"
