@@ -23,6 +23,14 @@ def _tanh_(values: Tensor) -> Tensor:
     return values.tanh_()
 
 
+def _multiply(left: Tensor, right: Tensor, into: Tensor) -> None:
+    """Write the products of matrices; NumPy's are some ten times as fast as torch's on a CPU where one is narrow."""
+    if into.is_cpu:
+        np.matmul(left.numpy(), right.numpy(), out=into.numpy())
+    else:
+        into.copy_(torch.bmm(left, right))
+
+
 @dataclass(frozen=True, slots=True)
 class Activation:
     """A function of hidden units, in place, and the gradient before it from that after it and its value."""
@@ -81,7 +89,7 @@ class Perceptrons:
         """Write the gradients of weights and biases, from what ``forward`` gave and the gradient of the outputs."""
         for place in reversed(range(len(self.layers))):
             into = self.gradients[place][some]
-            into.weight.copy_(torch.bmm(gradient.mT, values[place]))
+            _multiply(gradient.mT, values[place], into.weight)
             if into.bias is not None:
                 into.bias.copy_(gradient.sum(dim=1))
             if place:
