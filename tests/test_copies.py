@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from series_definition import SOURCE, column, definition, written
 
-from cirl_marl import CirlError, DefinitionError, Network, VectorEnv, load_network
+from cirl_marl import CirlError, DefinitionError, Network, RecipeError, VectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import Definition, write_network
 from cirl_marl.drawing.digraph import save_network
 from cirl_marl.drawing.folding import folded
+from cirl_marl.learners import Recipe
 
 ONE = f'unit = "1", {SOURCE}'
 REGIONS = '[regions]\njapan = "Japan"\nchina = "China"\n'
@@ -202,3 +203,26 @@ def test_copies_are_folded_in_pictures(folder: Path) -> None:
         folded(found, stock, flow, ["jpan"])
     plain = load_network("copper_net")
     assert folded(plain, stock, flow)[0] is plain
+
+
+def recipe(scheme: str) -> Recipe:
+    """Return one whose learners are for the same agent in all copies."""
+    learner = {"algorithm": "ARS", "scheme": scheme, "among": "copies"}
+    return Recipe.model_validate({"name": "mine", "title": "copies learn together", "learner": learner})
+
+
+def test_the_same_agents_of_all_copies_share_a_policy(folder: Path) -> None:
+    """Named by what they are copies of; what is of no copy learns by itself, also if it ends at one."""
+    found = network(folder)
+    agents = ["japan_ore", "china_ore", "china_market", "japan_market", "landed", "port"]
+    groups = {group.name: group.agents for group in recipe("shared").groups(found, agents)}
+    assert groups == {
+        "shared-learner-ore": ("japan_ore", "china_ore"),
+        "shared-learner-market": ("china_market", "japan_market"),
+        "shared-learner-landed": ("landed",),
+        "shared-learner-port": ("port",),
+    }
+    with pytest.raises(RecipeError, match="among: copies, but network 'ores' is not made of copies"):
+        recipe("joint").groups(load_network(written(folder, definition())), ["mine"])
+    with pytest.raises(RecipeError, match="among: copies is for the schemes shared and joint"):
+        recipe("independent").check(100)

@@ -100,6 +100,11 @@ class LearnerSettings(Settings):
         description="independent: a learner for each agent; shared: one policy for all, each acting by itself; "
         "joint: one policy that sees and acts for all at once",
     )
+    among: Literal["all", "copies"] = Field(
+        "all",
+        description="all: one shared or joint policy for all agents; copies: one for each agent of a definition of "
+        "which the network has copies, for that agent in all of them; agents of no copy learn by themselves",
+    )
     parameters: dict[str, Any] = {}
     normalise: Normalisation = Normalisation()
     bootstrap: StrictBool = Field(
@@ -130,6 +135,8 @@ class LearnerSettings(Settings):
         yield from algorithm_mistakes(self.algorithm, self.policy, self.parameters)
         if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
             yield f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true"
+        if self.among == "copies" and self.scheme == "independent":
+            yield "among: copies is for the schemes shared and joint; an independent learner has one agent"
         if self.share_of_steps == 0 and self.start is None:
             yield "share_of_steps: 0, so that it never learns: give a start by which it acts, or a share above 0"
         if self.demonstrations is None or self.algorithm not in algorithms():
@@ -198,7 +205,7 @@ class Group:
     """Agents that one learner learns for, in the order of the environment, and how it learns.
 
     An independent learner has the name of its agent, others are ``shared-learner`` or ``joint-learner``; of several
-    with the number of the match, 0 for the common one.
+    with the number of the match, 0 for the common one. One that is for the same agent in all copies ends with its name.
     """
 
     name: str
@@ -251,9 +258,16 @@ class Recipe(Settings):
                 alike = sum(other.scheme == spec.scheme for other in specs)
                 number = next(i for i, other in enumerate(specs) if other is spec)
                 name = f"{spec.scheme}-learner" + (f"-{number}" if alike > 1 else "")
+                if spec.among == "copies":
+                    self._has_copies(network)
+                    name += f"-{network.counterpart(agent) or agent}"
             members = found[name].agents if name in found else ()
             found[name] = Group(name, (*members, agent), spec)
         return tuple(found.values())
+
+    def _has_copies(self, network: Network) -> None:
+        if not network.copies:
+            self._refuse([f"among: copies, but network '{network.name}' is not made of copies ([copies]); use all"])
 
     def check(self, steps: int) -> None:
         """Raise a ``RecipeError`` that names all that is wrong whatever the network, in a run of ``steps``."""

@@ -106,6 +106,22 @@ class Network(Parts):
         """Every compartment by id, nodes first."""
         return MappingProxyType({c.id: c for c in (*self.nodes, *self.arcs)})
 
+    def counterpart(self, compartment: str) -> str | None:
+        """Return the id that a compartment of a copy has in what was copied; None if it is of no copy.
+
+        Ids of a copy begin with its region. An arc is of a copy if one of its ends is.
+        """
+        own = self.compartments[compartment]
+        places = {own.id} if isinstance(own, Node) else {own.donor, own.recipient}
+        for region, nodes in self._copied.items():
+            if own.id.startswith(f"{region}_") and places & nodes:
+                return own.id.removeprefix(f"{region}_")
+        return None
+
+    @cached_property
+    def _copied(self) -> Mapping[str, frozenset[str]]:
+        return {region: frozenset(nodes) for region, nodes in self.copies.items()}
+
     @cached_property
     def stores(self) -> tuple[Node, ...]:
         """Nodes that hold a stock, the first of ``nodes``, in the order of every stock array."""
