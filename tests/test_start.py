@@ -159,6 +159,23 @@ def test_a_stack_of_starts_learns_what_lockstep_does(first: tuple[Training, Path
         assert statistics(learner) == statistics(first[0].learners[name])
 
 
+def test_the_last_layer_alone_goes_on_learning(tmp_path: Path) -> None:
+    """Of a stacked search; whatever cannot do so says why."""
+    small = {"parameters": {"n_delta": 1, "n_eval_episodes": 1, "policy_kwargs": {"net_arch": [4, 3]}}}
+    train("copper_net", recipe("ARS", **small), directory=tmp_path / "first", **OPTIONS)
+    begun = train("copper_net", recipe("ARS", **small), **OPTIONS)
+    start = {"start": {"run": str(tmp_path / "first"), "last_layer": True}}
+    found = train("copper_net", recipe("ARS", **small, **start), **OPTIONS)
+    for name, learner in found.learners.items():
+        before, after = weights(begun.learners[name]), weights(learner)
+        moved = {key for key in before if not torch.equal(before[key], after[key])}
+        assert moved == {"action_net.4.weight", "action_net.4.bias"}
+    with pytest.raises(RecipeError, match=r"start.last_layer: needs a stacked ARS, which engine lockstep prevents"):
+        train("copper_net", recipe("ARS", **small, **start), engine="lockstep", **OPTIONS)
+    with pytest.raises(RecipeError, match=r"start.last_layer: is for ARS, not for PPO"):
+        train("copper_net", recipe("PPO", **start), **OPTIONS)
+
+
 class FailsAtOnce(BaseCallback):
     """Fails at the first step of its learner."""
 
@@ -298,7 +315,11 @@ start = { run = "runs/first", agent = "mine" }
     [
         ('"runs/first"', "3", "learner.start.run: Input should be a valid string, got 3"),
         ('"runs/first"', '""', "learner.start.run: String should have at least 1 character, got ''"),
-        ("run =", "runn =", "learner.start.runn: unknown key 'runn'. Did you mean 'run'? Known: run, agent."),
+        (
+            "run =",
+            "runn =",
+            "learner.start.runn: unknown key 'runn'. Did you mean 'run'? Known: run, agent, last_layer.",
+        ),
         ('{ run = "runs/first", agent = "mine" }', '"runs/first"', "learner.start: must be a table { run = … }, got"),
         ("share_of_steps = 0", "share_of_steps = -0.1", "share_of_steps: Input should be greater than or equal to 0"),
         ("start =", "# start =", "learner.share_of_steps: 0, so that it never learns: give a start by which it acts"),

@@ -88,6 +88,11 @@ class Start(Settings):
         "{seed} stands for the seed of the training"
     )
     agent: StrictStr | None = Field(None, description="learner of that run; None is the one of the same name")
+    last_layer: StrictBool = Field(
+        False,
+        description="whether only the last layer goes on learning: a search of whole episodes that moves a few hundred "
+        "weights instead of thousands. For ARS that can be stacked",
+    )
 
 
 class LearnerSettings(Settings):
@@ -135,6 +140,8 @@ class LearnerSettings(Settings):
         yield from algorithm_mistakes(self.algorithm, self.policy, self.parameters)
         if self.policy == CENTRAL_CRITIC and not self.normalise.observation:
             yield f"normalise.observation: {CENTRAL_CRITIC} sees physical units, so it must be true"
+        if self.start is not None and self.start.last_layer and self.algorithm != "ARS":
+            yield f"start.last_layer: is for ARS, not for {self.algorithm}"
         if self.among == "copies" and self.scheme == "independent":
             yield "among: copies is for the schemes shared and joint; an independent learner has one agent"
         if self.share_of_steps == 0 and self.start is None:

@@ -193,15 +193,19 @@ class Training:
         """Return the learners that the engine of the run lets run as one with others.
 
         Raises:
-            RecipeError: if all should, and one cannot; names it and what is in the way.
+            RecipeError: if one cannot that has to; names it and what is in the way.
         """
         engine = self.config.recipe.run.engine
         learners = list(self.learners.values())
         if engine == "stacked" and (why := first_obstacle(learners)) is not None:
             raise RecipeError(f"recipe '{self.config.recipe.name}': {why}; use engine auto or lockstep")
-        if engine == "lockstep":
-            return []
-        return [each for each in learners if each.name not in callbacks and obstacle(each) is None]
+        found = [each for each in learners if each.name not in callbacks and obstacle(each) is None]
+        found = [] if engine == "lockstep" else found
+        for each in learners:
+            if each.spec.start is not None and each.spec.start.last_layer and each not in found:
+                why = obstacle(each) or ("engine lockstep" if engine == "lockstep" else "a callback")
+                raise RecipeError(f"{each.seat.title}: start.last_layer: needs a stacked ARS, which {why} prevents")
+        return found
 
     @property
     def joint_steps(self) -> int:

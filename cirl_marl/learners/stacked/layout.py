@@ -15,11 +15,15 @@ from cirl_marl.network import Integers
 
 
 class Field:
-    """Where a padded tensor stands in the rows of a matrix."""
+    """Where a padded tensor stands in the rows of a matrix.
+
+    Attributes:
+        first: its first column.
+    """
 
     def __init__(self, columns: slice, shape: tuple[int, ...]) -> None:
         """Stand in these columns, which hold a tensor of this shape."""
-        self._columns, self._shape = columns, shape
+        self._columns, self._shape, self.first = columns, shape, columns.start
 
     def of(self, matrix: Tensor) -> Tensor:
         """Return it as a view of a matrix, shape (rows, …)."""

@@ -40,6 +40,8 @@ class SearchStack(Stack):
             for parameter, columns in self._layout.places(i):
                 self._centre[i, columns] = parameter.detach().flatten().to(self._device)
         self._columns = [torch.cat([c for _, c in self._layout.places(i)]) for i in range(len(members))]
+        begun = members[0].spec.start
+        self._kept = None if begun is None or not begun.last_layer else slice(self._fields[-1][0].first)
         seat = members[0].seat
         self._rows, self._copies = seat.num_envs, seat.copies
         self._each = copies_each(members[0])
@@ -89,11 +91,16 @@ class SearchStack(Stack):
             model.num_timesteps, model._n_updates = self._steps * self._rows**2, self._updates
 
     def _drawn(self) -> Tensor:
-        """Return the directions of all learners, each drawn as it draws them, shape (learners, K, columns)."""
+        """Return the directions of all learners, each drawn as it draws them, shape (learners, K, columns).
+
+        Where only the last layer learns, the others do not move.
+        """
         count = self._models[0].n_delta
         deltas = torch.zeros(len(self.members), count, self._layout.columns)
         for own, stream, columns in zip(deltas, self._noise, self._columns, strict=True):
             own[:, columns] = torch.normal(0.0, 1.0, (count, len(columns)), generator=stream)
+        if self._kept is not None:
+            deltas[:, :, self._kept] = 0.0
         return deltas.to(self._device)
 
     def _returns(self, candidates: Tensor, wait: Callable[[], None]) -> Tensor:
