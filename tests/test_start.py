@@ -161,10 +161,10 @@ def test_a_stack_of_starts_learns_what_lockstep_does(first: tuple[Training, Path
 
 def test_the_last_layer_alone_goes_on_learning(tmp_path: Path) -> None:
     """Of a stacked search; whatever cannot do so says why."""
-    small = {"parameters": {"n_delta": 1, "n_eval_episodes": 1, "policy_kwargs": {"net_arch": [4, 3]}}}
+    small: dict[str, Any] = {"parameters": {"n_delta": 1, "n_eval_episodes": 1, "policy_kwargs": {"net_arch": [4, 3]}}}
     train("copper_net", recipe("ARS", **small), directory=tmp_path / "first", **OPTIONS)
     begun = train("copper_net", recipe("ARS", **small), **OPTIONS)
-    start = {"start": {"run": str(tmp_path / "first"), "last_layer": True}}
+    start: dict[str, Any] = {"start": {"run": str(tmp_path / "first"), "last_layer": True}}
     found = train("copper_net", recipe("ARS", **small, **start), **OPTIONS)
     for name, learner in found.learners.items():
         before, after = weights(begun.learners[name]), weights(learner)

@@ -26,7 +26,7 @@ from scipy.sparse import csgraph
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network.ages import remaining
 from cirl_marl.network.declared import declarations
-from cirl_marl.network.elements import SINKS, Compartment, ControlKind, Law, Node, Role, Service
+from cirl_marl.network.elements import SINKS, Arc, Compartment, ControlKind, Law, Node, Role, Service
 from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
@@ -112,7 +112,7 @@ class Network(Parts):
         Ids of a copy begin with its region. An arc is of a copy if one of its ends is.
         """
         own = self.compartments[compartment]
-        places = {own.id} if isinstance(own, Node) else {own.donor, own.recipient}
+        places = {own.donor, own.recipient} if isinstance(own, Arc) else {own.id}
         for region, nodes in self._copied.items():
             if own.id.startswith(f"{region}_") and places & nodes:
                 return own.id.removeprefix(f"{region}_")
