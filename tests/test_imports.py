@@ -20,8 +20,9 @@ LAYERS = (
     ("controllers", "testing"),
     ("importing", "optimum"),
     ("learners",),
-    ("__init__", "evaluation", "paper"),
-    ("report", "sweeps"),
+    ("evaluation", "paper"),
+    ("reasons",),
+    ("__init__", "report", "sweeps"),
     ("cli",),
 )
 """From the ground up; a room imports from layers below its own, and from itself."""

@@ -56,6 +56,30 @@ class Kernel:
         self.high += at_once
 
 
+def released(chain: Chain, rate: Floats, length: float, degree: int) -> Floats:
+    """Return what leaves of a unit of mass that has just entered a chain at the start of each piece, and has stayed.
+
+    Args:
+        chain: the stages; what leaves at once, w_0, is not of it.
+        rate: μ in each piece, shape (pieces,), 1/time.
+        length: of a piece.
+        degree: d.
+
+    Returns:
+        Means weighted with B_i over each piece p of what entered at the start of piece q, 1/time, shape
+        (q, p, d + 1); 0 before.
+    """
+    parts = {each: weighted(chain.matrix / chain.rate * each * length, degree) for each in np.unique(rate).tolist()}
+    found = np.zeros((len(rate), len(rate), degree + 1))
+    held = np.zeros((chain.stages, len(rate)))
+    for p, each in enumerate(rate.tolist()):
+        means, whole = parts[each]
+        held[:, p] = chain.entering / chain.entering.sum()
+        found[:, p] = (each * means[:, -1] @ held).T
+        held = whole @ held
+    return found
+
+
 class _Motion:
     """The motion of stages in a piece in which they have passed on μδ times what they hold.
 

@@ -123,6 +123,11 @@ class Programs:
             self._under.add(kind, linked_under, under)
         self._weights, self._constant = objective(layout, service_weight)
 
+    def at_start(self, interval: int) -> tuple[Any, Any]:
+        """Return what the linked rows of A and of G have of the stocks at the start of an interval, (rows, stores)."""
+        kind = int(self.admissible.kinds[interval])
+        return self._equal.at_start(kind), self._under.at_start(kind)
+
     def program(self, initial: Floats, min_service: ArrayLike | None = None, intervals: range | None = None) -> Program:
         """Return the program from ``initial`` that gives each service the mean level demanded of it.
 

@@ -104,6 +104,10 @@ class Chained:
         self._before[kind].eliminate_zeros()
         self._alone[kind], _, self._looser[1][kind] = alone.matrices()
 
+    def at_start(self, kind: int) -> Any:
+        """Return what the linked rows of a kind of interval have of the stocks at its start, (rows, stores), sparse."""
+        return self._before[kind][:, self._layout.last]
+
     def over(self, kinds: Integers, initial: Floats, cut: Floats) -> tuple[Any, Floats]:
         """Return the matrix over intervals of some kinds, and the right-hand side.
 

@@ -30,7 +30,7 @@ from cirl_marl.dynamics.rows import Rows
 from cirl_marl.dynamics.stages import StagedNetwork, inside, staged
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Node
-from cirl_marl.optimum.kernels import Kernel
+from cirl_marl.optimum.kernels import Kernel, released
 from cirl_marl.optimum.layout import Layout
 
 LOOSE = 2e-4
@@ -184,6 +184,26 @@ class Lifetimes:
             blocks.append(matrix)
             limits.append(to)
         return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
+
+    def of_new(self, each: Lived, layout: Layout) -> Floats:
+        """Return what leaves of a unit of mass that is new in a stock at the start of each interval of an episode.
+
+        In a fixed lifetime it counts as what entered in the interval before.
+
+        Returns:
+            Its means by moment, in the order of the first half of the lifetime's rows, 1/time, shape
+            (steps, steps · moments).
+        """
+        steps, moments = self.network.episode.horizon, len(layout.moments)
+        lifetime = each.node.lifetime
+        assert lifetime is not None
+        if not len(each.rate):
+            delay = len(each.rows) - 1
+            out = np.kron(np.eye(steps, k=delay - 1), np.ones((1, moments)))
+            return np.asarray(out / self.network.episode.control_interval, dtype=float)
+        assert lifetime.chain is not None
+        found = released(lifetime.chain, np.repeat(each.rate, layout.pieces), layout.length, layout.degree)
+        return found[:: layout.pieces].reshape(steps, -1)
 
     def _of_chain(self, each: Lived, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
         assert each.node.lifetime is not None and each.node.lifetime.chain is not None

@@ -1,0 +1,138 @@
+"""What a little more of something changes in the optimum of a program, from its multipliers, without another solution.
+
+With the Lagrangian of the program at its optimum v, y, μ, d = c − Aᵀy − Gᵀμ ::
+
+    L = cᵀv + yᵀ(b − A v) + μᵀ(g − G v) + d₊ᵀ(l − v) + d₋ᵀ(u − v),
+
+the least cost of a program whose numbers are a little different differs, to first order, by the difference of L at the
+same v, y, μ and d. Each row and each variable belongs to an interval, and so does its part of the difference. Where the
+optimum has a kink, a little less may be worth more than a little more; then any of the slopes in between is found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cirl_marl.network import Floats
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.bounds import Bound
+from cirl_marl.optimum.layout import Layout
+from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.solver import solve
+
+WIDER = 10.0
+"""Factor by which boxes are widened that follow from the start, so that no multiplier rests on them."""
+
+
+def resting_on_rows(found: Bound, admissible: Admissible) -> Bound:
+    """Return a bound with boxes so wide that its multipliers rest on rows wherever they can.
+
+    Boxes of stocks and of what these drive follow from the start and from all that may happen. An optimum that lies on
+    one lies on rows as well, as a rule, and either may have the multiplier; more of a stock moves both. Where no rows
+    hold it the objective rises a little; it is a bound all the same.
+    """
+    problem, free = found.problem, _reached(admissible, found.problem.layout)
+    high = problem.high.reshape(-1, problem.layout.size).copy()
+    largest = high.max(axis=0)
+    # a stock that nothing reaches has a box of 0, which no factor widens
+    largest[free & (largest == 0)] = high.max()
+    high[:, free] = WIDER * np.maximum(high, largest)[:, free]
+    wider = replace(problem, high=high.ravel())
+    solution = solve(wider, found.basis, what="the program of the shadow prices")
+    return replace(found, problem=wider, solution=solution.plan, certificate=solution.certificate, basis=solution.basis)
+
+
+def _reached(admissible: Admissible, layout: Layout) -> NDArray[np.bool_]:
+    """Return which variables of an interval have boxes that follow from the start, shape (size,)."""
+    found, driven = np.zeros(layout.size, dtype=bool), ~admissible.scheduled
+    nodes, arcs = len(layout.network.nodes), len(layout.network.arcs)
+    for i in layout.moments:
+        found[layout.stock(i) : layout.flow(i)] = True
+        found[layout.flow(i) : layout.valve(i)] = driven
+        found[layout.valve(i) :][: len(layout.valves)] = True
+    for piece in range(layout.pieces):
+        found[layout.end(piece) :][: len(layout.network.stores)] = True
+        if layout.merged:
+            found[layout.end(piece) :][:nodes] = True
+            found[layout.end_flow(piece) :][:arcs] = driven
+    found[layout.imbalance] = True
+    return found
+
+
+def changes(found: Bound, admissible: Admissible, other: Program) -> Floats:
+    """Return how much the objective of a bound rises, to first order, with the numbers of another program.
+
+    Args:
+        found: the bound, resting on rows.
+        admissible: of its network.
+        other: a program with the same rows and variables.
+
+    Returns:
+        The parts of it by interval, shape (steps,). What changes in one interval may make room in later ones, and these
+        parts are theirs.
+
+    Raises:
+        ValueError: if the rows or variables differ.
+    """
+    problem, v, layout = found.problem, found.solution, found.problem.layout
+    y, mu = found.certificate.equal, np.minimum(found.certificate.under, 0.0)
+    pairs = ((problem.equal, other.equal), (problem.under, other.under))
+    if any(ours.shape != theirs.shape for ours, theirs in pairs) or layout.size != other.layout.size:
+        raise ValueError("the programs differ in their rows or variables")
+    reduced = problem.cost - problem.equal.T @ y - problem.under.T @ mu
+    least, most = np.maximum(reduced, 0.0), np.minimum(reduced, 0.0)
+    wider = np.where(np.tile(_reached(admissible, layout), len(v) // layout.size), 0.0, other.high - problem.high)
+    cost = (other.cost - problem.cost) * v + least * (other.low - problem.low) + most * wider
+    steps = len(v) // layout.size
+    by_interval = cost.reshape(steps, -1).sum(axis=1)
+    rights = (other.equal_to - problem.equal_to, other.under_to - problem.under_to)
+    for (ours, theirs), multipliers, right in zip(pairs, (y, mu), rights, strict=True):
+        parts = multipliers * (right - (theirs @ v - ours @ v))
+        by_interval += np.bincount(problem.interval_of_rows(ours), parts, steps)
+    rise: Floats = other.constant - problem.constant - by_interval
+    return rise
+
+
+def of_stocks(found: Bound, programs: Programs) -> Floats:
+    """Return how much the objective of a bound rises for a unit of mass more in a stock, new at the start of intervals.
+
+    Of a node with a lifetime it is new as well: it leaves as what has just entered does. What more of a stock changes
+    in boxes and in the envelopes of products is left out.
+
+    Args:
+        found: the bound of a whole episode, resting on rows.
+        programs: what its program was made by, or made alike.
+
+    Returns:
+        Shape (steps, stores), 1.
+    """
+    problem, lifetimes = found.problem, programs.admissible.lifetimes
+    y, mu = found.certificate.equal, np.minimum(found.certificate.under, 0.0)
+    planned, steps = problem.layout.network, programs.admissible.network.episode.horizon
+    worth, tops = np.empty((steps, len(planned.stores))), [0, 0]
+    for step in range(steps):
+        # a stock s at the start stands on the left as B s, so a unit more lowers the right-hand side by B
+        blocks = programs.at_start(step)
+        worth[step] = sum(
+            block.T @ multipliers[top : top + block.shape[0]]
+            for block, multipliers, top in zip(blocks, (y, mu), tops, strict=True)
+        )
+        tops = [top + block.shape[0] for top, block in zip(tops, blocks, strict=True)]
+    last = len(mu) - (0 if found.min_service is None else len(planned.services))
+    for each in reversed(lifetimes.lived):
+        out = lifetimes.of_new(each, problem.layout)
+        rows = out.shape[1]
+        above, below = mu[last - 2 * rows : last - rows], mu[last - rows : last]
+        worth[:, planned.node_index[each.node.id]] -= out @ (above - below)
+        last -= 2 * rows
+    of_nodes = worth[:, : len(lifetimes.network.stores)].copy()
+    stages = getattr(planned, "stages", {})
+    for i, node in enumerate(lifetimes.network.stores):
+        if len(stages.get(node.id, ())) > 1 and node.lifetime is not None and node.lifetime.chain is not None:
+            entering = node.lifetime.chain.entering
+            columns = [planned.node_index[stage] for stage in stages[node.id]]
+            of_nodes[:, i] = worth[:, columns] @ (entering / entering.sum())
+    return of_nodes
