@@ -73,7 +73,7 @@ $(VENV)/.runtime: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[dev,human,browser]'
+	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[dev,human,browser,explain]'
 	touch $@ $(VENV)/.runtime
 
 clean:  ## what these commands made, but for runs

@@ -35,6 +35,7 @@ from cirl_marl.network.series import Series
 
 if TYPE_CHECKING:
     from cirl_marl.learners.teams.team import Team, independent
+    from cirl_marl.reasons.explaining import explain
 
 __version__ = "0.1.0"
 
@@ -64,6 +65,7 @@ __all__ = [
     "Team",
     "VectorEnv",
     "aec_env",
+    "explain",
     "independent",
     "load_network",
     "networks",
@@ -77,8 +79,16 @@ __all__ = [
 register()
 
 
+LATE = {
+    "Team": "cirl_marl.learners.teams.team",
+    "explain": "cirl_marl.reasons.explaining",
+    "independent": "cirl_marl.learners.teams.team",
+}
+"""Where names are that are loaded when they are first asked for: what trains loads torch."""
+
+
 def __getattr__(name: str) -> Any:
-    """Return what trains, which loads torch, when it is first asked for."""
-    if name not in ("Team", "independent"):
+    """Return what is loaded late."""
+    if name not in LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module("cirl_marl.learners.teams.team"), name)
+    return getattr(import_module(LATE[name]), name)

@@ -103,6 +103,13 @@ def folder_for(path: Path, option: str) -> Path:
     return path
 
 
+def writable_folder(path: Path, option: str) -> Path:
+    """Return ``folder_for`` of a path; a ``CirlError`` says so as well if nothing can be written there."""
+    folder = folder_for(path, option)
+    _check_writable(folder / "file", f"{option} {path}")
+    return folder
+
+
 def page_for(path: Path | None) -> Path | None:
     """Return where a report for the browser goes, if it is asked for; a ``CirlError`` says why it cannot go there."""
     if path is None:
@@ -111,12 +118,16 @@ def page_for(path: Path | None) -> Path | None:
         raise CirlError(f"--html {path}: needs the name of an .html file")
     if path.is_dir():
         raise CirlError(f"--html {path}: is a folder, not a file")
+    _check_writable(path, f"--html {path}")
+    return path
+
+
+def _check_writable(path: Path, what: str) -> None:
     folder = next(each for each in path.absolute().parents if each.exists())
     if not folder.is_dir():
-        raise CirlError(f"--html {path}: {folder} is a file, not a folder")
+        raise CirlError(f"{what}: {folder} is a file, not a folder")
     if not os.access(folder, os.W_OK):
-        raise CirlError(f"--html {path}: nothing can be written in {folder}")
-    return path
+        raise CirlError(f"{what}: nothing can be written in {folder}")
 
 
 @contextmanager

@@ -34,6 +34,16 @@ class Policies(Controller):
         self._memory: dict[str, Any] = {}
         self._starts = np.ones(1, dtype=bool)
 
+    @property
+    def policies(self) -> Mapping[str, Policy]:
+        """The policies, by the names of their learners."""
+        return self._policies
+
+    @property
+    def memory(self) -> Mapping[str, Any]:
+        """What each remembers, as its algorithm has it; None of those that remember nothing, or have not acted yet."""
+        return self._memory
+
     def start(self, env: VectorEnv, seed: int) -> None:
         """Forget the last episode."""
         self._memory = dict.fromkeys(self._policies)

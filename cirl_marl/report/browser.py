@@ -20,7 +20,8 @@ from cirl_marl.report.document import document
 from cirl_marl.report.scenes import Story
 
 SCRIPTS = (
-    "elements", "figures", "clock", "ribbons", "diagram", "curves", "plane", "details", "agents", "tables", "main",
+    "elements", "figures", "clock", "ribbons", "diagram", "curves", "plane", "details", "agents", "reasons", "tables",
+    "main",
 )  # fmt: skip
 """Modules of the page, each behind those from which it imports."""
 

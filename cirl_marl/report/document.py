@@ -66,6 +66,7 @@ def document(story: Story) -> dict[str, Any]:
         ],
         "front": _rows(story.front),
         "notes": list(story.notes),
+        "reasons": [{"title": heading, "said": list(said)} for heading, said in story.reasons],
         "made": {
             "versions": [f"{name} {found[name]}" for name in SHOWN_VERSIONS],
             "definition": fingerprint(story.network),

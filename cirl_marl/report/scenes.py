@@ -85,6 +85,7 @@ class Story:
         default_factory=lambda: np.empty((0, 2))
     )
     notes: Annotated[tuple[str, ...], "what a reader has to know"] = ()
+    reasons: Annotated[tuple[tuple[str, tuple[str, ...]], ...], "headings with sentences that say why"] = ()
 
 
 def of_alternatives(found: Sequence[Alternative]) -> Story:

@@ -9,6 +9,7 @@ import { make, part, shown } from "./elements.js";
 import { measured } from "./figures.js";
 import { frameOf } from "./ribbons.js";
 import { planeOf } from "./plane.js";
+import { reasonsOf } from "./reasons.js";
 import { figuresOf, outcomeOf } from "./tables.js";
 
 const BESIDE = 4;
@@ -223,5 +224,9 @@ if (story.points.length) {
   shown("plane");
   plane = planeOf(part("plane-chart"), story);
   plane();
+}
+if (story.reasons.length) {
+  shown("reasons");
+  part("reasons-told").append(...reasonsOf(story.reasons));
 }
 resized();

@@ -1,0 +1,78 @@
+"""``cirl explain``: reasons for what is best, and for what agents do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from cirl_marl.cli import common
+from cirl_marl.cli.common import COMPARING, EpisodeCount, Scenario, Seed, app, console, say, shares
+from cirl_marl.definitions.catalogue import load_network
+
+
+@app.command(rich_help_panel=COMPARING)
+def explain(
+    source: Annotated[
+        str, typer.Argument(metavar="RUN | NETWORK", help="Training run; or a network, of which there are prices.")
+    ],
+    parts: Annotated[
+        str | None,
+        typer.Option(help="Comma-separated, of prices, inputs, rules; default: all, of a network the prices."),
+    ] = None,
+    min_service: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="Mean level of each service behind the prices; default: what the policies deliver, or 99 % of the "
+            "highest.",
+        ),
+    ] = None,
+    episodes: EpisodeCount = 16,
+    seed: Seed = 0,
+    top: Annotated[int, typer.Option(min=1, help="Inputs of an agent that are held together.")] = 3,
+    leaves: Annotated[int, typer.Option(min=2, help="Most leaves of a rule.")] = 4,
+    scenario: Scenario = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write; default: RUN/reasons or reasons_NETWORK[_SCENARIO].")
+    ] = None,
+) -> None:
+    """Say why: what more of a stock, of demand or of room is worth, what agents look at, and rules that act like them.
+
+    Prices are read off the certificate of the bound. Inputs are integrated gradients of each agent's action; the
+    most important ones are held at their means, to see what becomes of λ̄. Rules are small decision trees, judged by
+    what they lose in the policy's place. Inputs and rules need the extra explain. `cirl report RUN --html` shows what
+    is found.
+    """
+    from cirl_marl.reasons.explaining import explain as explained
+    from cirl_marl.report.reasons import FOLDER, inputs_table, prices_table, write_reasons
+
+    is_run = (Path(source) / "config.json").is_file()
+    if out is None:
+        stem = "" if is_run else common.stem(load_network(source, scenario=scenario))
+        out = Path(source) / FOLDER if is_run else Path(f"reasons_{stem}")
+    folder = common.writable_folder(out, "--out")
+    asked: dict[str, Any] = {"min_service": min_service, "episodes": episodes, "seed": seed, "top": top}
+    with shares() as progress:
+        found = explained(
+            source,
+            parts=None if parts is None else common.listed(parts),
+            scenario=scenario,
+            leaves=leaves,
+            progress=progress,
+            **asked,
+        )
+    from cirl_marl.reasons.words import paragraphs
+
+    if found.prices is not None:
+        console.print(prices_table(found.prices))
+    if found.inputs:
+        console.print(inputs_table(found))
+    for heading, said in paragraphs(found):
+        say(f"\n{heading}")
+        for each in said:
+            say(f"  {each}")
+    for path in write_reasons(found, folder, parts=parts, leaves=leaves, **asked):
+        say(f"wrote {path}")

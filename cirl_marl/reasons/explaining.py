@@ -1,0 +1,168 @@
+"""Everything that can be said of why: shadow prices of a network, and what the policies of a run look at and do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.evaluation.comparison import part_of, starting_stocks
+from cirl_marl.evaluation.yardsticks import demanded
+from cirl_marl.learners.run import RunDirectory
+from cirl_marl.network import Floats, Network
+from cirl_marl.optimum import NoCertificate
+from cirl_marl.reasons import extras
+from cirl_marl.reasons.inputs import Inputs, inputs
+from cirl_marl.reasons.prices import ShadowPrices, shadow_prices
+from cirl_marl.reasons.rules import LEAVES, Rules, rules
+from cirl_marl.reasons.watching import Watching, played
+
+PARTS = ("prices", "inputs", "rules")
+"""What can be explained: of a network the first alone."""
+TOP = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Explanation:
+    """Reasons; what was not asked for, or cannot be had, is None.
+
+    Attributes:
+        network: under its scenario.
+        about: a run's directory, or the network's name.
+        checkpoint: of the run that acts; empty for a network.
+        episodes: in which policies were watched; 0 for a network.
+        prices: shadow prices.
+        no_prices: why there are none; empty if there are, or nobody asked.
+        inputs: what each agent looks at; empty if nobody asked.
+        rules: what each agent does, in rules.
+    """
+
+    network: Network
+    about: str
+    checkpoint: str = ""
+    episodes: int = 0
+    prices: ShadowPrices | None = None
+    no_prices: str = ""
+    inputs: tuple[Inputs, ...] = ()
+    rules: Rules | None = None
+
+
+def explain(
+    source: str | Path | RunDirectory | Network,
+    *,
+    parts: Sequence[str] | None = None,
+    scenario: str | None = None,
+    min_service: float | None = None,
+    episodes: int = 16,
+    seed: int = 0,
+    top: int = TOP,
+    leaves: int = LEAVES,
+    progress: Callable[[str, float], None] = lambda what, share: None,
+) -> Explanation:
+    """Explain a network, or what the policies of a run do in it.
+
+    Shadow prices are those of the best plan from the middle of the initial ranges; of a run, from the mean of the
+    starts of its episodes, and with the service that the policies deliver there.
+
+    Args:
+        source: run directory, or name, file or object of a network.
+        parts: some of PARTS; None: all that there are.
+        scenario: of a network's definition; a run has its own.
+        min_service: mean level demanded of every service; None: what the policies deliver, or 99 % of the highest.
+        episodes: fresh episodes of a run, at least 2.
+        seed: of these.
+        top: how many inputs of an agent are held together.
+        leaves: most leaves of a rule.
+        progress: called with what is being done and the share of all that is done.
+
+    Raises:
+        CirlError: for input that cannot be used, a missing extra, or a service out of reach.
+        RunError: if the run is incomplete, or its agents see anything but rows of numbers.
+    """
+    run = source if isinstance(source, RunDirectory) else None
+    if isinstance(source, str | Path) and (Path(source) / "config.json").is_file():
+        run = RunDirectory(source)
+    known = PARTS if run is not None else PARTS[:1]
+    for part in parts or ():
+        if part in PARTS and part not in known:
+            raise CirlError(f"explain {source}: {part} are those of policies, and a network has none; give a run")
+        if part not in known:
+            raise CirlError(f"explain: {unknown('part', part, known)}")
+    asked = known if parts is None else tuple(parts)
+    if run is None:
+        assert not isinstance(source, RunDirectory)
+        network = (load_network(source) if isinstance(source, str | Path) else source).scenario(scenario)
+        told = part_of(progress, "shadow prices", 0.0, 1.0)
+        return Explanation(
+            network=network,
+            about=network.name,
+            prices=shadow_prices(network, min_service=min_service, progress=told),
+        )
+    if scenario is not None:
+        raise CirlError(f"scenario '{scenario}' goes with a network; a run has its own")
+    return _of_run(run, asked, min_service, episodes, seed, top, leaves, progress)
+
+
+def _of_run(
+    run: RunDirectory,
+    asked: Sequence[str],
+    min_service: float | None,
+    episodes: int,
+    seed: int,
+    top: int,
+    leaves: int,
+    progress: Callable[[str, float], None],
+) -> Explanation:
+    if episodes < 2:
+        raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
+    if top < 1 or leaves < 2:
+        raise CirlError(f"top must be at least 1 and leaves at least 2, got {top} and {leaves}")
+    for part, extra in (("inputs", extras.captum), ("rules", extras.trees)):
+        if part in asked:
+            extra()
+    from cirl_marl.learners.trained import Trained  # it needs torch
+
+    policies, env, first = Trained(run), run.make_env(episodes, uncertain=False), first_seed(seed)
+    starts = starting_stocks(env, first)
+    watching = Watching(policies)
+    share = 1.0 / (1 + len(asked))
+    usual = played(env, watching, first, part_of(progress, "episodes", 0.0, share))
+    prices: ShadowPrices | None = None
+    looked: tuple[Inputs, ...] = ()
+    ruled: Rules | None = None
+    no_prices, done = "", share
+    if "prices" in asked:
+        level = demanded(usual.episode_levels.mean(axis=0)) if min_service is None else min_service
+        try:
+            prices = _prices(env, starts, level, part_of(progress, "shadow prices", done, share))
+        except NoCertificate as missing:
+            no_prices = str(missing)
+        done += share
+    if "inputs" in asked:
+        told = part_of(progress, "what agents look at", done, share)
+        looked = inputs(env, policies, Trained(run), watching.seen, usual, first, top=top, progress=told)
+        done += share
+    if "rules" in asked:
+        told = part_of(progress, "rules", done, share)
+        ruled = rules(env, policies, usual, first, leaves=leaves, progress=told)
+    return Explanation(
+        network=env.network,
+        about=str(run.path),
+        checkpoint=policies.checkpoint.name,
+        episodes=episodes,
+        prices=prices,
+        no_prices=no_prices,
+        inputs=looked,
+        rules=ruled,
+    )
+
+
+def _prices(env: VectorEnv, starts: Floats, level: float | Floats, progress: Callable[[float], None]) -> ShadowPrices:
+    mean = np.asarray(starts.mean(axis=0))
+    return shadow_prices(env.network, mean, min_service=level, agents=env.agents, progress=progress)

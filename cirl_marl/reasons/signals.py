@@ -1,0 +1,101 @@
+"""What agents see, with the units of what it stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.learners.views import View
+from cirl_marl.network import Integers, Network
+from cirl_marl.network.elements import Arc, Law, Node
+
+TIME = "time"
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """An entry of observations.
+
+    Attributes:
+        name: as ``VectorEnv.observation_names`` has it.
+        about: the compartment that it is about; empty for time, services and what models show.
+        scale: what it is multiplied by to be in its unit.
+        unit: of what it stands for.
+    """
+
+    name: str
+    about: str
+    scale: float
+    unit: str
+
+
+def signal(network: Network, name: str) -> Signal:
+    """Return what an entry of an observation stands for.
+
+    Observations are divided by the scale of their compartment; time is a share of the episode.
+    """
+    if name == TIME:
+        return Signal(name, "", network.episode.horizon * network.episode.control_interval, network.time_unit)
+    kind, _, about = name.rpartition(" on " if name.startswith("mass on ") else " of ")
+    compartment = network.compartments.get(about)
+    if compartment is None:
+        return Signal(name, "", 1.0, "1")
+    scale, rate = compartment.scale, f"{network.mass_unit}/{network.time_unit}"
+    is_batch = isinstance(compartment, Arc) and compartment.law is Law.BATCH
+    if kind == "flow" and is_batch:  # what it delivers in an interval is shown as a mass
+        return Signal(name, about, scale / network.episode.control_interval, rate)
+    stores = isinstance(compartment, Node) and compartment.stores
+    return Signal(name, about, scale, network.mass_unit if stores or is_batch else rate)
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """What stands in the row that a policy sees when it acts for one agent.
+
+    Attributes:
+        names: of the signals that stand in it, each once.
+        places: for each of them the columns of the row.
+        seen: for each of them an agent, and an entry of its observation, where it is found first.
+        entries: columns of the policy's output that are the agent's action.
+    """
+
+    names: tuple[str, ...]
+    places: tuple[Integers, ...]
+    seen: tuple[tuple[str, int], ...]
+    entries: Integers
+
+
+def columns(env: VectorEnv, view: View, agent: str) -> Columns:
+    """Return what stands where in the row in which a policy sees an agent.
+
+    Views are asked: they are shown numbers that no indicator and no padding has.
+    """
+    first, codes, known = 2, {}, list[tuple[str, int]]()
+    for each in view.agents:
+        count = len(env.observation_names[each])
+        codes[each] = np.arange(first, first + count, dtype=np.float64)[None]
+        known += [(each, entry) for entry in range(count)]
+        first += count
+    rows = np.asarray(view.rows(codes), dtype=np.float64)
+    row = rows[view.row_agents.index(agent)] if view.row_agents else rows[0]
+    found: dict[str, list[int]] = {}
+    seen: dict[str, tuple[str, int]] = {}
+    for column, code in enumerate(row.astype(int).tolist()):
+        if code >= 2:
+            whose, entry = known[code - 2]
+            name = env.observation_names[whose][entry]
+            found.setdefault(name, []).append(column)
+            seen.setdefault(name, (whose, entry))
+    outputs = int(view.action_space.shape[0])  # type: ignore[index]
+    acted = view.act(np.tile(np.arange(outputs, dtype=np.float64), (max(1, len(view.row_agents)), 1)))
+    places = tuple(np.array(each, dtype=np.intp) for each in found.values())
+    return Columns(tuple(found), places, tuple(seen.values()), np.asarray(acted[agent][0], dtype=np.intp))
+
+
+def entries_of(env: VectorEnv, agent: str, names: Sequence[str]) -> Integers:
+    """Return which entries of an agent's observation have these names."""
+    shown = env.observation_names[agent]
+    return np.array([i for i, name in enumerate(shown) if name in names], dtype=np.intp)
