@@ -35,6 +35,7 @@ from cirl_marl.network.series import Series
 
 if TYPE_CHECKING:
     from cirl_marl.learners.teams.team import Team, independent
+    from cirl_marl.reasons.aims import infer
     from cirl_marl.reasons.explaining import explain
 
 __version__ = "0.1.0"
@@ -67,6 +68,7 @@ __all__ = [
     "aec_env",
     "explain",
     "independent",
+    "infer",
     "load_network",
     "networks",
     "parallel_env",
@@ -83,6 +85,7 @@ LATE = {
     "Team": "cirl_marl.learners.teams.team",
     "explain": "cirl_marl.reasons.explaining",
     "independent": "cirl_marl.learners.teams.team",
+    "infer": "cirl_marl.reasons.aims",
 }
 """Where names are that are loaded when they are first asked for: what trains loads torch."""
 

@@ -1,4 +1,4 @@
-"""``cirl explain``: reasons for what is best, and for what agents do."""
+"""``cirl explain | infer``: reasons for what is best and for what agents do, and the aims behind plans."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from cirl_marl.cli import common
-from cirl_marl.cli.common import COMPARING, EpisodeCount, Scenario, Seed, app, console, say, shares
+from cirl_marl.cli.common import COMPARING, EpisodeCount, NetworkName, Scenario, Seed, app, console, say, shares
 from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.errors import CirlError
 
 
 @app.command(rich_help_panel=COMPARING)
@@ -76,3 +77,59 @@ def explain(
             say(f"  {each}")
     for path in write_reasons(found, folder, parts=parts, leaves=leaves, **asked):
         say(f"wrote {path}")
+
+
+@app.command(rich_help_panel=COMPARING)
+def infer(
+    network: NetworkName,
+    plans: Annotated[
+        list[str],
+        typer.Argument(metavar="PLAN...", help="CSV files of cirl plan or simulate, or training runs; one or several."),
+    ],
+    terms: Annotated[
+        str | None, typer.Option(help="Comma-separated, of circularity, services, set-points; default: all.")
+    ] = None,
+    within: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=0.99, help="How far from the best plans may be, as share of what there is to be had."
+        ),
+    ] = 0.01,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes that are taken of a run.")] = 4,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="With which cirl plan started; of a run, of its episodes.")
+    ] = None,
+    scenario: Scenario = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file to write.")] = None,
+) -> None:
+    """Find what plans aim at: the weights of circularity, services and set-points under which they are best.
+
+    Inverse linear programming with the rows of the bound: the weights that fit form a cone, which several plans narrow.
+    Weights are shares of all, each term measured by how much of it there is to be had.
+    """
+    from cirl_marl.reasons.aims import infer as inferred
+    from cirl_marl.reasons.terms import KINDS
+    from cirl_marl.report.aims import aims_sentences, aims_table, write_aims
+
+    if out is not None:
+        if out.suffix != ".csv":
+            raise CirlError(f"--out {out}: needs the name of a .csv file")
+        if out.is_dir():
+            raise CirlError(f"--out {out}: is a folder, not a file")
+        common.writable_folder(out.parent, "--out")
+    with common.bar("weighing") as progress:
+        found = inferred(
+            network,
+            plans,
+            kinds=KINDS if terms is None else common.listed(terms),
+            within=within,
+            scenario=scenario,
+            seed=seed,
+            episodes=episodes,
+            progress=progress,
+        )
+    console.print(aims_table(found))
+    for each in aims_sentences(found):
+        say(each)
+    if out is not None:
+        say(f"wrote {write_aims(found, out)}")

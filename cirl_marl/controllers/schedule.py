@@ -94,7 +94,7 @@ def schedule(
     columns = [
         (f"from ({network.time_unit})", ends - network.episode.control_interval),
         (f"to ({network.time_unit})", ends),
-        *zip(_controls(network, env.agents), values, strict=True),
+        *zip(control_names(network, env.agents), values, strict=True),
         *_throughputs(network, env.agents, run.flow.T),
         (f"circularity at the end ({network.mass_unit})", run.circularity[0]),
         (f"mean circularity ({network.mass_unit})", run.circularity_mean[0]),
@@ -104,7 +104,7 @@ def schedule(
     return Schedule(network, header, np.array(found), begun, run, usual, env.agents, start)
 
 
-def _controls(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
+def control_names(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
     """Yield what each entry of the actions sets, with its unit."""
     for agent in agents:
         compartment = network.compartments[agent]
