@@ -25,6 +25,8 @@ STATUS = tuple(highspy.HighsBasisStatus(i) for i in range(len(highspy.HighsBasis
 
 WARM_ITERATIONS = 2000
 """Simplex iterations from a given basis after which interior points, which need none, are the faster way."""
+PRIMAL = 4
+"""HiGHS's number of the primal simplex method."""
 NO_PLAN = (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible)
 """As every variable is bounded, the latter means the former."""
 SETTINGS: tuple[Mapping[str, str], ...] = (
@@ -87,17 +89,24 @@ class Solution:
 
 
 def solve(
-    problem: Program, basis: Basis | None = None, *, what: str = "the program", certified: bool = True
+    problem: Program,
+    basis: Basis | None = None,
+    *,
+    what: str = "the program",
+    certified: bool = True,
+    same_rows: bool = False,
 ) -> Solution:
     """Minimise cᵀv over the program.
 
-    From a basis the dual simplex method goes on; else ``SETTINGS`` are tried in turn. What counts is not what HiGHS
-    says of its answer but what its multipliers prove: any multipliers are a certificate, good ones a tight one.
+    From a basis the dual simplex method goes on, or the primal one, which is faster if the cost alone differs; else
+    ``SETTINGS`` are tried in turn. What counts is not what HiGHS says of its answer but what its multipliers prove: any
+    multipliers are a certificate, good ones a tight one.
 
     Args:
         problem: the program.
         basis: from which to start.
         what: is solved, for the message of an error.
+        same_rows: whether ``basis`` is of a program that differs in the cost alone.
         certified: whether multipliers must prove the answer good; else what HiGHS calls optimal is taken at its word,
             and of other answers that satisfy the rows the best.
 
@@ -108,7 +117,7 @@ def solve(
     name, found, best, status, refused = problem.layout.network.name, None, math.inf, "", False
     scaled = _Scaled(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
     for settings in (None, *SETTINGS) if basis is not None else SETTINGS:
-        highs = scaled.run(settings, basis if settings is None else None)
+        highs = scaled.run(settings, basis if settings is None else None, primal=same_rows)
         ended = highs.getModelStatus()
         status, refused = highs.modelStatusToString(ended), ended in NO_PLAN
         if refused and settings is not None and not certified:
@@ -165,8 +174,8 @@ class _Scaled:
         self._equal = len(problem.equal_to)
         self._to = np.concatenate([problem.equal_to, problem.under_to]) * self._row
 
-    def run(self, settings: Mapping[str, str] | None, basis: Basis | None) -> highspy.Highs:
-        """Return HiGHS after a run with ``settings``, or of the dual simplex method from ``basis``."""
+    def run(self, settings: Mapping[str, str] | None, basis: Basis | None, *, primal: bool = False) -> highspy.Highs:
+        """Return HiGHS after a run with ``settings``, or of the dual or ``primal`` simplex method from ``basis``."""
         highs = highspy.Highs()  # type: ignore[no-untyped-call]
         highs.setOptionValue("output_flag", False)
         for option, value in (settings or {"solver": "simplex"}).items():
@@ -174,6 +183,8 @@ class _Scaled:
         highs.passModel(self._model())
         if basis is not None:
             highs.setBasis(_highs_basis(basis))
+            if primal:
+                highs.setOptionValue("simplex_strategy", PRIMAL)
             highs.setOptionValue("simplex_iteration_limit", WARM_ITERATIONS)
         highs.run()
         return highs

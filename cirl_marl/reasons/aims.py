@@ -116,7 +116,7 @@ class _Plan:
     def against(self, weights: Floats) -> tuple[Floats, float]:
         """Return the terms of an episode that is best for weights, and what no episode exceeds."""
         problem = replace(self._problem, cost=-(weights @ self._columns))
-        solution = solve(problem, self._basis, what="the program of the best for some weights")
+        solution = solve(problem, self._basis, what="the program of the best for some weights", same_rows=True)
         self._basis = solution.basis or self._basis
         proof = verified(problem, solution.certificate, solution.plan)
         return self._columns @ solution.plan, proof.bound

@@ -31,7 +31,7 @@ LINES, BARS = 6, 8
 """Most stocks and bounds of controls in the picture."""
 WORTH_TELLING = 1e-3
 """Part of the largest price of its kind below which a price is left out on screen and in the picture."""
-OUTCOME = ("change of λ̄ ({})", "low", "high", "change of service (1)", "low", "high")
+OUTCOME = ("change of λ̄ ({})", "λ̄, low", "λ̄, high", "change of service (1)", "service, low", "service, high")
 Reasons = tuple[tuple[str, tuple[str, ...]], ...]
 """Headings with their sentences."""
 
