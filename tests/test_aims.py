@@ -36,7 +36,7 @@ from cirl_marl.optimum import Bound, NoCertificate, bound
 from cirl_marl.reasons.aims import Aims, infer
 from cirl_marl.reasons.courses import courses
 from cirl_marl.reasons.prices import shadow_prices
-from cirl_marl.reasons.terms import Course, terms
+from cirl_marl.reasons.terms import PlannedEpisode, terms
 from cirl_marl.report.aims import aims_sentences, write_aims
 from cirl_marl.report.trajectory import write_trajectory
 
@@ -58,9 +58,9 @@ def ladder(steps: int = 24, growth: float = 1.03, start: float = 1000.0, **arc: 
     )
 
 
-def course(found: Bound) -> Course:
+def course(found: Bound) -> PlannedEpisode:
     """Return the plan of the program itself."""
-    return Course("plan", found.initial, found.stock[1:], found.flow)
+    return PlannedEpisode("plan", found.initial, found.stock[1:], found.flow)
 
 
 def shares(found: Aims, weights: list[float]) -> Any:
@@ -122,7 +122,9 @@ def test_set_points_bend() -> None:
     network = replace(ladder(steps=4, set_point=5.0, scale=2.0), services=())
     flow = 3.0
     stock = np.cumsum(np.full(4, flow))
-    made = Course("by hand", np.array([1000.0, 0.0]), np.stack([1000 - stock, stock], axis=1), np.full((4, 1), flow))
+    made = PlannedEpisode(
+        "by hand", np.array([1000.0, 0.0]), np.stack([1000 - stock, stock], axis=1), np.full((4, 1), flow)
+    )
     found = infer(network, made, within=0.0)
     assert [each.kind for each in found.terms] == ["circularity", "set-points"]
     # 3 = 5 − w₁ · 4/(2 w₂), so w₂ = w₁
@@ -149,7 +151,7 @@ def test_a_poor_plan_is_far_from_the_best() -> None:
     flow = np.full((8, 1), 0.0)
     flow[-1] = network.held(network.services[0].low)[-1]  # it serves when that costs most
     stock = np.cumsum(flow[:, 0])
-    made = Course("late", np.array([1000.0, 0.0]), np.stack([1000 - stock, stock], axis=1), flow)
+    made = PlannedEpisode("late", np.array([1000.0, 0.0]), np.stack([1000 - stock, stock], axis=1), flow)
     found = infer(network, made, within=0.0)
 
     def short(share: float) -> float:

@@ -30,7 +30,7 @@ from cirl_marl.optimum.maximise import DEGREE
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Basis, solve
 from cirl_marl.reasons.courses import courses, setting
-from cirl_marl.reasons.terms import KINDS, Course, Term, terms
+from cirl_marl.reasons.terms import KINDS, PlannedEpisode, Term, terms
 
 WITHIN = 0.01
 ROUNDS = 200
@@ -100,10 +100,10 @@ class Aims:
         return [j for j in range(len(self.terms)) if self.high[j] - self.low[j] <= NARROW * middle[j]]
 
 
-class _Plan:
+class _WeighedPlan:
     """One plan, with the program of what could have been done from its start."""
 
-    def __init__(self, programs: Programs, weighed: Sequence[Term], course: Course) -> None:
+    def __init__(self, programs: Programs, weighed: Sequence[Term], course: PlannedEpisode) -> None:
         admissible = programs.admissible
         network, lifetimes = admissible.lifetimes.network, admissible.lifetimes
         steps = network.episode.horizon
@@ -124,7 +124,7 @@ class _Plan:
 
 def infer(
     network: str | Path | Network,
-    plans: Sequence[str | Path | Course] | str | Path | Course,
+    plans: Sequence[str | Path | PlannedEpisode] | str | Path | PlannedEpisode,
     *,
     kinds: Sequence[str] = KINDS,
     within: float = WITHIN,
@@ -156,18 +156,18 @@ def infer(
     if episodes < 1:
         raise CirlError(f"episodes must be at least 1, got {episodes}")
     known = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
-    given = [plans] if isinstance(plans, str | Path | Course) else list(plans)
+    given = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
     if not given:
         raise CirlError("infer: no plans were given")
     known, agents = setting(known, given)
     weighed = tuple(terms(known, kinds))
     programs = Programs(Admissible.of(known, agents), DEGREE, None)
-    every: list[Course] = []
+    every: list[PlannedEpisode] = []
     for each in given:
-        every += [each] if isinstance(each, Course) else courses(known, each, seed=seed, episodes=episodes)
+        every += [each] if isinstance(each, PlannedEpisode) else courses(known, each, seed=seed, episodes=episodes)
     for course in every:
         _check_shape(known, course)
-    cone = _Cone([_Plan(programs, weighed, course) for course in every], len(weighed), progress)
+    cone = _Cone([_WeighedPlan(programs, weighed, course) for course in every], len(weighed), progress)
     spread = cone.spread
     best, distance = cone.closest()
     allowed = distance + within
@@ -189,7 +189,7 @@ def infer(
     )
 
 
-def _check_shape(network: Network, course: Course) -> None:
+def _check_shape(network: Network, course: PlannedEpisode) -> None:
     steps = network.episode.horizon
     shapes = (steps, len(network.stores)), (steps, len(network.arcs))
     if (course.stock.shape, course.flow.shape) != shapes:
@@ -202,7 +202,7 @@ def _check_shape(network: Network, course: Course) -> None:
 class _Cone:
     """The inequalities that are known, and those that are yet to be found."""
 
-    def __init__(self, plans: Sequence[_Plan], count: int, progress: Callable[[float], None]) -> None:
+    def __init__(self, plans: Sequence[_WeighedPlan], count: int, progress: Callable[[float], None]) -> None:
         self._plans, self._count, self._progress = plans, count, progress
         self.solved = 0
         reached: list[tuple[int, Floats]] = []

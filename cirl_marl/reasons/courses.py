@@ -18,13 +18,13 @@ from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.bounds import by_stage
-from cirl_marl.reasons.terms import Course
+from cirl_marl.reasons.terms import PlannedEpisode
 
 ALIKE = 1e-4
 """Relative distance of circularities up to which an episode that is simulated again is the one in a table."""
 
 
-def courses(network: Network, plan: str | Path, *, seed: int | None = None, episodes: int = 4) -> list[Course]:
+def courses(network: Network, plan: str | Path, *, seed: int | None = None, episodes: int = 4) -> list[PlannedEpisode]:
     """Return the episodes of a plan.
 
     A table with stocks and flows, as ``cirl simulate`` writes it, is taken as it is. One with controls alone, as
@@ -109,7 +109,7 @@ def _column(path: Path, header: list[str], rows: list[list[str]], name: str, fir
     return np.array([_number(path, first + i + 2, name, row[place]) for i, row in enumerate(rows[first:])])
 
 
-def _of_trajectory(network: Network, path: Path, header: list[str], rows: list[list[str]]) -> Course:
+def _of_trajectory(network: Network, path: Path, header: list[str], rows: list[list[str]]) -> PlannedEpisode:
     mass, steps = network.mass_unit, network.episode.horizon
     rate = f"{mass}/{network.time_unit}"
     if len(rows) != steps + 1:
@@ -121,7 +121,7 @@ def _of_trajectory(network: Network, path: Path, header: list[str], rows: list[l
             raise CirlError(f"{path}: {unknown('column', each, sorted(known))} It is a plan of another network")
     stock = np.array([_column(path, header, rows, each) for each in wanted]).T
     flow = np.array([_column(path, header, rows, f"flow of {arc.id} ({rate})", 1) for arc in network.arcs]).T
-    return Course(str(path), by_stage(network, stock[0]), stock[1:], flow)
+    return PlannedEpisode(str(path), by_stage(network, stock[0]), stock[1:], flow)
 
 
 class _Given(Controller):
@@ -145,7 +145,9 @@ class _Given(Controller):
         return found
 
 
-def _of_controls(network: Network, path: Path, header: list[str], rows: list[list[str]], seed: int | None) -> Course:
+def _of_controls(
+    network: Network, path: Path, header: list[str], rows: list[list[str]], seed: int | None
+) -> PlannedEpisode:
     env = VectorEnv(network, num_envs=1)
     steps = network.episode.horizon
     if len(rows) != steps:
@@ -162,7 +164,7 @@ def _of_controls(network: Network, path: Path, header: list[str], rows: list[lis
             f"{path}: carried out from {begun.said} its mean circularity is {found.mean():.6g} {network.mass_unit}, but"
             f" the file says {told.mean():.6g}: it is of another start (--seed), scenario or definition"
         )
-    return Course(str(path), initial, run.stock, run.flow)
+    return PlannedEpisode(str(path), initial, run.stock, run.flow)
 
 
 def _stocks(env: VectorEnv) -> Floats:
@@ -171,7 +173,7 @@ def _stocks(env: VectorEnv) -> Floats:
     return found
 
 
-def _of_run(run: RunDirectory, seed: int, episodes: int) -> list[Course]:
+def _of_run(run: RunDirectory, seed: int, episodes: int) -> list[PlannedEpisode]:
     from cirl_marl.learners.trained import Trained  # it needs torch
 
     policies, env, found = Trained(run), run.make_env(1, uncertain=False), []
@@ -179,5 +181,5 @@ def _of_run(run: RunDirectory, seed: int, episodes: int) -> list[Course]:
         first = first_seed(seed) + episode
         env.reset(seed=first)
         initial, played = _stocks(env), rollout(env, policies, seed=first)
-        found.append(Course(f"{run.path}, episode {episode + 1}", initial, played.stock, played.flow))
+        found.append(PlannedEpisode(f"{run.path}, episode {episode + 1}", initial, played.stock, played.flow))
     return found

@@ -18,9 +18,9 @@ from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.reasons import extras
-from cirl_marl.reasons.inputs import Inputs, inputs
+from cirl_marl.reasons.inputs import AgentInputs, inputs
 from cirl_marl.reasons.prices import ShadowPrices, shadow_prices
-from cirl_marl.reasons.rules import LEAVES, Rules, rules
+from cirl_marl.reasons.rules import LEAVES, TeamRules, rules
 from cirl_marl.reasons.watching import Watching, played
 
 PARTS = ("prices", "inputs", "rules")
@@ -49,8 +49,8 @@ class Explanation:
     episodes: int = 0
     prices: ShadowPrices | None = None
     no_prices: str = ""
-    inputs: tuple[Inputs, ...] = ()
-    rules: Rules | None = None
+    inputs: tuple[AgentInputs, ...] = ()
+    rules: TeamRules | None = None
 
 
 def explain(
@@ -134,8 +134,8 @@ def _of_run(
     share = 1.0 / (1 + len(asked))
     usual = played(env, watching, first, part_of(progress, "episodes", 0.0, share))
     prices: ShadowPrices | None = None
-    looked: tuple[Inputs, ...] = ()
-    ruled: Rules | None = None
+    looked: tuple[AgentInputs, ...] = ()
+    ruled: TeamRules | None = None
     no_prices, done = "", share
     if "prices" in asked:
         level = demanded(usual.episode_levels.mean(axis=0)) if min_service is None else min_service

@@ -21,7 +21,7 @@ from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.network import Floats, Integers
 from cirl_marl.reasons.extras import captum
 from cirl_marl.reasons.signals import Signal, columns, entries_of, signal
-from cirl_marl.reasons.watching import Holding, Instead, Seen, played
+from cirl_marl.reasons.watching import Holding, Instead, SeenEpisodes, played
 
 SAMPLES = 512
 """Most decisions of an agent that are looked at."""
@@ -30,7 +30,7 @@ POINTS = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class Consequence:
     """How episodes differ from those of the policies from the same starts: means with 95 % intervals over episodes.
 
     Attributes:
@@ -45,7 +45,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Inputs:
+class AgentInputs:
     """What one agent looks at, first what counts most.
 
     Attributes:
@@ -66,13 +66,13 @@ class Inputs:
     slope: Floats
     missed: float
     top: int
-    top_held: Outcome
-    least_held: Outcome | None
+    top_held: Consequence
+    least_held: Consequence | None
 
 
-def compared(run: Rollout, usual: Rollout) -> Outcome:
+def compared(run: Rollout, usual: Rollout) -> Consequence:
     """Return how episodes differ from those to which they are compared, start by start."""
-    return Outcome(
+    return Consequence(
         circularity=over_episodes(run.episode_circularity - usual.episode_circularity),
         service=over_episodes(run.episode_service - usual.episode_service),
         usual=float(usual.episode_circularity.mean()),
@@ -83,13 +83,13 @@ def inputs(
     env: VectorEnv,
     policies: Policies,
     again: Policies,
-    seen: Seen,
+    seen: SeenEpisodes,
     usual: Rollout,
     seed: int,
     *,
     top: int = 3,
     progress: Callable[[float], None] = lambda share: None,
-) -> tuple[Inputs, ...]:
+) -> tuple[AgentInputs, ...]:
     """Attribute what each agent does to what it sees, and hold the inputs that count most.
 
     Args:
@@ -121,7 +121,7 @@ def inputs(
             outcomes.append(compared(run, usual) if names else None)
         assert outcomes[0] is not None
         found.append(
-            Inputs(
+            AgentInputs(
                 agent=agent,
                 signals=tuple(signal(env.network, where.names[i]) for i in order),
                 share=share[order],
@@ -136,12 +136,14 @@ def inputs(
     return tuple(found)
 
 
-def _means(env: VectorEnv, agent: str, names: list[str], seen: Seen) -> tuple[Integers, Floats]:
+def _means(env: VectorEnv, agent: str, names: list[str], seen: SeenEpisodes) -> tuple[Integers, Floats]:
     entries = entries_of(env, agent, names)
     return entries, seen.observations[agent].mean(axis=(0, 1))[entries]
 
 
-def _attributed(env: VectorEnv, name: str, policy: Policy, agent: str, seen: Seen) -> tuple[Floats, Floats, float]:
+def _attributed(
+    env: VectorEnv, name: str, policy: Policy, agent: str, seen: SeenEpisodes
+) -> tuple[Floats, Floats, float]:
     """Return shares, slopes and what is missed, for the signals of ``columns``."""
     import torch
 

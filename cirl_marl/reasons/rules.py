@@ -21,9 +21,9 @@ from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.learners.policies import Policies
 from cirl_marl.network import Floats
 from cirl_marl.reasons.extras import trees
-from cirl_marl.reasons.inputs import Outcome, compared
+from cirl_marl.reasons.inputs import Consequence, compared
 from cirl_marl.reasons.signals import Signal, columns, signal
-from cirl_marl.reasons.watching import Instead, Seen, Watching, played
+from cirl_marl.reasons.watching import Instead, SeenEpisodes, Watching, played
 
 LEAVES = 4
 ROUNDS = 2
@@ -74,11 +74,11 @@ class Rule:
     agent: str
     leaves: tuple[Leaf, ...]
     explained: float
-    cost: Outcome
+    cost: Consequence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Rules:
+class TeamRules:
     """The rules of all agents.
 
     Attributes:
@@ -87,7 +87,7 @@ class Rules:
     """
 
     rules: tuple[Rule, ...]
-    together: Outcome
+    together: Consequence
 
 
 class Tree(Controller):
@@ -118,7 +118,7 @@ def rules(
     *,
     leaves: int = LEAVES,
     progress: Callable[[float], None] = lambda share: None,
-) -> Rules:
+) -> TeamRules:
     """Distil the policies into rules, and let these act.
 
     Args:
@@ -137,7 +137,7 @@ def rules(
         policy = next(each for each in policies.policies.values() if agent in each.view.agents)
         where[agent] = columns(env, policy.view, agent)
     places = {agent: each.seen for agent, each in where.items()}
-    watched: list[Seen] = []
+    watched: list[SeenEpisodes] = []
     grown: dict[str, Any] = {}
     work = ROUNDS + 1 + len(env.agents) + 1
     for round_ in range(ROUNDS + 1):
@@ -162,10 +162,10 @@ def rules(
         progress((ROUNDS + 2 + a) / work)
     together = compared(played(env, tree, seed), usual)
     progress(1.0)
-    return Rules(rules=tuple(found), together=together)
+    return TeamRules(rules=tuple(found), together=together)
 
 
-def _table(agent: str, watched: Sequence[Seen], places: Sequence[tuple[str, int]]) -> tuple[Floats, Floats]:
+def _table(agent: str, watched: Sequence[SeenEpisodes], places: Sequence[tuple[str, int]]) -> tuple[Floats, Floats]:
     """Return all features that an agent saw, as trees keep them, and what its policy did."""
     features = [
         np.stack([each.observations[whose][:, :, entry].ravel() for whose, entry in places], axis=1) for each in watched
@@ -174,7 +174,7 @@ def _table(agent: str, watched: Sequence[Seen], places: Sequence[tuple[str, int]
     return np.concatenate(features).astype(np.float32), np.concatenate(actions)
 
 
-def _grown(agent: str, watched: Sequence[Seen], places: Sequence[tuple[str, int]], leaves: int) -> Any:
+def _grown(agent: str, watched: Sequence[SeenEpisodes], places: Sequence[tuple[str, int]], leaves: int) -> Any:
     features, actions = _table(agent, watched, places)
     variance = float(actions.var(axis=0).mean())
     tree = trees().DecisionTreeRegressor(
@@ -186,7 +186,7 @@ def _grown(agent: str, watched: Sequence[Seen], places: Sequence[tuple[str, int]
     return tree.fit(features, actions if actions.shape[1] > 1 else actions.ravel())
 
 
-def _explained(tree: Any, agent: str, places: Sequence[tuple[str, int]], watched: Sequence[Seen]) -> float:
+def _explained(tree: Any, agent: str, places: Sequence[tuple[str, int]], watched: Sequence[SeenEpisodes]) -> float:
     features, actions = _table(agent, watched, places)
     left = actions - tree.predict(features).reshape(actions.shape)
     variance = float(actions.var(axis=0).sum())
@@ -199,7 +199,7 @@ def _leaves(
     tree: Any,
     names: Sequence[str],
     places: Sequence[tuple[str, int]],
-    watched: Sequence[Seen],
+    watched: Sequence[SeenEpisodes],
 ) -> tuple[Leaf, ...]:
     features, _ = _table(agent, watched, places)
     steps = np.concatenate([np.repeat(np.arange(len(each.actions[agent])), env.num_envs) for each in watched])

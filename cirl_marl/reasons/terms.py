@@ -30,7 +30,7 @@ LOST = {
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class PlannedEpisode:
     """What became of a network in one episode.
 
     Attributes:
@@ -64,7 +64,7 @@ class Functional:
     level: Floats | None = None
     imbalance: Floats | None = None
 
-    def of(self, network: Network, course: Course) -> float:
+    def of(self, network: Network, course: PlannedEpisode) -> float:
         """Return what it is in an episode."""
         net = np.abs(course.flow @ network.circularity_weights[1])
         measured = (course.flow, course.stock, network.throughput(course.flow.T).T, levels(network, course), net)
@@ -107,7 +107,7 @@ class Term:
     about: str = ""
     roles: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def tangent(self, network: Network, course: Course) -> Functional:
+    def tangent(self, network: Network, course: PlannedEpisode) -> Functional:
         """Return the term, or its tangent at an episode."""
         steps = network.episode.horizon
         if self.kind == "services":
@@ -183,7 +183,7 @@ def _part(network: Network, arc: int) -> str:
     return LOST[next(role for role in LOST if role in (roles if network.sustainability[arc] > 0 else roles[::-1]))]
 
 
-def levels(network: Network, course: Course) -> Floats:
+def levels(network: Network, course: PlannedEpisode) -> Floats:
     """Return the level min(1, q/low) of each service in each interval, shape (steps, services)."""
     found = np.ones((len(course.flow), len(network.services)))
     for s, service in enumerate(network.services):

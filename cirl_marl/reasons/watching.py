@@ -17,7 +17,7 @@ from cirl_marl.network import Floats, Integers
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SeenEpisodes:
     """What agents saw, and what a teacher did there.
 
     Attributes:
@@ -65,10 +65,10 @@ class Watching(Controller):
         return actions if self.pupil is None else self.pupil.act(observations)
 
     @property
-    def seen(self) -> Seen:
+    def seen(self) -> SeenEpisodes:
         """What was seen and done in the last episodes."""
         agents = self._seen[0]
-        return Seen(
+        return SeenEpisodes(
             {agent: np.stack([each[agent] for each in self._seen]) for agent in agents},
             {agent: np.stack([each[agent] for each in self._done]) for agent in self._done[0]},
             {name: [each[name] for each in self._memories] for name in self.teacher.policies},

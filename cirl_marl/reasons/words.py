@@ -14,7 +14,7 @@ from cirl_marl.network import Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.network.elements import Arc, ControlKind
 from cirl_marl.reasons.explaining import Explanation
-from cirl_marl.reasons.inputs import Inputs, Outcome
+from cirl_marl.reasons.inputs import AgentInputs, Consequence
 from cirl_marl.reasons.prices import ShadowPrices
 from cirl_marl.reasons.rules import Condition, Leaf, Rule
 from cirl_marl.reasons.signals import TIME, Signal
@@ -80,7 +80,7 @@ def of_prices(found: ShadowPrices) -> list[str]:
     return said
 
 
-def of_inputs(network: Network, found: Inputs) -> str:
+def of_inputs(network: Network, found: AgentInputs) -> str:
     """Say what an agent looks at, and what becomes of λ̄ when it does not."""
     if not found.share.any():
         return f"*{name(network, found.agent)}* always does the same, whatever it sees."
@@ -182,7 +182,7 @@ def _of_donor(network: Network, agent: str) -> str:
     return f" of {network.compartments[compartment.donor].label}" if isinstance(compartment, Arc) else ""
 
 
-def changed(network: Network, found: Outcome) -> str:
+def changed(network: Network, found: Consequence) -> str:
     """Say how λ̄ and service differ, with 95 % intervals."""
     if found.usual == 0:
         by = _ranged(found.circularity, 1.0, network.mass_unit)

@@ -19,7 +19,7 @@ from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.reasons.explaining import Explanation
-from cirl_marl.reasons.inputs import Outcome
+from cirl_marl.reasons.inputs import Consequence
 from cirl_marl.reasons.prices import ShadowPrices
 from cirl_marl.reasons.words import conditions, does, moments, name, of_signal, paragraphs
 from cirl_marl.records.files import published, write_json, write_table
@@ -183,7 +183,7 @@ def _rules(found: Explanation) -> Iterator[list[object]]:
     yield ["all together", "", "", "", "", "", *_outcome(found.rules.together)]
 
 
-def _outcome(found: Outcome | None) -> list[str]:
+def _outcome(found: Consequence | None) -> list[str]:
     if found is None:
         return [""] * len(OUTCOME)
     ends = [end for each in (found.circularity, found.service) for end in (each.value, each.low, each.high)]
