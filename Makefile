@@ -4,11 +4,11 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo check test test-all written lint types wheel fast unit every fuzz kill study planner speed peers clean
+.PHONY: demo check test test-all docs notebooks written lint types wheel fast unit every fuzz kill study planner speed peers clean
 
-demo: $(VENV)/.runtime  ## train copper_net and draw what changed (within 5 minutes on 2 cores)
+demo: $(VENV)/.runtime  ## train copper_net, compare, open the report (within 5 minutes on 2 cores)
 	rm -rf runs/demo
-	$(BIN)/cirl train copper_net --steps 4000000 --seed 0 --out runs/demo
+	$(BIN)/cirl demo
 
 check: lint types fast  ## lint, types and the fast tests, in under 2 minutes on 2 cores
 
@@ -24,7 +24,7 @@ types: $(VENV)/.dev
 	$(BIN)/mypy
 
 # two workers have two cores
-fast unit every: export OMP_NUM_THREADS = 1
+fast unit every docs notebooks: export OMP_NUM_THREADS = 1
 
 fast: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 -m 'not slow and not medium' tests
@@ -32,7 +32,7 @@ fast: $(VENV)/.dev
 unit: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 -m 'not slow'
 
-every: $(VENV)/.dev
+every: $(VENV)/.dev $(VENV)/.docs
 	$(BIN)/python -m pytest -q -n 2 --hypothesis-profile=all
 
 wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clean environment
@@ -42,6 +42,12 @@ wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clea
 	$(PYTHON) -m venv build/clean
 	build/clean/bin/python -m pip install --disable-pip-version-check --quiet --no-compile -c constraints.txt dist/*.whl
 	$(PYTHON) tests/installed.py build/clean
+
+docs: $(VENV)/.docs  ## the documents as a site in build/site; what is broken or stale ends it (some minutes)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
+notebooks: $(VENV)/.docs  ## run the notebooks whose scripts have changed and keep what comes out (minutes each)
+	$(BIN)/python -m docs.site.notebooks
 
 written: $(VENV)/.runtime  ## the JSON schema of networks and docs/format.md, from the declarations of fields
 	$(BIN)/python -m cirl_marl.definitions.guide
@@ -74,6 +80,10 @@ $(VENV)/.runtime: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[dev,human,browser,explain]'
+	touch $@ $(VENV)/.runtime
+
+$(VENV)/.docs: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(PIP) install --quiet -c constraints.txt -e '.[docs]'
 	touch $@ $(VENV)/.runtime
 
 clean:  ## what these commands made, but for runs

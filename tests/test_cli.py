@@ -22,6 +22,7 @@ from small_networks import ONE_OF_EACH
 
 import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, VectorEnv, cli, learners
+from cirl_marl.cli import demonstration
 from cirl_marl.controllers.rollout import beginning, first_seed
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import write_network
@@ -79,6 +80,22 @@ def test_check_has_nothing_to_say_of_the_catalogue(
     printed = capsys.readouterr().out
     assert "no mistakes" in printed
     assert "remark" not in printed
+
+
+def test_check_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Scenario by scenario, file by file, up to all of it, whether or not there are mistakes."""
+    bottles()
+    Path("wrong.toml").write_text("name = 'wrong'")
+    told: list[float] = []
+
+    @contextmanager
+    def bar(what: str) -> Iterator[Callable[[float], None]]:
+        yield told.append
+
+    monkeypatch.setattr(cli.networks, "bar", bar)
+    assert run(monkeypatch, "check", "bottles.toml", "wrong.toml") == 2
+    assert told == [0.25, 0.5, 0.5, 1.0]  # two scenarios, then the file, then the one that cannot be read
+    assert "no mistakes" in capsys.readouterr().out
 
 
 def test_check_names_every_mistake(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -475,6 +492,55 @@ def test_train_evaluate_report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     names = [scene["name"] for scene in told["scenes"]]
     assert names == ["business as usual", "trained, independent ars", "plan of the bound"]
     assert told["scenes"][1]["figures"]["gap"][0] > 0 and "mean of 4 episodes" in told["scenes"][1]["about"]
+
+
+@pytest.mark.medium
+def test_demo_trains_compares_and_opens_its_report(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where there is a display, unless it is told not to; a second call trains nothing, another run is refused."""
+    bottles()
+    opened: list[str] = []
+
+    def open_(uri: str) -> bool:
+        opened.append(uri)
+        return True
+
+    monkeypatch.setattr("webbrowser.open", open_)
+    monkeypatch.setattr(demonstration, "NETWORK", "bottles.toml")
+    monkeypatch.setattr(demonstration, "COMPARED", 4)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert run(monkeypatch, "demo", "--steps", "2000") == 0
+    page = Path("runs/demo/report.html").resolve()
+    said = f"report: {page} (open it in a browser; it needs no server)"
+    assert said in " ".join(capsys.readouterr().out.split()) and opened == []
+    names = [scene["name"] for scene in shown(page.read_text(encoding="utf-8"))["scenes"]]
+    assert names == ["business as usual", "trained, independent ars", "plan of the bound"]
+    steps = RunDirectory(Path("runs/demo")).status["joint_steps"]
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert run(monkeypatch, "demo") == 0
+    printed = capsys.readouterr().out
+    assert opened == [page.as_uri()] and "open it in a browser" not in printed
+    assert "runs/demo is trained already" in printed
+    assert RunDirectory(Path("runs/demo")).status["joint_steps"] == steps
+    assert run(monkeypatch, "demo", "--no-open") == 0
+    assert len(opened) == 1 and "open it in a browser" in capsys.readouterr().out
+    monkeypatch.setattr(demonstration, "NETWORK", "copper_net")
+    assert run(monkeypatch, "demo") == 2
+    assert "is a run of independent_ars in bottles, not of the demo" in " ".join(capsys.readouterr().err.split())
+
+
+def test_demo_stopped_says_what_is_kept(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Ctrl-C ends it with 130."""
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cirl_marl.learners.completion.completed", stop)
+    assert run(monkeypatch, "demo") == 130
+    assert "stopped; nothing was learnt yet" in capsys.readouterr().out
 
 
 @pytest.mark.medium

@@ -305,7 +305,7 @@ def test_the_live_table_says_who_is_how_far(asked: Path) -> None:
     """Those at work first; gaps of those that are not done are only about right."""
     from rich.console import Console
 
-    from cirl_marl.cli.sweeping import ROWS, table_of
+    from cirl_marl.cli.sweeping import ROWS, share_done, table_of
 
     cell = cells_of(load_sweep(asked))[0]
     training = {"what": "training", "done": 80, "total": 160}
@@ -328,6 +328,8 @@ def test_the_live_table_says_who_is_how_far(asked: Path) -> None:
         ["second", "done", "160 of 160", "25.0%"],
     ]
     assert table_of(standings[:1] * (ROWS + 1)).row_count == ROWS + 1
+    assert [share_done(each) for each in standings] == [0.0, 1.0, 1.0, 0.5]
+    assert str(table_of(standings, 90.2).title).endswith("; about 0:01:30 left")
 
 
 def test_the_example_is_the_one_of_the_guide() -> None:

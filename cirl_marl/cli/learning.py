@@ -106,10 +106,10 @@ def train(
                 learners.train(str(network), recipe, seed=seed, directory=directories[0], **options)
         except KeyboardInterrupt:
             for directory in directories:
-                console.print(f"\nstopped; {_kept(directory)}", soft_wrap=True, highlight=False)
+                console.print(f"\nstopped; {what_is_kept(directory)}", soft_wrap=True, highlight=False)
             raise typer.Exit(130) from None
     for directory in directories:
-        _evaluate_and_draw(directory, episodes, 0)
+        evaluate_and_draw(directory, episodes, 0)
 
 
 def _directories(out: Path | None, network: str, recipe: str, seeds: Sequence[int]) -> list[Path]:
@@ -157,7 +157,7 @@ def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0, html: Html
 
     With --html the policies stand beside business as usual and the plan of the bound: as long as ``cirl evaluate``.
     """
-    _evaluate_and_draw(run, episodes, seed, page_for(html))
+    evaluate_and_draw(run, episodes, seed, page_for(html))
 
 
 @app.command(rich_help_panel=LEARNING)
@@ -249,7 +249,7 @@ def _only_resume(context: typer.Context) -> None:
         raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(given)}")
 
 
-def _kept(directory: Path) -> str:
+def what_is_kept(directory: Path) -> str:
     """Say what a training that was stopped has left."""
     from cirl_marl.learners.run import RunDirectory
 
@@ -269,7 +269,8 @@ def _say_shortages(rollouts: Mapping[str, Rollout], network: Network) -> None:
             say(f"{name}: {said}")
 
 
-def _evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | None = None) -> None:
+def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | None = None) -> None:
+    """Evaluate a run, say what came of it and draw its pictures; with ``page`` also hold it against the best."""
     from cirl_marl.learners.run import RunDirectory
     from cirl_marl.report.run import choice, draw_run, evaluate_run, evaluate_story
     from cirl_marl.report.tables import evaluation_table

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
 
-from cirl_marl.cli.common import NETWORKS, NetworkName, Scenario, StartSeed, app, console, errors, plain, say, stem
+from cirl_marl.cli.common import NETWORKS, NetworkName, Scenario, StartSeed, app, bar, console, errors, plain, say, stem
 from cirl_marl.controllers.rollout import beginning
 from cirl_marl.definitions.catalogue import families, load_network, recipes
 from cirl_marl.definitions.reading import Definition
@@ -26,10 +28,12 @@ def list_networks() -> None:
     """List the networks and the learner recipes of the catalogue."""
     from cirl_marl.report.tables import networks_table
 
-    found = {}
-    for family, names in families().items():
-        several = f"{family}_{{{', '.join(each.removeprefix(f'{family}_') for each in names)}}}"
-        found[names[0] if len(names) == 1 else several] = load_network(names[0])
+    found, known = {}, families()
+    with bar("reading") as progress:
+        for i, (family, names) in enumerate(known.items()):
+            several = f"{family}_{{{', '.join(each.removeprefix(f'{family}_') for each in names)}}}"
+            found[names[0] if len(names) == 1 else several] = load_network(names[0])
+            progress((i + 1) / len(known))
     console.print(networks_table(found))
     console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
@@ -113,20 +117,27 @@ def check(
 
     What is no mistake but seldom meant is said as a remark. Nothing is trained.
     """
-    faulty = False
-    for source in [each for given in sources for each in _with_regions(given)]:
-        try:
-            if _is_recipe(source):
-                _check_recipe(source, network)
-            elif network is None:
-                _check_network(source)
-            else:
-                raise CirlError(f"check {source}: is no recipe; --network names the network that recipes must fit")
-        except CirlError as error:
-            faulty = True
-            errors.print(plain(error), highlight=False, soft_wrap=True)
+    faulty, all_ = False, [each for given in sources for each in _with_regions(given)]
+    with bar("checking") as progress:
+        for i, source in enumerate(all_):
+            try:
+                if _is_recipe(source):
+                    _check_recipe(source, network)
+                elif network is None:
+                    _check_network(source, partial(_part, progress, i, len(all_)))
+                else:
+                    raise CirlError(f"check {source}: is no recipe; --network names the network that recipes must fit")
+            except CirlError as error:
+                faulty = True
+                errors.print(plain(error), highlight=False, soft_wrap=True)
+            progress((i + 1) / len(all_))
     if faulty:
         raise typer.Exit(2)
+
+
+def _part(progress: Callable[[float], None], place: int, count: int, share: float) -> None:
+    """Tell how far all is when one of several is done to a share."""
+    progress((place + share) / count)
 
 
 def _with_regions(source: str) -> list[str]:
@@ -173,15 +184,16 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
     return [where for where, learner in recipe.learners()[1:] if id(learner) not in busy]
 
 
-def _check_network(source: str) -> None:
+def _check_network(source: str, progress: Callable[[float], None]) -> None:
     from cirl_marl.controllers.remarks import remarks
 
     network = load_network(source)
     assert network.source is not None
     Definition(network.source).check(network.region)
-    for each in (network, *network.scenarios.values()):
+    for i, each in enumerate((network, *network.scenarios.values()), start=1):
         try:
             VectorEnv(each, num_envs=1)  # finds what only a network that is run says, as rates no solver can follow
+            progress(i / (1 + len(network.scenarios)))
         except CirlError as error:
             raise CirlError(f"{source}, scenario '{each.scenario_name}': {error}") from error
     say(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
+import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -106,8 +108,16 @@ def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStanding]], None]]
     """Live table of all cells; where nobody looks on, a line for each cell that begins or ends."""
     printer = errors if on_stderr else console
     if printer.is_terminal:
+        begun: list[tuple[float, float]] = []
+
+        def update(standings: Sequence[CellStanding]) -> None:
+            now = clock.monotonic(), sum(map(share_done, standings)) / len(standings)
+            if not begun:
+                begun.append(now)
+            live.update(table_of(standings, time_left(begun[0], now)), refresh=True)
+
         with Live(console=printer, transient=True, auto_refresh=False) as live:
-            yield lambda standings: live.update(table_of(standings), refresh=True)
+            yield update
         return
     before: dict[str, str] = {}
 
@@ -124,10 +134,32 @@ def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStanding]], None]]
     yield tell
 
 
-def table_of(standings: Sequence[CellStanding]) -> Table:
-    """Draw who is how far."""
+def share_done(each: CellStanding) -> float:
+    """Return the share of a cell's training that is done; what follows on it is short."""
+    what = str(each.standing.figures.get("what", ""))
+    if each.standing.state == "done" or what.startswith("evaluat"):
+        return 1.0
+    return each.standing.share if what == "training" else 0.0
+
+
+def time_left(begun: tuple[float, float], now: tuple[float, float]) -> float | None:
+    """Return the seconds that are left if all goes on as since ``begun``; each is a time and a share that is done.
+
+    None while nothing has been done since.
+
+    >>> time_left((0.0, 0.5), (60.0, 0.75))
+    60.0
+    """
+    done = now[1] - begun[1]
+    return (now[0] - begun[0]) * (1.0 - now[1]) / done if done > 0 else None
+
+
+def table_of(standings: Sequence[CellStanding], left: float | None = None) -> Table:
+    """Draw who is how far, and about how many seconds are left."""
     counts = {state: sum(each.standing.state == state for each in standings) for state in ORDER}
     title = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    if left:
+        title += f"; about {timedelta(seconds=round(left))} left"
     table = Table("cell", "state", "steps", "gap to the bound", title=title)
     ordered = sorted(standings, key=lambda each: ORDER.index(each.standing.state))
     for each in ordered[:ROWS]:

@@ -12,6 +12,9 @@ from cirl_marl.network import Network
 from cirl_marl.network.declared import itemised
 
 TABLES = ("nodes", "arcs", "services")
+SETTINGS = ("scales", "episode", "objective")
+ENDS = ("value", "low", "neutral", "high")
+"""What a quantity, a range and the span of a control consist of."""
 
 
 @itemised
@@ -19,8 +22,8 @@ TABLES = ("nodes", "arcs", "services")
 class Stated:
     """A number as its definition states it."""
 
-    key: Annotated[str, "dotted path within the compartment or service, such as ``rate`` or ``control``"]
-    value: Annotated[str, "what is stated, with its unit; empty for a series or a column of a file"]
+    key: Annotated[str, "dotted path within the compartment, service or file, such as ``rate`` or ``control``"]
+    value: Annotated[str, "what is stated, with its unit; of a series its ends, of a column its name and file"]
     source: Annotated[str, "where it comes from"]
 
 
@@ -32,31 +35,56 @@ def stated(network: Network) -> Mapping[str, Mapping[str, tuple[Stated, ...]]]:
     Raises:
         DefinitionError: if the file has changed since the network was read from it.
     """
+    document = _document(network)
+    return {table: {id_: tuple(_stated(each, "")) for id_, each in document.get(table, {}).items()} for table in TABLES}
+
+
+def stated_settings(network: Network) -> tuple[Stated, ...]:
+    """Return what the definition of ``network`` states of scales, episode and objective; see ``stated``."""
+    document = _document(network)
+    return tuple(each for table in SETTINGS for each in _stated(document.get(table), table))
+
+
+def _document(network: Network) -> Mapping[str, Any]:
     if network.source is None:
-        return {table: {} for table in TABLES}
+        return {}
     definition = Definition(network.source)
     if definition.sha256 != network.source_sha256:
         raise DefinitionError(str(network.source), ["has changed since it was read; what it says of sources is of now"])
-    document = definition.document(network.scenario_name)
-    return {
-        table: {id_: tuple(_stated(each, "", network.region)) for id_, each in document.get(table, {}).items()}
-        for table in TABLES
-    }
+    return definition.document(network.scenario_name)
 
 
-def _stated(value: Any, key: str, region: str) -> Iterator[Stated]:
+def _stated(value: Any, key: str) -> Iterator[Stated]:
     if not isinstance(value, Mapping):
         return
     if isinstance(source := value.get("source"), str):
         yield Stated(key, _said(value), source)
     for name, each in value.items():
-        yield from _stated(each, f"{key}.{name}".lstrip("."), region)
+        yield from _stated(each, f"{key}.{name}".lstrip("."))
 
 
 def _said(value: Mapping[str, Any]) -> str:
-    """Say a quantity, a range or the span of a control."""
-    numbers = [value[name] for name in ("value", "low", "neutral", "high") if isinstance(value.get(name), int | float)]
-    if not numbers:
-        return ""
+    """Say a quantity, a range, the span of a control, a lifetime, a series, a column of a file, or a model."""
+    ends = [value[name] for name in ENDS if name in value] or [value]
+    said = " – ".join(map(_end, ends))
+    if "mean" in value:
+        said = f"{value['distribution'].replace('_', ' ')} {value['mean']:g}"
     unit = value.get("unit", "")
-    return " – ".join(f"{each:g}" for each in numbers) + (f" {unit}" if unit not in ("", "1") else "")
+    said += f" {unit}" if said and unit not in ("", "1") else ""
+    if (spread := value.get("deviation")) is not None:
+        said += f" ± {spread if isinstance(spread, str) else f'{spread:g}'}"
+    times = [each["times"] for each in ends if isinstance(each, Mapping) and "times" in each]
+    return f"{said} ({times[-1][0]} to {times[-1][-1]})" if times else said
+
+
+def _end(value: Any) -> str:
+    """Say a number, or what stands for one that changes in time."""
+    if isinstance(value, int | float):
+        return f"{value:g}"
+    if not isinstance(value, Mapping):
+        return str(value)
+    if "file" in value:
+        return f"{value['column']} of {value['file']}"
+    if values := value.get("values", value.get("masses")):
+        return f"{values[0]:g} … {values[-1]:g}"
+    return str(value.get("kind", ""))

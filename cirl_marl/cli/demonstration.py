@@ -1,0 +1,81 @@
+"""``cirl demo``: a team trained, compared and shown in the browser, in a few minutes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cirl_marl.cli.common import LEARNING, app, folder_for, say, training_bar
+from cirl_marl.cli.learning import evaluate_and_draw, what_is_kept
+from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.errors import CirlError
+
+if TYPE_CHECKING:
+    from cirl_marl.learners.recipe import Recipe
+
+NETWORK, RECIPE, STEPS = "copper_net", "independent_ars", 4_000_000
+EVALUATIONS, EPISODES = 20, 256
+"""Of the training: fewer than the recipe's, which cost as much as a third of its steps."""
+COMPARED = 16
+"""Episodes in which the team is held against the bound."""
+PAGE = "report.html"
+
+
+@app.command(rich_help_panel=LEARNING)
+def demo(
+    out: Annotated[Path, typer.Option(help="Run directory; one of this demo is taken up where it was left.")] = Path(
+        "runs/demo"
+    ),
+    steps: Annotated[int, typer.Option(min=1, help="Environment steps of the training.")] = STEPS,
+    opens: Annotated[bool, typer.Option("--open/--no-open", help="Whether to open the report in the browser.")] = True,
+) -> None:
+    """Train the sixteen agents of the copper network for a few minutes, compare them, and open the report.
+
+    Ctrl-C saves what was learnt; the same command goes on. Without a display the path of the report is printed alone.
+    """
+    try:
+        _train(folder_for(out, "--out"), steps)
+    except KeyboardInterrupt:
+        say(f"\nstopped; {what_is_kept(out)}")
+        raise typer.Exit(130) from None
+    page = out / PAGE
+    evaluate_and_draw(out, COMPARED, 0, page)
+    shown = opens and has_display() and webbrowser.open(page.resolve().as_uri())
+    say(f"report: {page.resolve()}" + ("" if shown else "  (open it in a browser; it needs no server)"))
+
+
+def _train(out: Path, steps: int) -> None:
+    """Train the team, or what is left of that."""
+    from cirl_marl.learners.completion import completed
+    from cirl_marl.learners.run import RunDirectory
+
+    if (out / "config.json").is_file():
+        run = RunDirectory(out)
+        found = (run.network().name, run.config.recipe.name)
+        if found != (load_network(NETWORK).name, RECIPE):
+            raise CirlError(
+                f"--out {out}: is a run of {found[1]} in {found[0]}, not of the demo; choose another folder"
+            )
+        if run.status["state"] == "complete":
+            say(f"{out} is trained already; remove it to begin anew")
+    with training_bar() as report:
+        completed(out, NETWORK, _recipe(), steps=steps, seed=0, report=report)
+
+
+def _recipe() -> Recipe:
+    """Return the recipe with fewer evaluations."""
+    from cirl_marl.learners.recipe import load_recipe
+
+    recipe = load_recipe(RECIPE)
+    shorter = recipe.run.model_copy(update={"evaluations": EVALUATIONS, "episodes": EPISODES})
+    return recipe.model_copy(update={"run": shorter})
+
+
+def has_display() -> bool:
+    """Whether a window can be opened; a browser of the terminal is none."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

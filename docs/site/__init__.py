@@ -1,0 +1,1 @@
+"""The documents as a site: what its pages are made from, beside the documents themselves."""
