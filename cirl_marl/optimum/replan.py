@@ -12,16 +12,18 @@ from dataclasses import replace
 import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.network import Floats
 from cirl_marl.optimum.actions import normalised_actions
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import Bound
+from cirl_marl.optimum.layout import Layout
 from cirl_marl.optimum.merit import merit, prices
 from cirl_marl.optimum.plan import achieved
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Infeasible, Unsolved, solve
 
-ROUNDS = 3
-"""Most programs that are solved; the first holds the controls, the others make up for what is then lacking."""
+ROUNDS = 2
+"""Most programs that are solved."""
 DEGREE = 1
 """Degree of these programs, whatever that of the bound: they are solved several times."""
 KEPT = 1e-4
@@ -39,12 +41,12 @@ def replanned(
 
     Each round solves the program of the bound with controls that are constant within an interval to first order
     (``Programs``), which the simulator carries out more faithfully. Where an episode delivers less of a service than
-    its program promised, later rounds demand that much more: the lower end l of its band becomes
+    its program promised, the next one demands that much more: the lower end l of its band becomes
 
         l·(1 + Σ max(0, promised level − delivered level)),
 
-    summed over the rounds so far. The best episode counts, by the merit of ``improved``; rounds end when no service
-    lacks more than KEPT.
+    summed over the episodes so far, that of the bound's plan being the first. The best episode counts, by the merit of
+    ``improved``; rounds end when no service lacks more than KEPT.
 
     Args:
         bound: with the actions to start from.
@@ -54,7 +56,8 @@ def replanned(
     """
     admissible = Admissible.of(bound.network, bound.agents or None)
     charged, best, run = prices(bound), bound, achieved(bound)
-    reached, raised = merit(bound, run, charged), np.ones_like(admissible.served)
+    reached = merit(bound, run, charged)
+    raised = 1.0 + _lacking(bound.problem.layout, bound.solution, run, 1.0)
     for done in range(rounds):
         if enough(run):
             break
@@ -66,16 +69,24 @@ def replanned(
         except (Infeasible, Unsolved):  # more than can be had: what was found so far is the plan
             break
         layout = programs.layout
-        planned = planned.reshape(-1, layout.size)
-        candidate = replace(bound, actions=normalised_actions(asked, layout, planned))
+        candidate = replace(bound, actions=normalised_actions(asked, layout, planned.reshape(-1, layout.size)))
         tried = achieved(candidate)
         progress((done + 1) / rounds)
         if (worth := merit(bound, tried, charged)) > reached:
             best, run, reached = candidate, tried, worth
-        promised = np.minimum(planned[:, layout.level : layout.imbalance] * raised, 1.0)
-        lacking = np.maximum(promised - tried.levels[0].T, 0.0)
+        lacking = _lacking(layout, planned, tried, raised)
         if lacking.mean(axis=0).max(initial=0.0) <= KEPT:
             break
         raised += lacking
     progress(1.0)
     return best
+
+
+def _lacking(layout: Layout, planned: Floats, run: Rollout, raised: float | Floats) -> Floats:
+    """Return what an episode lacks of the levels that its program promised, shape (steps, services).
+
+    The program's levels are of bands that were ``raised``.
+    """
+    levels = planned.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
+    lacking: Floats = np.maximum(np.minimum(levels * raised, 1.0) - run.levels[0].T, 0.0)
+    return lacking
