@@ -2,11 +2,14 @@
 
 python -m benchmarks.steel_world           # writes envs/steel_world.csv and steel_world_rest.csv anew
 python -m benchmarks.steel_world --levers  # what single levers and countries bring, in docs/data.md
+python -m benchmarks.steel_world --plan    # bound and plan, and who brings how much of it, there (ten minutes)
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -22,7 +25,9 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.tables import read_flows
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Network
+from cirl_marl.optimum import achieved, bound, improved
+from cirl_marl.optimum.plan import Plan, Planned
 from cirl_marl.records.files import write_table
 
 GOODS = ("ore", "pig_iron", "dri", "scrap", "semis", "long", "flat", "goods")
@@ -40,7 +45,9 @@ LEVERS = {
 }
 """Levers that nothing speaks against, and the actions of their agents."""
 SHOWN = 8
-"""Countries that the table of levers has."""
+"""Countries that the tables of levers and of the plan have."""
+DEGREE = 1
+"""Of the test polynomials of the bound."""
 AT = {year: y for y, year in enumerate(YEARS)} | dict.fromkeys(FUTURE, len(YEARS))
 """Position of each year that files state."""
 
@@ -156,11 +163,82 @@ def lever_lines() -> Iterator[str]:
         yield f"| {rows[i][0]} | {reached[i]:.1f} | {gains[i]:+.1f} | {service[i]:.3f} |"
 
 
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A plan of which some agents do their part, while the others are neutral."""
+
+    network: Network
+    agents: tuple[str, ...]
+    initial: Floats
+    actions: Annotated[Floats, "normalised, shape (steps, entries)"]
+
+
+def gain_lines(plan: Planned) -> Iterator[str]:
+    """Yield the table of what the plan gains where one kind of agent, or one country, keeps to it, or all but these."""
+    network = plan.network
+    kinds = {agent: next(r for r in network.copies if agent.startswith(f"{r}_")) for agent in plan.agents}
+    levers = {agent: agent.removeprefix(f"{region}_") for agent, region in kinds.items()}
+    names = {region: region.replace("_", " ").title() for region in network.copies}
+    groups = {
+        f"`{lever}`, in all countries": [a for a in plan.agents if levers[a] == lever] for lever in levers.values()
+    }
+    countries_ = {f"all of {name}": [a for a in plan.agents if kinds[a] == region] for region, name in names.items()}
+    chosen = [[], list(plan.agents)]
+    for part in (*groups.values(), *countries_.values()):
+        chosen += [part, [agent for agent in plan.agents if agent not in part]]
+    env = VectorEnv(network, num_envs=len(chosen))
+    begun = beginning(env)
+    env.reset(seed=begun.seed, options={"initial_state": begun.given})
+    neutral = env.stack(env.neutral_action)[:, 0]
+    acts = np.array([[agent in part for agent in plan.agents] for part in chosen])
+    parts = [_Part(network, plan.agents, plan.initial, np.where(who, plan.actions, neutral)) for who in acts]
+    run = rollout(env, Plan(parts), seed=begun.seed, start=begun.given)
+    reached, service = run.episode_circularity / 1e3, run.episode_levels.min(axis=1)
+    gains = reached - reached[0]
+    yield "| who keeps to the plan | gain alone, Mt/a | lowest service | gain without them, Mt/a |"
+    yield "|-|-|-|-|"
+    yield f"| everybody | {gains[1]:+.1f} | {service[1]:.4f} | |"
+    rows = {name: 2 + 2 * i for i, name in enumerate((*groups, *countries_))}
+    best = sorted(countries_, key=lambda name: -gains[rows[name]])[:SHOWN]
+    for name in (*sorted(groups, key=lambda name: -gains[rows[name]]), *best):
+        i = rows[name]
+        yield f"| {name} | {gains[i]:+.1f} | {service[i]:.4f} | {gains[i + 1]:+.1f} |"
+
+
+def planned() -> tuple[Planned, Iterator[str]]:
+    """Return the plan of the world at full service, and the table that says how good it is."""
+    begun = time.process_time()
+    found = bound(load_network(ENVS / "steel_world.toml"), min_service=1.0, degree=DEGREE)
+    proved = found.verify().bound
+    solved = time.process_time()
+    plan = improved(found)
+    run = achieved(plan)
+    done = time.process_time()
+    reached, levels = float(run.episode_circularity[0]), run.episode_levels[0]
+    there = float(found.at(min_service=np.minimum(levels, 1.0)))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+    def lines() -> Iterator[str]:
+        yield "| bound, Mt | plan, Mt | gap | lowest service | gap at its services | bound, s | plan, s | memory, GB |"
+        yield "|-|-|-|-|-|-|-|-|"
+        gaps = f"{found.gap(reached):.2%} | {levels.min():.4f} | {(there - reached) / abs(there):.2%}"
+        spent = f"{solved - begun:.0f} | {done - begun:.0f} | {memory:.1f}"
+        yield f"| {proved / 1e3:.1f} | {reached / 1e3:.1f} | {gaps} | {spent} |"
+
+    return plan, lines()
+
+
 def main() -> None:
     """Write the data files, or the table of levers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--levers", action="store_true", help="write the table of levers instead")
-    if parser.parse_args().levers:
+    parser.add_argument("--plan", action="store_true", help="write the tables of the bound and its plan instead")
+    given = parser.parse_args()
+    if given.plan:
+        plan, lines = planned()
+        write_sections(steel.DOCUMENT, {"world_plan": "\n".join(lines), "world_gains": "\n".join(gain_lines(plan))})
+        return
+    if given.levers:
         write_sections(steel.DOCUMENT, {"levers": "\n".join(lever_lines())})
         return
     everyone = sorted(countries(read_flows(TABLE)), key=lambda each: each.name)

@@ -20,14 +20,16 @@ from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats
 from cirl_marl.optimum.bounds import Bound
+from cirl_marl.optimum.merit import demanded, merit, prices
 from cirl_marl.optimum.plan import achieved
 from cirl_marl.optimum.program import LinearProgram
+from cirl_marl.optimum.replan import replanned
 from cirl_marl.optimum.solver import best_values
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
-PENALTY = 3.0
-"""Price of what a service lacks in the merit, times the price that the bound puts on it."""
+MOST_SLOPES = 50_000_000
+"""Entries of the largest Jacobians of all intervals that are written, 0.4 GB."""
 TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions."""
 
@@ -43,7 +45,8 @@ def improved(
 
     The merit is the objective of the bound; what each service lacks of ``min_service`` is charged PENALTY times what
     the bound says it costs to provide. Local optimality is all that is sought; ``bound.gap`` says how much better any
-    plan could be.
+    plan could be. Of a network so large that its Jacobians would have more than MOST_SLOPES entries the plan is made by
+    ``replanned``, whatever ``rounds`` is.
 
     Args:
         bound: with the actions to start from.
@@ -51,51 +54,31 @@ def improved(
         enough: asked of each episode that is better than those before, whether to stop there.
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
-    prices = _prices(bound)
+    dynamics = Dynamics(bound.network)
+    inputs = dynamics.rows.nodes.stop + bound.actions.shape[1]
+    if bound.actions.shape[0] * inputs * (dynamics.rows.nodes.stop + len(bound.network.arcs)) > MOST_SLOPES:
+        return replanned(bound, enough=enough, progress=progress)
+    charged = prices(bound)
     best, run = bound, achieved(bound)
-    merit, trust, slopes = _merit(bound, run, prices), TRUST, None
+    reached, trust, slopes = merit(bound, run, charged), TRUST, None
     for done in range(rounds):
         if trust < SMALLEST or enough(run):
             break
         slopes = _jacobians(best) if slopes is None else slopes
-        step = _step(best, run, prices, trust, slopes)
+        step = _step(best, run, charged, trust, slopes)
         progress((done + 1) / rounds)
         if step is None:  # a smaller region is another program
             trust /= 4
             continue
         candidate = replace(best, actions=np.clip(best.actions + step, -1.0, 1.0))
         tried = achieved(candidate)
-        gained = _merit(bound, tried, prices) - merit
+        gained = merit(bound, tried, charged) - reached
         if gained > 0:
-            best, run, merit, trust, slopes = candidate, tried, merit + gained, min(1.0, 2 * trust), None
+            best, run, reached, trust, slopes = candidate, tried, reached + gained, min(1.0, 2 * trust), None
         else:
             trust /= 4
     progress(1.0)
     return best
-
-
-def _prices(bound: Bound) -> Floats:
-    """Return what the merit charges for a unit that each service lacks, which covers what the certificate asks for it.
-
-    Shape (services,); 0 if nothing is demanded.
-    """
-    services = len(bound.network.services)
-    if bound.min_service is None:
-        return np.zeros(services)
-    charged = -bound.certificate.under[len(bound.certificate.under) - services :]
-    return PENALTY * np.maximum(charged, bound.network.objective.circularity_scale)
-
-
-def _merit(bound: Bound, run: Rollout, prices: Floats) -> float:
-    circularity = float(run.episode_circularity[0])
-    if bound.service_weight is not None:
-        scale = bound.network.objective.circularity_scale
-        return circularity / scale + bound.service_weight * float(run.episode_service[0])
-    return circularity - float(prices @ np.maximum(0.0, _demanded(bound) - run.episode_levels[0]))
-
-
-def _demanded(bound: Bound) -> Floats:
-    return np.zeros(len(bound.network.services)) if bound.min_service is None else bound.min_service
 
 
 def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
@@ -144,7 +127,7 @@ def _path(bound: Bound, dynamics: Dynamics) -> Floats:
 
 
 def _step(
-    bound: Bound, run: Rollout, prices: Floats, trust: float, slopes: tuple[Floats, Floats, Floats]
+    bound: Bound, run: Rollout, charged: Floats, trust: float, slopes: tuple[Floats, Floats, Floats]
 ) -> Floats | None:
     """Return the best change of the actions within the trust region to first order, shape (steps, entries).
 
@@ -190,11 +173,11 @@ def _step(
     bounds[:, imbalance, 0] = 0.0
     low, high = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services, 1))]).T
     problem = LinearProgram(
-        cost=np.append(np.tile(_cost(bound, size, level, nodes), steps), prices),
+        cost=np.append(np.tile(_cost(bound, size, level, nodes), steps), charged),
         equal=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, services))], format="csr"),
         equal_to=np.zeros(steps * outputs),
         under=under,
-        under_to=np.append(limits.ravel(), -_demanded(bound)),
+        under_to=np.append(limits.ravel(), -demanded(bound)),
         low=low,
         high=high,
     )

@@ -21,7 +21,7 @@ from cirl_marl.optimum.objective import measures, objective
 from cirl_marl.optimum.reach import ComparisonSystem, Delayed, Reach
 from cirl_marl.optimum.rows import Chained, ProgramRows
 from cirl_marl.optimum.scheduled import deliveries, openings, orders
-from cirl_marl.optimum.settled import ends, settled
+from cirl_marl.optimum.settled import ends, has_fast, settled
 from cirl_marl.optimum.shared import followers, passing
 from cirl_marl.optimum.supplies import supplies
 from cirl_marl.optimum.vintages import Lifetimes
@@ -203,8 +203,10 @@ def _layout(admissible: Admissible, substeps: int, merged: bool | None, degree: 
     openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
     fine = Layout(network, pieces, pieces < substeps, False, degree, valves, openings)
-    if pieces > max(1, degree - 1) and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
-        return replace(fine, pieces=max(1, degree - 1), coarse=True, merged=True)
+    few = max(1, degree - 1)
+    if pieces > few and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
+        coarse = replace(fine, pieces=few, coarse=True)
+        return replace(coarse, merged=True) if merged or has_fast(admissible, coarse.length) else coarse
     return fine
 
 

@@ -34,6 +34,13 @@ WIDER, ROUND_OFF = 1.0 + 1e-9, 1e-12
 """Factor and allowance by which transients are widened; rounding errors are far smaller."""
 
 
+def has_fast(admissible: Admissible, length: float) -> bool:
+    """Return whether some stock counts as fast in pieces of a length, so that rows about it say something."""
+    stores = len(admissible.network.stores)
+    kinds = np.unique(admissible.kinds).tolist()
+    return any((admissible.exits(kind)[0, :stores] * length >= FAST[0]).any() for kind in kinds)
+
+
 def ends(admissible: Admissible, layout: Layout, step: int, equal: ProgramRows, under: ProgramRows) -> None:
     """Add the flow laws at the end of merged pieces; keys (3, piece, what, which, side)."""
     network, piece = admissible.network, np.arange(layout.pieces)[:, None]

@@ -6,8 +6,9 @@ References: Huangfu and Hall 2018, Mathematical Programming Computation 10, 119 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import highspy
 import numpy as np
@@ -29,9 +30,10 @@ PRIMAL = 4
 """HiGHS's number of the primal simplex method."""
 NO_PLAN = (highspy.HighsModelStatus.kInfeasible, highspy.HighsModelStatus.kUnboundedOrInfeasible)
 """As every variable is bounded, the latter means the former."""
-SETTINGS: tuple[Mapping[str, str], ...] = (
-    {"solver": "ipm"},
-    {"solver": "ipm", "run_crossover": "off"},
+HighsOptions = Mapping[str, str | float]
+SETTINGS: tuple[HighsOptions, ...] = (
+    {"solver": "ipx"},
+    {"solver": "ipx", "run_crossover": "off"},
     {"solver": "simplex", "presolve": "off"},
 )
 """Tried in turn, from nothing, until the certificate of an answer says that it is good.
@@ -39,10 +41,23 @@ SETTINGS: tuple[Mapping[str, str], ...] = (
 Crossover, which finds a basis for later programs, and presolve fail now and then: where residence times are a fraction
 of a control interval, rows fix a stock several times over. Interior points without them do not, and leave no basis.
 """
+EXTRA = "highspy_extras"
+"""Package that brings HiPO."""
+MANY = 100_000
+"""Variables from which on a program is large: crossover may then take hours."""
+FACTORED: tuple[HighsOptions, ...] = (
+    {"solver": "hipo", "run_crossover": "off", "kkt_tolerance": 1e-5},
+    {"solver": "ipx", "run_crossover": "off", "time_limit": 3600.0},
+)
+"""What is tried for it. HiPO, in a package of its own, factorises where the other interior points (IPX) look for a
+basis. Below that tolerance it stagnates, and goes on as IPX does.
+"""
 FEASIBLE = 1e-6
 """Largest amount by which the rows of a plan may be missed, relative to their largest term."""
 OPTIMAL = 1e-5
 """Relative distance of a plan from its certificate, up to which nothing else is tried."""
+NEAR = 2e-3
+"""The same for a large program."""
 USABLE = 1e-2
 """The same for the best answer of all, beyond which there is no bound."""
 
@@ -115,8 +130,9 @@ def solve(
         Unsolved: if HiGHS finds no usable answer; names the network, what was not solved, and HiGHS's status.
     """
     name, found, best, status, refused = problem.layout.network.name, None, math.inf, "", False
+    several = _settings(problem)
     scaled = _Scaled(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
-    for settings in (None, *SETTINGS) if basis is not None else SETTINGS:
+    for settings in (None, *several) if basis is not None else several:
         highs = scaled.run(settings, basis if settings is None else None, primal=same_rows)
         ended = highs.getModelStatus()
         status, refused = highs.modelStatusToString(ended), ended in NO_PLAN
@@ -130,12 +146,14 @@ def solve(
         distance = scaled.distance(problem, solution)
         if distance < best:
             found, best = solution, distance
-        if best <= OPTIMAL:
+        if best <= (OPTIMAL if several is SETTINGS else NEAR):
             break
     if found is None and refused:  # presolve errs now and then, so the last settings, without it, have the last word
         raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {what}")
     if found is None or (certified and best > USABLE):
-        raise Unsolved(f"network '{name}': HiGHS did not solve {what}: {status}")
+        missing = len(problem.cost) >= MANY and not find_spec(EXTRA)
+        advice = f"; of {len(problem.cost):,} variables HiPO may: pip install 'cirl-marl[large]'" if missing else ""
+        raise Unsolved(f"network '{name}': HiGHS did not solve {what}: {status}{advice}")
     return found
 
 
@@ -152,6 +170,13 @@ def best_values(problem: LinearProgram, size: Floats) -> Floats | None:
         if scaled.is_feasible(highs):
             return scaled.solution(highs).plan
     return None
+
+
+def _settings(problem: LinearProgram) -> Sequence[HighsOptions]:
+    """Return what is tried for a program; HiPO only where its package is installed, as HiGHS takes another one else."""
+    if len(problem.cost) < MANY:
+        return SETTINGS
+    return FACTORED if find_spec(EXTRA) else FACTORED[1:]
 
 
 class _Scaled:
@@ -174,7 +199,7 @@ class _Scaled:
         self._equal = len(problem.equal_to)
         self._to = np.concatenate([problem.equal_to, problem.under_to]) * self._row
 
-    def run(self, settings: Mapping[str, str] | None, basis: Basis | None, *, primal: bool = False) -> highspy.Highs:
+    def run(self, settings: HighsOptions | None, basis: Basis | None, *, primal: bool = False) -> highspy.Highs:
         """Return HiGHS after a run with ``settings``, or of the dual or ``primal`` simplex method from ``basis``."""
         highs = highspy.Highs()  # type: ignore[no-untyped-call]
         highs.setOptionValue("output_flag", False)

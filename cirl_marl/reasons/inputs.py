@@ -11,17 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
-from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.network import Floats, Integers
 from cirl_marl.reasons.extras import captum
 from cirl_marl.reasons.signals import Signal, columns, entries_of, signal
 from cirl_marl.reasons.watching import Holding, Instead, SeenEpisodes, played
+
+if TYPE_CHECKING:
+    from cirl_marl.learners.policies import Policies, Policy
 
 SAMPLES = 512
 """Most decisions of an agent that are looked at."""

@@ -11,19 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import VectorEnv
-from cirl_marl.learners.policies import Policies
 from cirl_marl.network import Floats
 from cirl_marl.reasons.extras import trees
 from cirl_marl.reasons.inputs import Consequence, compared
 from cirl_marl.reasons.signals import Signal, columns, signal
 from cirl_marl.reasons.watching import Instead, SeenEpisodes, Watching, played
+
+if TYPE_CHECKING:
+    from cirl_marl.learners.policies import Policies
 
 LEAVES = 4
 ROUNDS = 2

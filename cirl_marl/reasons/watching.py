@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,8 +12,10 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import VectorEnv
 from cirl_marl.errors import RunError
-from cirl_marl.learners.policies import Policies
 from cirl_marl.network import Floats, Integers
+
+if TYPE_CHECKING:
+    from cirl_marl.learners.policies import Policies
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,144 @@
+"""What large yearly networks cost: memory, a simulated year, the linear program of the bound; ``benchmarks/README.md``.
+
+python -m benchmarks.large              # networks of 1 386 to 100 800 arcs, and programs of the smaller ones
+python -m benchmarks.large --regions 33 --program    # one of them, here, as a line of JSON
+
+Each network is measured in a process of its own, so that peaks of memory are its own; times are processor time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.document import markdown_table, write_sections
+from benchmarks.generated import yearly_network
+from cirl_marl import VectorEnv
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.maximise import starting_stocks
+from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.solver import solve
+
+DOCUMENT = Path(__file__).parent / "README.md"
+REGIONS = (33, 120, 480, 2400)
+"""Regions of the networks that are simulated: each has 15 nodes and 42 arcs."""
+SOLVED = (8, 16, 33, 66, 120)
+"""Regions of those whose program is solved."""
+YEARS = 10
+"""Years that are timed."""
+
+
+def simulated(regions: int) -> dict[str, float]:
+    """Return what a network costs to make, to compile and to simulate."""
+    begun = time.process_time()
+    network = yearly_network(regions=regions)
+    made = time.process_time()
+    env = VectorEnv(network, num_envs=1)
+    env.reset(seed=0)
+    compiled = time.process_time()
+    actions = {agent: np.zeros((1, 1)) for agent in env.agents}
+    for _ in range(YEARS):
+        env.step(actions)
+    done = time.process_time()
+    return {
+        "arcs": len(network.arcs),
+        "nodes": len(network.nodes),
+        "made": made - begun,
+        "compiled": compiled - made,
+        "year": (done - compiled) / YEARS,
+        "memory": _peak(),
+    }
+
+
+def solved(regions: int) -> dict[str, float]:
+    """Return what the program of degree 1 for the bound on λ̄ costs to write and to solve."""
+    network = yearly_network(regions=regions)
+    begun = time.process_time()
+    admissible = Admissible.of(network, None)
+    program = Programs(admissible, 1, None).program(starting_stocks(network, None))
+    written = time.process_time()
+    memory = _peak()
+    solve(program)
+    done = time.process_time()
+    return {
+        "arcs": len(network.arcs),
+        "variables": len(program.cost),
+        "entries": program.equal.nnz + program.under.nnz,
+        "written": written - begun,
+        "written_memory": memory,
+        "solved": done - written,
+        "memory": _peak(),
+    }
+
+
+def _peak() -> float:
+    """Return the most memory that the process has had, GB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def _apart(regions: int, *options: str) -> dict[str, float]:
+    """Measure a network in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.large", "--regions", str(regions), *options]
+    found: dict[str, float] = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return found
+
+
+def simulation_table() -> str:
+    """Return the table of networks that are simulated."""
+    rows = []
+    for regions in REGIONS:
+        found = _apart(regions)
+        rows.append(
+            (
+                f"{found['arcs']:,.0f}",
+                f"{found['nodes']:,.0f}",
+                f"{found['made']:.1f}",
+                f"{found['compiled']:.1f}",
+                f"{1e3 * found['year']:.2g}",
+                f"{1e6 * found['year'] / found['arcs']:.2g}",
+                f"{found['memory']:.2g}",
+            )
+        )
+    return markdown_table(("arcs", "nodes", "made, s", "compiled, s", "a year, ms", "per arc, µs", "memory, GB"), rows)
+
+
+def program_table() -> str:
+    """Return the table of programs that are solved."""
+    rows = []
+    for regions in SOLVED:
+        found = _apart(regions, "--program")
+        rows.append(
+            (
+                f"{found['arcs']:,.0f}",
+                f"{found['variables']:,.0f}",
+                f"{found['entries']:,.0f}",
+                f"{found['written']:.1f}",
+                f"{found['solved']:.0f}",
+                f"{found['memory']:.2g}",
+            )
+        )
+    return markdown_table(("arcs", "variables", "entries", "written, s", "solved, s", "memory, GB"), rows)
+
+
+def main() -> None:
+    """Write the tables, or measure one network."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--regions", type=int, help="measure the network of so many regions alone")
+    parser.add_argument("--program", action="store_true", help="its program instead of its simulation")
+    given = parser.parse_args()
+    if given.regions is None:
+        write_sections(DOCUMENT, {"large": simulation_table(), "large_programs": program_table()})
+        return
+    found = solved(given.regions) if given.program else simulated(given.regions)
+    sys.stdout.write(json.dumps(found) + "\n")
+
+
+if __name__ == "__main__":
+    main()

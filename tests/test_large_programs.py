@@ -1,0 +1,94 @@
+"""Programs and plans of large networks: fewer pieces, other interior points, plans without Jacobians."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from cirl_marl import load_network
+from cirl_marl.optimum import achieved, bound, improve, improved, program, routes, solver
+from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.merit import merit, prices
+
+
+@pytest.mark.parametrize(("scenario", "merged"), [(None, False), ("longer_lives", True)])
+def test_pieces_are_merged_where_stocks_are_fast(
+    scenario: str | None, merged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A large program has one piece a year; rows about its end only if stages of lifetimes turn over in it."""
+    admissible = Admissible.of(load_network("steel_japan", scenario=scenario))
+    fine = program._layout(admissible, 2, False, 1)
+    monkeypatch.setattr(program, "LARGE", 0)
+    layout = program._layout(admissible, 2, None, 1)
+    assert (fine.pieces, layout.pieces, layout.coarse, layout.merged) == (2, 1, True, merged)
+
+
+@pytest.mark.medium
+def test_coarse_pieces_bound_what_the_simulator_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bound is above its plan in the simulator, and near it."""
+    monkeypatch.setattr(program, "LARGE", 0)
+    found = bound("steel_japan", min_service=1.0, degree=1, horizon=6)
+    assert found.problem.layout.coarse and not found.problem.layout.merged
+    run = achieved(found)
+    assert run.episode_levels.min() > 0.999
+    assert 0 < found.gap(run.episode_circularity[0]) < 0.02
+
+
+def test_least_arrivals_are_below_those_of_the_inverse() -> None:
+    """They are (I − P)⁻¹ R to rounding, never more, also where a loop keeps nearly all of what is in it."""
+    random = np.random.default_rng(0)
+    for kept in (0.5, 1 - 1e-6):
+        shares = random.dirichlet(np.ones(6), size=6)
+        passed, arriving = kept * shares, (1 - kept) * random.dirichlet(np.ones(2), size=6)
+        visits = np.full(6, 1 / (1 - kept))
+        found = routes._least(sparse.csc_array(passed), arriving, visits)
+        # all arrives somewhere, so that both stocks together get 1
+        assert (found.sum(axis=1) <= 1.0).all()
+        assert found.sum(axis=1) == pytest.approx(np.ones(6), abs=1e-7)
+        assert found == pytest.approx(np.linalg.inv(np.eye(6) - passed) @ arriving, abs=1e-7)
+
+
+def test_hipo_proves_the_bound_that_the_others_prove(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large program is solved by HiPO, whose multipliers prove as much."""
+    pytest.importorskip("highspy_extras")
+    usual = bound("copper_net", min_service=0.9, degree=1, horizon=40)
+    monkeypatch.setattr(solver, "MANY", 0)
+    tried, run = list[solver.HighsOptions | None](), solver._Scaled.run
+
+    def noted(scaled: Any, options: solver.HighsOptions | None, basis: Any) -> Any:
+        tried.append(options)
+        return run(scaled, options, basis)
+
+    monkeypatch.setattr(solver._Scaled, "run", noted)
+    found = bound("copper_net", min_service=0.9, degree=1, horizon=40)
+    assert tried == [solver.FACTORED[0]]
+    assert found.basis is None
+    assert found.verify().bound == pytest.approx(usual.objective, rel=solver.NEAR)
+
+
+def test_without_hipo_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other interior points are tried for an hour; an error then names the extra."""
+    hurried = ({**solver.FACTORED[0]}, {**solver.FACTORED[1], "time_limit": 0.0})
+    monkeypatch.setattr(solver, "MANY", 0)
+    monkeypatch.setattr(solver, "FACTORED", hurried)
+    monkeypatch.setattr(solver, "find_spec", lambda name: None)
+    with pytest.raises(solver.Unsolved, match=r"'copper_net'.*pip install 'cirl-marl\[large\]'"):
+        bound("copper_net", min_service=0.9, degree=1, horizon=40)
+
+
+@pytest.mark.medium
+def test_plans_of_large_networks_make_up_for_what_lacked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without any Jacobian the plan serves more than that of the bound, and is worth more by the same merit."""
+    found = bound("copper_net", min_service=1.0, degree=1, horizon=40)
+    monkeypatch.setattr(improve, "MOST_SLOPES", 0)
+    monkeypatch.setattr(improve, "_jacobians", None)
+    better = improved(found)
+    before, after = achieved(found), achieved(better)
+    assert better.objective == found.objective
+    lacking = [1.0 - float(run.episode_levels.min()) for run in (before, after)]
+    assert lacking[0] > 5e-4 and lacking[1] < 1e-4
+    charged = prices(found)
+    assert merit(found, after, charged) > merit(found, before, charged)
