@@ -58,9 +58,9 @@ def test_hipo_proves_the_bound_that_the_others_prove(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(solver, "MANY", 0)
     tried, run = list[solver.HighsOptions | None](), solver._Scaled.run
 
-    def noted(scaled: Any, options: solver.HighsOptions | None, basis: Any) -> Any:
+    def noted(scaled: Any, options: solver.HighsOptions | None, basis: Any, **others: Any) -> Any:
         tried.append(options)
-        return run(scaled, options, basis)
+        return run(scaled, options, basis, **others)
 
     monkeypatch.setattr(solver._Scaled, "run", noted)
     found = bound("copper_net", min_service=0.9, degree=1, horizon=40)

@@ -121,8 +121,8 @@ def test_the_first_settings_may_lie(monkeypatch: pytest.MonkeyPatch) -> None:
     network = yearly(0.5, horizon=3)
     usual, run = bound(network).objective, solver._Scaled.run
 
-    def lying(self: solver._Scaled, settings: Any, basis: Any) -> highspy.Highs:
-        highs = run(self, settings, basis)
+    def lying(self: solver._Scaled, settings: Any, basis: Any, **options: Any) -> highspy.Highs:
+        highs = run(self, settings, basis, **options)
         if (settings or {}).get("presolve") != "off":
             highs.clearSolver()
             monkeypatch.setattr(highspy.Highs, "getModelStatus", lambda _: highspy.HighsModelStatus.kInfeasible)
