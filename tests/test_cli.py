@@ -731,6 +731,7 @@ def test_improvement_that_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert "service level" in capsys.readouterr().out and Path("p.csv").is_file()
 
 
+@pytest.mark.slow
 def test_scenarios_write_files_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Names carry network, scenario and control, of a simulation as of a plan."""
     monkeypatch.chdir(tmp_path)

@@ -299,7 +299,7 @@ def test_recipe_in_the_guide_is_valid(tmp_path: Path) -> None:
     assert added[0].start is not None and added[1].algorithm == "TQC"
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_examples_run() -> None:
     """Each example runs to its end."""
     examples = sorted((ROOT / "examples").glob("*.py"))

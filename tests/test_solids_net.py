@@ -243,6 +243,7 @@ print("the same", len(states))
 """
 
 
+@pytest.mark.slow
 @both
 def test_snapshot_in_the_middle_of_an_attempt(scenario: str, tmp_path: Path) -> None:
     """From there all comes again bit for bit, MuJoCo included: here, in a fresh environment, in another process."""

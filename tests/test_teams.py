@@ -402,7 +402,7 @@ def test_a_team_is_kept_and_goes_on(tmp_path: Path) -> None:
         Team.load(tmp_path / "nothing", make)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_a_model_by_itself_needs_nothing_of_ours(tmp_path: Path) -> None:
     """Even of an agent that was absent at times, ``save`` writes what Stable-Baselines3 alone reads."""
     lengths = iter([7, 5])

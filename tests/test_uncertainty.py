@@ -384,6 +384,7 @@ def test_no_draw_exceeds_what_arrays_are_made_for() -> None:
     np.testing.assert_array_equal(drawn(network, factors[:, 7].tolist()).initial, network.initial)
 
 
+@pytest.mark.slow
 def test_an_episode_is_held_against_what_it_drew(tmp_path: Path) -> None:
     """Everyone meets the same draws; the bound is that of a network with these numbers, for the service delivered."""
     network = load_network(EXAMPLE).with_options(episode={"horizon": 4})
