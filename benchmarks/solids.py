@@ -2,6 +2,7 @@
 
 python -m benchmarks.solids             # scripts that wait in each attempt
 python -m benchmarks.solids RUN [RUN …]  # whom a run has acts as it learnt, the others by script
+python -m benchmarks.solids RUN --carry 0.4  # and the robot carries what it holds at 0.4 of its speed
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ WAITS = ((0, 0), (0, 10), (0, 28), (28, 28), (50, 50))
 """Steps that the robot waits in each attempt at an item of the first and of the second batch."""
 SECOND_BATCH = 200
 """Interval in which the second batch leaves the reservoir: after 8 s of 0.04 s each."""
+WITHIN_GRIP = 0.03
+"""Distance from the gripper, m, within which an item is held once the gripper closes."""
 REST = np.array([0.0, 0.0, 0.0, 1.0])
 """Action of the robot that moves nothing and keeps the gripper open."""
 
@@ -60,13 +63,14 @@ class Episodes:
 
 def main(
     runs: Annotated[list[Path] | None, typer.Argument(help="Runs in solids_net; default: scripts that wait.")] = None,
+    carry: Annotated[float, typer.Option(min=0.0, max=1.0, help="Part of its speed at which the robot carries.")] = 1.0,
 ) -> None:
     """Play episodes and print what came of them: a row for each run, and what they have in common."""
     if not runs:
         for waits in WAITS:
             typer.echo(f"waits {waits}: {played(partial(_waiting, waits))}")
         return
-    found = [played(_learnt(run)) for run in runs]
+    found = [played(_carrying(_learnt(run), carry)) for run in runs]
     for run, each in zip(runs, found, strict=True):
         typer.echo(f"{run.name}: {each}")
     if len(found) > 1:
@@ -111,6 +115,23 @@ def _learnt(run: Path) -> Act:
     env = directory.make_env(1)
     policies = {group.name: _policy(learnt(directory.chosen, group, env)) for group in directory.groups()}
     return lambda _env, _t, seen, _script: {agent: act(seen[agent]) for agent, act in policies.items()}
+
+
+def _carrying(act: Act, speed: float) -> Act:
+    """Return ``act`` with a robot that moves at a part of its speed while it holds an item."""
+
+    def slowly(env: VectorEnv, t: int, seen: Actions, script: Actions) -> Actions:
+        actions = act(env, t, seen, script)
+        if "sorter" not in actions or speed == 1.0:
+            return actions
+        names = env.layout.names["sorter"]
+        from_grip = seen["sorter"][:, [names.index(f"sorter.object_from_grip_{axis}") for axis in "xyz"]]
+        moved = np.clip(actions["sorter"], -1.0, 1.0)
+        held = (moved[:, 3] < 0) & (np.linalg.norm(from_grip, axis=1) < WITHIN_GRIP)
+        moved[held, :3] *= speed
+        return actions | {"sorter": moved}
+
+    return slowly
 
 
 def _policy(learner: Learner) -> Callable[[NDArray[np.floating]], NDArray[np.floating]]:
