@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -222,6 +223,9 @@ def test_the_same_agents_of_all_copies_share_a_policy(folder: Path) -> None:
         "shared-learner-landed": ("landed",),
         "shared-learner-port": ("port",),
     }
+    sunk = next(arc for arc in found.arcs if arc.id == "sunk")
+    named = replace(found, arcs=(*(arc for arc in found.arcs if arc is not sunk), replace(sunk, id="china_sunk")))
+    assert named.counterpart("china_sunk") is None and named.counterpart("china_ore") == "ore"
     with pytest.raises(RecipeError, match="among: copies, but network 'ores' is not made of copies"):
         recipe("joint").groups(load_network(written(folder, definition())), ["mine"])
     with pytest.raises(RecipeError, match="among: copies is for the schemes shared and joint"):
