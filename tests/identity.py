@@ -5,30 +5,33 @@
 
 Simulated CSV files, batched episodes, bounds, plans, trained weights and compared figures of the catalogue, bit for
 bit. The hashes are those of one machine: another processor or another BLAS rounds differently.
+
+Numbers are hashed apart from the keys under which they stand: a key of ``infos`` may be renamed (``RENAMED``) or come
+newly (``ADDED``), a tensor of a checkpoint or a column of a table may get another name, and the numbers must still be
+the same bits.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import hashlib
-import io
 import json
 import sys
 import tempfile
-import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from safetensors.numpy import load_file
 
 import cirl_marl
-from cirl_marl import learners, optimum
-from cirl_marl.cli import app
 
 CONTROLS = ("neutral", "random", "scripted")
 TRAININGS = {
+    "independent_ars": ("copper_net", 64_000),
     "independent_ppo": ("copper_net", 4096),
     "independent_a2c": ("net_zero", 640),
     "independent_sac": ("carbo_net", 400),
@@ -41,22 +44,76 @@ TRAININGS = {
 }
 """Recipe → network and environment steps."""
 
+RENAMED: dict[str, str] = {}
+"""Keys of ``infos`` that had another name before: old → new."""
+ADDED: frozenset[str] = frozenset()
+"""Keys of ``infos`` that came newly."""
+
+
+def named(*places: str) -> Any:
+    """Return the first of ``module:name`` that there is, the present place first and former ones after it."""
+    for place in places:
+        module, _, name = place.partition(":")
+        try:
+            return getattr(import_module(module), name)
+        except (ImportError, AttributeError):
+            continue
+    raise ImportError(f"none of {', '.join(places)}")
+
+
+app = named("cirl_marl.cli:app")
+bound = named("cirl_marl:bound", "cirl_marl.optimum:bound")
+improved = named("cirl_marl.optimum:improved")
+search = named("cirl_marl.optimum:search")
+train = named("cirl_marl:train", "cirl_marl.learners:train")
+
 
 def digest(*parts: Any) -> str:
-    """Return the hash of arrays, texts, numbers and nested containers of them."""
-    found = hashlib.sha256()
+    """Return the hash of arrays, texts, numbers and nested containers of them; a mapping counts by its values.
+
+    Raises:
+        ValueError: if there is nothing to hash.
+    """
+    if not parts:
+        raise ValueError("nothing to hash: a hash of nothing never differs")
+    state = hashlib.sha256()
     for part in parts:
-        if isinstance(part, dict):
-            found.update(digest(*[each for pair in sorted(part.items()) for each in pair]).encode())
+        if isinstance(part, Mapping):
+            state.update(digest(*part.values()).encode() if part else b"{}")
         elif isinstance(part, list | tuple):
-            found.update(digest(*part).encode())
-        elif isinstance(part, torch.Tensor):
-            found.update(part.detach().cpu().contiguous().numpy().tobytes())
+            state.update(digest(*part).encode() if part else b"[]")
         elif isinstance(part, str | bytes):
-            found.update(part.encode() if isinstance(part, str) else part)
+            state.update(part.encode() if isinstance(part, str) else part)
         else:
-            found.update(np.ascontiguousarray(part).tobytes())
-    return found.hexdigest()[:16]
+            array = np.ascontiguousarray(part)
+            if array.dtype == object:
+                raise TypeError(f"no numbers: {type(part).__name__}")
+            state.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    return state.hexdigest()[:16]
+
+
+def digest_of_table(path: Path) -> str:
+    """Return the hash of the columns of a CSV file, whatever they are called."""
+    header, *rows = csv.reader(path.read_text(encoding="utf-8").splitlines())
+    if not rows:
+        raise ValueError(f"{path}: {len(header)} columns and no row")
+    return digest(*zip(*rows, strict=True))
+
+
+def digest_of_tensors(paths: Iterable[Path]) -> str:
+    """Return the hash of all tensors in these safetensors files, whatever they are called and in whichever order."""
+    return digest(*sorted(digest(tensor) for path in paths for tensor in load_file(path).values()))
+
+
+def by_key(infos: Iterable[Mapping[str, Mapping[str, Any]]]) -> Iterator[tuple[str, str]]:
+    """Yield for each key of ``infos`` of several steps, agent → key → value, the hash of all that stood under it."""
+    values: dict[str, list[Any]] = {}
+    for step in infos:
+        for of_agent in step.values():
+            for key, value in of_agent.items():
+                values.setdefault(key, []).append(value)
+    for key, parts in values.items():
+        yield key, digest(*parts)
 
 
 def simulated(folder: Path) -> Iterator[tuple[str, str]]:
@@ -65,19 +122,19 @@ def simulated(folder: Path) -> Iterator[tuple[str, str]]:
         for scenario in ("default", *cirl_marl.load_network(name).scenarios):
             for control in CONTROLS:
                 out = folder / scenario / control
-                asked = ["simulate", name, "--control", control, "--steps", "12", "--out", str(out), "--seed", "3"]
-                app([*asked, "--scenario", scenario], standalone_mode=False)
-                (csv,) = out.glob(f"{name}*.csv")
-                yield f"simulate {name} {scenario} {control}", digest(csv.read_bytes())
+                words = ["simulate", name, "--control", control, "--steps", "12", "--out", str(out), "--seed", "3"]
+                app([*words, "--scenario", scenario], standalone_mode=False)
+                tables = sorted(out.glob(f"{name}*.csv"))  # the episode, and the ages of what has a lifetime
+                yield f"simulate {name} {scenario} {control}", digest(*map(digest_of_table, tables))
     for name, control, *more in (
         ("copper_net", "lqr", "--scenario", "paper"),
         ("copper_net", "optimum"),
         ("carbo_net", "mpc"),
     ):
-        asked = ["simulate", name, "--control", control, "--steps", "4", "--out", str(folder / "by"), *more]
-        app(asked, standalone_mode=False)
-        (csv,) = (folder / "by").glob(f"{name}*{control}*.csv")
-        yield f"simulate {name} {control}", digest(csv.read_bytes())
+        words = ["simulate", name, "--control", control, "--steps", "4", "--out", str(folder / "by"), *more]
+        app(words, standalone_mode=False)
+        (table,) = (folder / "by").glob(f"{name}*{control}*.csv")
+        yield f"simulate {name} {control}", digest_of_table(table)
 
 
 def stepped() -> Iterator[tuple[str, str]]:
@@ -87,24 +144,30 @@ def stepped() -> Iterator[tuple[str, str]]:
             for reward in ("local", "circularity", "mixed", "difference", "mixed_difference", "local_sum", "team"):
                 env = cirl_marl.vector_env(name, num_envs=7, scenario=scenario, reward=reward, horizon=5)
                 random = np.random.default_rng(1)
-                seen: list[Any] = [env.reset(seed=11)]
+                shown: list[Any] = [env.reset(seed=11)]
+                infos = []
                 for _ in range(7):
                     actions = {a: random.uniform(-1, 1, (7, *s.shape)) for a, s in env.action_spaces.items()}
-                    seen += env.step(actions)
-                yield f"step {name} {scenario} {reward}", digest(seen, env.state(), env.local_rewards())
+                    *outcome, info = env.step(actions)
+                    shown += outcome
+                    infos.append(info)
+                what = f"step {name} {scenario} {reward}"
+                yield what, digest(*shown, env.state(), env.local_rewards())
+                for key, hash_ in by_key(infos):
+                    yield f"{what} infos {key}", hash_
 
 
 def bounded() -> Iterator[tuple[str, str]]:
     """Yield bounds with their multipliers and plans, and the plans of searches."""
     for name in ("copper_net", "carbo_net"):
-        asked: tuple[dict[str, Any], ...] = ({}, {"min_service": 0.97}, {"service_weight": 3.0})
-        for options in asked:
-            found = optimum.bound(name, horizon=6, **options)
-            better = optimum.improved(found, rounds=2)
-            proof = [found.certificate.equal, found.certificate.under, found.verify().bound]
-            yield f"bound {name} {options}", digest(found.objective, proof, found.actions, better.actions)
+        settings: tuple[dict[str, Any], ...] = ({}, {"min_service": 0.97}, {"service_weight": 3.0})
+        for options in settings:
+            proven = bound(name, horizon=6, **options)
+            better = improved(proven, rounds=2)
+            proof = [proven.certificate.equal, proven.certificate.under, proven.verify().bound]
+            yield f"bound {name} {options}", digest(proven.objective, proof, proven.actions, better.actions)
     for name in ("solids_net", "net_zero"):
-        plan = optimum.search(name, horizon=8, knots=2, population=8, iterations=3)
+        plan = search(name, horizon=8, knots=2, population=8, iterations=3)
         yield f"search {name}", digest(plan.circularity, plan.service, plan.actions)
 
 
@@ -112,16 +175,29 @@ def trained(folder: Path) -> Iterator[tuple[str, str]]:
     """Yield the weights of every learner of short trainings, and the figures of a comparison."""
     for recipe, (network, steps) in TRAININGS.items():
         run = folder / recipe
-        learners.train(network, recipe, directory=run, steps=steps, seed=5)
-        weights = {}
-        for saved in sorted(run.glob("checkpoints/*/*.zip")):
-            with zipfile.ZipFile(saved) as archive:
-                weights[saved.stem] = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True)
-        yield f"train {recipe} {network}", digest(weights)
-    asked = ["compare", str(folder / "joint_ppo"), "--episodes", "2", "--out", str(folder / "compared")]
-    app([*asked, "--controllers", "neutral,random"], standalone_mode=False)
-    text = (folder / "compared" / "summary.csv").read_bytes()
-    yield "compare joint_ppo", digest(text)
+        train(network, recipe, directory=run, steps=steps, seed=5)
+        policies = [path for path in run.glob("checkpoints/*/*.safetensors") if path.name.count(".") == 1]
+        yield f"train {recipe} {network}", digest_of_tensors(policies)
+        yield f"train {recipe} {network} evaluations", digest_of_table(run / "evaluations.csv")
+    words = ["compare", str(folder / "joint_ppo"), "--episodes", "2", "--out", str(folder / "compared")]
+    app([*words, "--controllers", "neutral,random"], standalone_mode=False)
+    yield "compare joint_ppo", digest_of_table(folder / "compared" / "summary.csv")
+
+
+def renamed(hashes: Mapping[str, str]) -> dict[str, str]:
+    """Return hashes of an earlier run with the present names of the keys of ``infos``."""
+    result = {}
+    for what, hash_ in hashes.items():
+        step, infos, key = what.partition(" infos ")
+        result[step + infos + RENAMED.get(key, key)] = hash_
+    return result
+
+
+def differences(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
+    """Return what differs, is missing or came newly, but for the listed exceptions."""
+    expected = renamed(before)
+    other = [what for what in expected.keys() | after.keys() if expected.get(what) != after.get(what)]
+    return sorted(what for what in other if what in expected or what.partition(" infos ")[2] not in ADDED)
 
 
 def main() -> None:
@@ -129,15 +205,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("out", type=Path, help="JSON file to write")
     parser.add_argument("--against", type=Path, help="JSON file of another run; exit code 1 if anything differs")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         parts = (simulated(Path(folder)), stepped(), bounded(), trained(Path(folder)))
-        found = {what: hash_ for part in parts for what, hash_ in part}
-    asked.out.write_text(json.dumps(found, indent=1) + "\n")
-    sys.stderr.write(f"{len(found)} hashes in {asked.out}\n")
-    if asked.against is not None:
-        before = json.loads(asked.against.read_text())
-        other = sorted(what for what in before.keys() | found.keys() if before.get(what) != found.get(what))
+        hashes = {what: hash_ for part in parts for what, hash_ in part}
+    arguments.out.write_text(json.dumps(hashes, indent=1) + "\n")
+    sys.stderr.write(f"{len(hashes)} hashes in {arguments.out}\n")
+    if arguments.against is not None:
+        other = differences(json.loads(arguments.against.read_text()), hashes)
         sys.stderr.write("".join(f"differs: {what}\n" for what in other) + f"{len(other)} differ\n")
         sys.exit(bool(other))
 
