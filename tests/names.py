@@ -17,29 +17,35 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PRONOUNS = frozenset(
-    "each every everyone everybody everything other others another one ones it its this that these those them they he "
-    "she we us you me who whose whom which what whatever any anyone anything all some someone something none nobody "
-    "nothing both either neither same such own ours theirs yours mine many few several here there where when how why".split()
+    (
+        "each every everyone everybody everything other others another one ones it its this that these those "
+        "them they he she we us you me who whose whom which what whatever any anyone anything all some "
+        "someone something none nobody nothing both either neither same such own ours theirs yours mine many "
+        "few several here there where when how why"
+    ).split()
 )
 IRREGULAR = frozenset(
-    "found told said known given asked taken made kept left held seen shown done gone begun chosen written drawn meant "
-    "grown lost met paid sent spent got gotten built brought bought caught fed felt fought forgotten frozen heard hidden "
-    "laid led lent lain born borne broken driven eaten fallen flown forbidden risen run-down sold sought spoken stolen "
-    "sworn taught thought thrown torn understood woken worn woven won wound split-off stood struck stuck swept swung "
-    "told-off unmet undone unknown unseen withheld withdrawn bound-to been had become come overcome proven sawn sewn "
-    "shaken shut sunk sung slept swum dealt dug bent bitten blown bred cast clung crept hung hurt knelt leant learnt "
-    "lit mown overrun rid ridden rung shed shone shot shrunk slain slid slung sown sped spelt spilt spun sprung stung "
-    "strewn striven swollen wept wrung awoken beaten burnt chidden outdone overdone overseen paid-off redone rewritten "
-    "unsaid untold upheld".split()
+    (
+        "found told said known given asked taken made kept left held seen shown done gone begun chosen "
+        "written drawn meant grown lost met paid sent spent got gotten built brought bought caught fed felt "
+        "fought forgotten frozen heard hidden laid led lent lain born borne broken driven eaten fallen flown "
+        "forbidden risen sold sought spoken stolen sworn taught thought thrown torn understood woken worn "
+        "woven won wound stood struck stuck swept swung unmet undone unknown unseen withheld withdrawn been "
+        "had become come overcome proven sawn sewn shaken shut sunk sung slept swum dealt dug bent bitten "
+        "blown bred cast clung crept hung hurt knelt leant learnt lit mown overrun rid ridden rung shed shone "
+        "shot shrunk slain slid slung sown sped spelt spilt spun sprung stung strewn striven swollen wept "
+        "wrung awoken beaten burnt chidden outdone overdone overseen redone rewritten unsaid untold upheld"
+    ).split()
 )
+# verbs, nouns and terms of the field that end as participles do
 NO_PARTICIPLES = frozenset(
-    "seed speed need needs feed bed breed embed exceed proceed succeed red shed sled weed deed indeed "
-    # nouns and terms of the field that end as participles do
-    "truncated terminated string ring thing things king spring training padding rounding timing setting spacing heading "
-    "mapping encoding scoring pricing sampling scaling mixing recycling drawing ordering indexing logging "
-    "rendering warning sing bring routing testing importing starting-point pickling processing swing wing evening "
-    "morning ceiling bearing lighting housing meaning reading writing finding "
-    "embedding".split()
+    (
+        "seed speed need needs feed bed breed embed exceed proceed succeed red shed sled weed deed indeed "
+        "truncated terminated string ring thing things king spring training padding rounding timing setting "
+        "spacing heading mapping encoding scoring pricing sampling scaling mixing recycling drawing ordering "
+        "indexing logging rendering warning sing bring routing testing importing pickling processing swing "
+        "wing evening morning ceiling bearing lighting housing meaning reading writing finding embedding"
+    ).split()
 )
 TERMS = frozenset({"done", "dones"})
 """Participles that Gymnasium and Stable-Baselines3 made names of arrays."""
@@ -71,7 +77,7 @@ def is_filler(name: str) -> bool:
 
 
 def fillers(folder: Path) -> tuple[int, list[tuple[str, Path, int, bool]]]:
-    """Return how many bindings the modules of a folder have, and which of them are fillers: name, file, line, header."""
+    """Return how many bindings the modules of a folder have, and the fillers among them: name, file, line, header."""
     count, places = 0, []
     for path in sorted(folder.rglob("*.py")):
         for name, line, header in bindings(ast.parse(path.read_text(encoding="utf-8"))):
