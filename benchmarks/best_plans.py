@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cirl_marl import CirlError, Network, VectorEnv, load_network, networks
+from cirl_marl import CirlError, MultiAgentVectorEnv, Network, load_network, networks
 from cirl_marl.controllers.rollout import beginning
 from cirl_marl.controllers.schedule import Schedule, schedule
 from cirl_marl.definitions.writing import fingerprint
@@ -107,7 +107,7 @@ def replayed(kept: BestPlan) -> Schedule:
 
 
 def _episode(network: Network, actions: Mapping[str, list[list[float]]]) -> Schedule:
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     beginning(env, None).reset(env)
     rows = np.concatenate([np.array(actions[agent]) for agent in env.agents], axis=1)
     return schedule(env, Plan(KeptActions(env.network, env.agents, starting_states(env)[0], rows)))
@@ -120,7 +120,7 @@ def best_plan(name: str) -> BestPlan:
         CirlError: if none of the levels ``DEMANDED`` can be had, or a solver fails.
     """
     network = load_network(name)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     begun = beginning(env, None)
     begun.reset(env)
     proved, reason, level = None, "", SEARCHED
@@ -153,7 +153,7 @@ def best_plan(name: str) -> BestPlan:
     )
 
 
-def _entries(env: VectorEnv) -> dict[str, slice]:
+def _entries(env: MultiAgentVectorEnv) -> dict[str, slice]:
     """Return the entries of each agent among those of all."""
     sizes = [int(env.action_spaces[agent].shape[0]) for agent in env.agents]
     ends = np.cumsum(sizes).tolist()

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from benchmarks.document import made_with, write_sections
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.evaluation.comparison import starting_stocks
@@ -144,7 +144,7 @@ def _sections() -> dict[str, Section]:
 
 def _starts(name: str) -> Rows:
     """Hold what a few solutions prove from drawn starts against what a program solved for each start proves."""
-    starts = starting_stocks(VectorEnv(name, num_envs=STARTS), EVALUATION_SEEDS)
+    starts = starting_stocks(MultiAgentVectorEnv(name, num_envs=STARTS), EVALUATION_SEEDS)
     members = envelope(name, starts, solves=SOLVES, min_service=SERVICE, degree=1).members
     best = np.array([bound(name, start, min_service=SERVICE, degree=1, near=members[0]).objective for start in starts])
     for count in range(1, SOLVES + 1):
@@ -188,7 +188,7 @@ def _price(name: str) -> Rows:
 
 def _search(name: str) -> Rows:
     """Hold the search from the first evaluated episode against the bound of degree 2 from there."""
-    start = starting_stocks(VectorEnv(name, num_envs=1), EVALUATION_SEEDS)[0]
+    start = starting_stocks(MultiAgentVectorEnv(name, num_envs=1), EVALUATION_SEEDS)[0]
     proved = bound(name, start, min_service=SERVICE, degree=2)
     shown = [f"{proved.objective:.5g} {proved.network.mass_unit}", _achieved(improved(proved))]
     for population, iterations in ((64, 30), (64, 150), (256, 300)):
@@ -236,7 +236,7 @@ def _merit(found: Incumbent, circularity: float, service: float, weight: float |
 
 def _mpc(name: str, horizon: int | None) -> Rows:
     """Run MPC from drawn starts, or with horizon 0 the open-loop plans, and hold it against the bound of degree 2."""
-    env = VectorEnv(name, num_envs=EPISODES)
+    env = MultiAgentVectorEnv(name, num_envs=EPISODES)
     starts = starting_stocks(env, EVALUATION_SEEDS)
     began = time.process_time()
     if horizon == 0:

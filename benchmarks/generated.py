@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from cirl_marl.environments.vector import Infos, VectorEnv
+from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.recipe import Recipe
@@ -149,7 +149,7 @@ def simple_spread(copies: int, agents: int) -> Callable[[], object] | None:
     return lambda: env.step(actions)
 
 
-class FreeEnv(VectorEnv):
+class FreeEnv(MultiAgentVectorEnv):
     """Agents, spaces and episode length of a network, but nothing is simulated: outcomes were drawn beforehand.
 
     No agent's outcome depends on any action, so a learner meets the same steps here as in its ``lone_seat``.

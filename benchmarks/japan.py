@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.document import write_sections
-from cirl_marl import VectorEnv, load_network
+from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import Rollout, beginning, rollout
 from cirl_marl.evaluation import Comparison, compare
@@ -37,7 +37,7 @@ class Levers:
     def __init__(self, plan: Bound) -> None:
         """Take the actions of ``plan``, and those while nobody acts."""
         self.plan, self.network = plan, plan.network
-        env = VectorEnv(self.network, num_envs=1)
+        env = MultiAgentVectorEnv(self.network, num_envs=1)
         named = {self.network.compartments[agent].label: (agent,) for agent in env.agents}
         together = {agent for agents in TOGETHER.values() for agent in agents}
         self.agents = {name: agents for name, agents in named.items() if not together & {*agents}} | TOGETHER
@@ -97,7 +97,7 @@ def _value(run: Rollout, usual: float) -> float:
 def lives() -> Iterator[str]:
     """Yield what longer lives are worth, by themselves and on top of what agents do until then."""
     network = load_network(NAME, scenario="longer_lives")
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     begun = beginning(env)
     neutral = {agent: float(action[0, 0]) for agent, action in env.neutral_action.items()}
     usual = rollout(env, Neutral(), seed=begun.seed, start=begun.given)

@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.document import markdown_table, write_sections
 from benchmarks.generated import yearly_network
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.maximise import starting_stocks
 from cirl_marl.optimum.program import Programs
@@ -40,7 +40,7 @@ def simulated(regions: int) -> dict[str, float]:
     begun = time.process_time()
     network = yearly_network(regions=regions)
     made = time.process_time()
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     compiled = time.process_time()
     actions = {agent: np.zeros((1, 1)) for agent in env.agents}

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.controllers.scripted import Scripted
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import over_episodes, over_seeds
 from cirl_marl.learners.learner import Learner, learnt
 from cirl_marl.learners.run import RunDirectory
@@ -37,7 +37,7 @@ REST = np.array([0.0, 0.0, 0.0, 1.0])
 """Action of the robot that moves nothing and keeps the gripper open."""
 
 Actions = dict[str, NDArray[np.floating]]
-Act = Callable[[VectorEnv, int, Actions, Actions], Actions]
+Act = Callable[[MultiAgentVectorEnv, int, Actions, Actions], Actions]
 """From the environment, the interval, what is seen and what the script does to what is done instead."""
 
 
@@ -83,7 +83,7 @@ def main(
 
 def played(act: Act) -> Episodes:
     """Play episodes by script, but for what ``act`` gives."""
-    env, script = VectorEnv("solids_net", num_envs=EPISODES), Scripted()
+    env, script = MultiAgentVectorEnv("solids_net", num_envs=EPISODES), Scripted()
     seen = env.reset(seed=first_seed(0))
     script.start(env, 0)
     place = {name: env.state_names.index(name) for name in ("sorter.sorted_now", "sorter.missed_now")}
@@ -102,7 +102,7 @@ def played(act: Act) -> Episodes:
     return Episodes(told["episode_circularity"], told["episode_service_level"], items[0], items[1], loads)
 
 
-def _waiting(waits: tuple[int, int], env: VectorEnv, t: int, _seen: Actions, script: Actions) -> Actions:
+def _waiting(waits: tuple[int, int], env: MultiAgentVectorEnv, t: int, _seen: Actions, script: Actions) -> Actions:
     """Rest in the first steps of each attempt."""
     attempt = env.state()[:, env.state_names.index("sorter.attempt_step")]
     rests = attempt < waits[t >= SECOND_BATCH]
@@ -120,7 +120,7 @@ def _learnt(run: Path) -> Act:
 def _carrying(act: Act, speed: float) -> Act:
     """Return ``act`` with a robot that moves at a part of its speed while it holds an item."""
 
-    def slowly(env: VectorEnv, t: int, seen: Actions, script: Actions) -> Actions:
+    def slowly(env: MultiAgentVectorEnv, t: int, seen: Actions, script: Actions) -> Actions:
         actions = act(env, t, seen, script)
         if "sorter" not in actions or speed == 1.0:
             return actions

@@ -37,7 +37,7 @@ from benchmarks.generated import (
 )
 from cirl_marl import parallel_env
 from cirl_marl.environments.parallel import NetworkParallelEnv
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners import Recipe, load_recipe, train, train_seeds
 from cirl_marl.network import Network
 from cirl_marl.records.machine import processor
@@ -112,7 +112,7 @@ def main(
 
 def batched() -> list[Figure]:
     """Measure copper_net in 1 024 copies against VMAS and against lone environments, in agent-steps per second."""
-    env = VectorEnv("copper_net", num_envs=COPIES)
+    env = MultiAgentVectorEnv("copper_net", num_envs=COPIES)
     actions = _actions(env.agents, (COPIES, 1))
     env.reset(seed=0)
     horizon = env.network.episode.horizon
@@ -179,18 +179,18 @@ def single() -> list[Figure]:
 
 
 def share() -> list[Figure]:
-    """Measure which share of a training run PPO in lockstep spends in ``VectorEnv.step``."""
+    """Measure which share of a training run PPO in lockstep spends in ``MultiAgentVectorEnv.step``."""
     spans: list[tuple[float, float]] = []
-    step = VectorEnv.step
+    step = MultiAgentVectorEnv.step
 
-    def timed(env: VectorEnv, actions: Any) -> Any:
+    def timed(env: MultiAgentVectorEnv, actions: Any) -> Any:
         began = time.perf_counter()
         outcome = step(env, actions)
         spans.append((began, time.perf_counter()))
         return outcome
 
     recipe, shares, rates = _learning_alone(), [], []
-    with patch.object(VectorEnv, "step", timed):
+    with patch.object(MultiAgentVectorEnv, "step", timed):
         for seed in range(4):
             spans.clear()
             train("copper_net", recipe, steps=LEARNT, seed=seed, engine="lockstep")
@@ -281,12 +281,12 @@ def stacked() -> list[Figure]:
 
 def arcs() -> list[Figure]:
     """Measure what one step costs per arc and copy on random networks of growing size, put into local order."""
-    envs = [VectorEnv(random_network(size).in_local_order(), num_envs=max(1, CELLS // size)) for size in ARCS]
-    envs.append(VectorEnv(random_network(ARCS[-1]), num_envs=1))
+    envs = [MultiAgentVectorEnv(random_network(size).in_local_order(), num_envs=max(1, CELLS // size)) for size in ARCS]
+    envs.append(MultiAgentVectorEnv(random_network(ARCS[-1]), num_envs=1))
     for env in envs:
         env.reset(seed=0)
 
-    def cost_of(env: VectorEnv) -> Callable[[], float]:
+    def cost_of(env: MultiAgentVectorEnv) -> Callable[[], float]:
         actions = _actions(env.agents, (env.num_envs, 1))
         cells = len(env.network.arcs) * env.num_envs
         return lambda: _seconds(lambda: env.step(actions), 3) / cells
@@ -312,11 +312,11 @@ def yearly() -> list[Figure]:
         "monthly": yearly_network(monthly=True),
         "copper_net": "copper_net",
     }
-    found = {name: VectorEnv(network, num_envs=COPIES) for name, network in envs.items()}
+    found = {name: MultiAgentVectorEnv(network, num_envs=COPIES) for name, network in envs.items()}
     for env in found.values():
         env.reset(seed=0)
 
-    def cost_of(env: VectorEnv, steps: int) -> Callable[[], float]:
+    def cost_of(env: MultiAgentVectorEnv, steps: int) -> Callable[[], float]:
         actions = _actions(env.agents, (COPIES, 1))
         return lambda: _seconds(lambda: env.step(actions), steps) / COPIES
 
@@ -350,9 +350,9 @@ def yearly() -> list[Figure]:
 
 def world() -> list[Figure]:
     """Measure the steel of the world against that of Japan: every service is made up for, under random actions."""
-    found = {name: VectorEnv(name, num_envs=WORLDS) for name in ("steel_world", "steel_japan")}
+    found = {name: MultiAgentVectorEnv(name, num_envs=WORLDS) for name in ("steel_world", "steel_japan")}
 
-    def cost_of(env: VectorEnv, steps: int) -> Callable[[], float]:
+    def cost_of(env: MultiAgentVectorEnv, steps: int) -> Callable[[], float]:
         env.reset(seed=0)
         actions = _actions(env.agents, (WORLDS, 1))
         return lambda: _seconds(lambda: env.step(actions), steps) / WORLDS

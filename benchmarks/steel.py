@@ -17,11 +17,11 @@ import numpy as np
 
 from benchmarks.document import write_sections
 from benchmarks.plans import plan_lines
-from cirl_marl import VectorEnv, load_network
+from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
-from cirl_marl.importing.tables import FlowTable, read_flows
+from cirl_marl.importing.flow_table import FlowTable, read_flows
 from cirl_marl.network import Floats
 from cirl_marl.records.files import write_table
 
@@ -321,7 +321,7 @@ def _said(value: float) -> str:
 def simulated(region: str, scenario: str) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """Return flows by arc and stocks by node of a scenario in which nobody acts."""
     network = load_network(f"{ENVS / 'steel.toml'}:{region}", scenario=scenario)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     begun = beginning(env)
     run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
     flows = {arc.id: run.flow[:, k] for k, arc in enumerate(network.arcs)}

@@ -19,12 +19,12 @@ import numpy as np
 from benchmarks import steel
 from benchmarks.document import write_sections
 from benchmarks.steel import ENVS, FUTURE, RECENT, TABLE, YEARS, Country, countries
-from cirl_marl import VectorEnv, load_network
+from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
-from cirl_marl.importing.tables import read_flows
+from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import achieved, bound, improved
 from cirl_marl.optimum.plan import Plan, Planned
@@ -115,7 +115,7 @@ def _said(value: float) -> str:
 def simulated(scenario: str) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """Return flows by arc and stocks by node of a scenario in which nobody acts."""
     network = load_network(ENVS / "steel_world.toml", scenario=scenario)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     begun = beginning(env)
     run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
     flows = {arc.id: run.flow[:, k] for k, arc in enumerate(network.arcs)}
@@ -128,7 +128,7 @@ class _Apart(Controller):
     def __init__(self, held: Sequence[Mapping[str, float]]) -> None:
         self._held = held
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         self._env = env
 
     def act(self, observations: Arrays) -> Arrays:
@@ -151,7 +151,7 @@ def lever_lines() -> Iterator[str]:
     rows += [(f"{name}, in all countries", held(everybody, agents.items())) for name, agents in LEVERS.items()]
     names = {region: region.replace("_", " ").title() for region in everybody}
     rows += [(f"all of these, in {name} alone", held([region], every)) for region, name in names.items()]
-    env = VectorEnv(network, num_envs=len(rows))
+    env = MultiAgentVectorEnv(network, num_envs=len(rows))
     begun = beginning(env)
     run = rollout(env, _Apart([actions for _, actions in rows]), seed=begun.seed, start=begun.given)
     reached, service = run.episode_circularity / 1e3, run.levels.min(axis=(1, 2))
@@ -186,7 +186,7 @@ def gain_lines(plan: Planned) -> Iterator[str]:
     chosen = [[], list(plan.agents)]
     for part in (*groups.values(), *countries_.values()):
         chosen += [part, [agent for agent in plan.agents if agent not in part]]
-    env = VectorEnv(network, num_envs=len(chosen))
+    env = MultiAgentVectorEnv(network, num_envs=len(chosen))
     begun = beginning(env)
     env.reset(seed=begun.seed, options={"initial_state": begun.given})
     neutral = env.stack(env.neutral_action)[:, 0]

@@ -24,7 +24,7 @@ from benchmarks.document import made_with, markdown_table, write_sections
 from cirl_marl.controllers import LQR, Controller, Neutral
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.evaluation import Comparison, Row, compare, yardstick
 from cirl_marl.evaluation.comparison import starting_stocks
@@ -273,7 +273,7 @@ def _lqr_table(episodes: int) -> Iterator[str]:
     yield "| network | who acts | controller | set-points | λ̄ | service level | bound | gap to the bound |"
     yield "|-|-|-|-|-|-|-|-|"
     for name, agent, set_points in LQR_CASES:
-        env = VectorEnv(name, num_envs=episodes, agents=[agent])
+        env = MultiAgentVectorEnv(name, num_envs=episodes, agents=[agent])
         starts = starting_stocks(env, first_seed(0))
         acting: dict[str, Controller] = {
             "neutral": Neutral(),

@@ -16,7 +16,7 @@ from cirl_marl.environments.parallel import NetworkParallelEnv, aec_env, paralle
 from cirl_marl.environments.registration import register
 from cirl_marl.environments.single import SingleAgentEnv, single_agent_env
 from cirl_marl.environments.state import Snapshot
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, DefinitionError, LearnerError, NetworkError, RecipeError, RunError
 from cirl_marl.network import Network
 from cirl_marl.network.elements import (
@@ -50,6 +50,7 @@ __all__ = [
     "Episode",
     "Law",
     "LearnerError",
+    "MultiAgentVectorEnv",
     "Network",
     "NetworkError",
     "NetworkParallelEnv",
@@ -64,7 +65,6 @@ __all__ = [
     "SingleAgentEnv",
     "Snapshot",
     "Team",
-    "VectorEnv",
     "aec_env",
     "explain",
     "independent",

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from cirl_marl import CirlError, VectorEnv, load_network
+from cirl_marl import CirlError, MultiAgentVectorEnv, load_network
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.learners.recipe import load_recipe
 
@@ -79,7 +79,7 @@ MUTATIONS: list[Callable[[str, random.Random], str]] = [numbers, numbers, words,
 def network_works(path: Path, region: str) -> None:
     """Build the network and play three steps, in which nothing is infinite."""
     network = load_network(f"{path}:{region}" if region else path)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     for _ in range(3):
         actions = {agent: np.full((1, *space.shape), -0.3) for agent, space in env.action_spaces.items()}

@@ -11,7 +11,7 @@ from gymnasium.wrappers import RescaleAction
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from cirl_marl import Arc, CirlError, Control, ControlError, ControlKind, Network, Node, VectorEnv
+from cirl_marl import Arc, CirlError, Control, ControlError, ControlKind, MultiAgentVectorEnv, Network, Node
 from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation import compare
@@ -33,7 +33,7 @@ def valve(low: float, neutral: float, high: float) -> Network:
 def test_neutral_at_a_bound_is_an_action(low: float, high: float, where: str) -> None:
     """Decimal bounds round; the neutral action is still one that ``step`` takes, and the ends are the bounds."""
     assume(low < high)
-    env = VectorEnv(valve(low, low if where == "low" else high, high), num_envs=2)
+    env = MultiAgentVectorEnv(valve(low, low if where == "low" else high, high), num_envs=2)
     action = env.neutral_action["k"]
     assert action == pytest.approx(-1.0 if where == "low" else 1.0)
     assert (abs(action) <= 1.0).all()
@@ -60,9 +60,9 @@ def test_nobody_has_to_act() -> None:
     network = valve(0.0, 1.0, 2.0)
     still = replace(network, arcs=(replace(network.arcs[0], control=None),))
     for reward in ("local", "difference", "mixed_difference", "team"):
-        env = VectorEnv(still, num_envs=2, reward=reward)
+        env = MultiAgentVectorEnv(still, num_envs=2, reward=reward)
         for controller in (Random(), Neutral()):
             assert np.isfinite(rollout(env, controller, seed=0).circularity).all()
     assert [row.name for row in compare([], ["random"], network=still, episodes=2).rows] == ["neutral", "random"]
     with pytest.raises(CirlError, match=r"agents \[\] must be distinct and at least one"):
-        VectorEnv(network, num_envs=1, agents=[])
+        MultiAgentVectorEnv(network, num_envs=1, agents=[])

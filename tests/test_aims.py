@@ -20,13 +20,13 @@ from cirl_marl import (
     ControlKind,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     Network,
     Node,
     Role,
     RunError,
     Series,
     Service,
-    VectorEnv,
     load_network,
 )
 from cirl_marl.controllers.basic import Random
@@ -168,7 +168,7 @@ def test_a_poor_plan_is_far_from_the_best() -> None:
 def test_tables_of_plan_and_simulate_are_the_same_course(tmp_path: Path) -> None:
     """One holds controls and is carried out again, the other stocks and flows; another seed or network is refused."""
     network = load_network("carbo_net").with_options(episode={"horizon": 5})
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     planned = schedule(env, Random(), seed=3)
     planned.write(tmp_path / "plan.csv")
     begun = beginning(env, 3)

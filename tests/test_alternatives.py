@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from cirl_marl import CirlError, VectorEnv, cli
+from cirl_marl import CirlError, MultiAgentVectorEnv, cli
 from cirl_marl.controllers.rollout import Rollout, beginning, rollout
 from cirl_marl.evaluation.alternatives import Alternative, ComparedQuantity, alternatives, compared_quantities
 from cirl_marl.optimum.named import named_controller
@@ -81,9 +81,11 @@ def definition(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def alone(network: str | Path, scenario: str | None, control: str, seed: int | None) -> tuple[VectorEnv, Rollout]:
+def alone(
+    network: str | Path, scenario: str | None, control: str, seed: int | None
+) -> tuple[MultiAgentVectorEnv, Rollout]:
     """Return what a single simulation finds."""
-    env = VectorEnv(network, num_envs=1, scenario=scenario)
+    env = MultiAgentVectorEnv(network, num_envs=1, scenario=scenario)
     begun = beginning(env, seed)
     return env, rollout(env, named_controller(control), seed=begun.seed, start=begun.given)
 

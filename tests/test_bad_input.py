@@ -14,9 +14,9 @@ from cirl_marl import (
     Arc,
     CirlError,
     ControlError,
+    MultiAgentVectorEnv,
     Network,
     Node,
-    VectorEnv,
     load_network,
     parallel_env,
     single_agent_env,
@@ -89,7 +89,7 @@ def test_acting_outside_an_episode() -> None:
 def test_bad_options(options: dict[str, Any], message: str) -> None:
     """A wrong option is an error that gives the nearest valid one."""
     with pytest.raises(CirlError, match=message):
-        VectorEnv("copper_net", **options)
+        MultiAgentVectorEnv("copper_net", **options)
 
 
 def test_bad_options_of_the_views() -> None:
@@ -153,11 +153,11 @@ def test_bad_snapshots() -> None:
 def test_snapshot_of_another_definition() -> None:
     """The same names with other rates are another network."""
     network = load_network("copper_net")
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(0)
     faster = tuple(replace(arc, rate=2 * constant(arc.rate)) for arc in network.arcs)
     with pytest.raises(ControlError, match="another definition of network 'copper_net'"):
-        VectorEnv(replace(network, arcs=faster), num_envs=1).restore(env.snapshot())
+        MultiAgentVectorEnv(replace(network, arcs=faster), num_envs=1).restore(env.snapshot())
 
 
 @pytest.mark.parametrize(
@@ -171,14 +171,14 @@ def test_snapshot_of_another_definition() -> None:
 )
 def test_states_beyond_the_equations(network: str, scenario: str, given: dict[str, float], message: str) -> None:
     """A start for which a model does not hold, or that its simulator would not take over, is refused."""
-    env = VectorEnv(network, num_envs=2, scenario=scenario)
+    env = MultiAgentVectorEnv(network, num_envs=2, scenario=scenario)
     with pytest.raises(ControlError, match=message):
         env.reset(seed=0, options={"initial_state": given})
 
 
 def test_a_whole_state_of_a_simulator_is_a_start() -> None:
     """What one robot was in, another goes on from, bit for bit."""
-    env = VectorEnv("solids_net", num_envs=1, scenario="reacher")
+    env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")
     names = [name for name in env.state_names if name.startswith("sorter.")]
     env.reset(seed=3)
     begun = dict(zip(env.state_names, env.state()[0], strict=False))
@@ -191,7 +191,7 @@ def test_a_whole_state_of_a_simulator_is_a_start() -> None:
 def test_mass_is_counted_in_each_copy() -> None:
     """What one copy holds here and another there is not added up."""
     ends = Node(id="a", initial=(0.0, 100.0)), Node(id="b")
-    env = VectorEnv(
+    env = MultiAgentVectorEnv(
         Network(name="two", nodes=ends, arcs=(Arc(id="f", donor="a", recipient="b", rate=0.1),)), num_envs=2
     )
     env.reset(0, options={"initial_state": {"a": [100.0, 0.0], "b": [0.0, 100.0]}})
@@ -204,8 +204,8 @@ def test_scenario_after_options_is_an_error() -> None:
     """Options would be lost with the scenario they were set in."""
     network = load_network("copper_net").with_options(objective={"reward": "team"})
     with pytest.raises(CirlError, match="choose it first"):
-        VectorEnv(network, scenario="paper")
-    assert VectorEnv(network).reward_mode == "team"
+        MultiAgentVectorEnv(network, scenario="paper")
+    assert MultiAgentVectorEnv(network).reward_mode == "team"
 
 
 def test_what_is_shared_cannot_be_written_to() -> None:
@@ -215,7 +215,7 @@ def test_what_is_shared_cannot_be_written_to() -> None:
         network.sustainability[:] = 0.0
     with pytest.raises(NetworkXError, match="Frozen"):
         network.graph.clear()
-    env = VectorEnv(network, num_envs=2)
+    env = MultiAgentVectorEnv(network, num_envs=2)
     env.reset(0)
     infos = env.step({agent: np.zeros((2, 1)) for agent in env.agents})[4]
     for shared in ("circularity", "service_level", "flows"):
@@ -261,7 +261,8 @@ def test_misspelt_options_name_the_nearest() -> None:
     for make in (parallel_env, vector_env, single_agent_env):
         with pytest.raises(CirlError, match=r"network must be a name of the catalogue, a file or a Network, got 3"):
             make(3)  # type: ignore[arg-type]
-    assert VectorEnv("copper_net", circularity_weight=np.float32(0.5)).network.objective.circularity_weight == 0.5  # type: ignore[arg-type]
+    weighed = MultiAgentVectorEnv("copper_net", circularity_weight=np.float32(0.5))  # type: ignore[arg-type]
+    assert weighed.network.objective.circularity_weight == 0.5
     with pytest.raises(CirlError, match=r"unknown field 'horzon'\. Did you mean 'horizon'"):
         load_network("copper_net").with_options(episode={"horzon": 3})
     with pytest.raises(CirlError, match=r"unknown group 'episod'\. Did you mean 'episode'"):

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv
+from cirl_marl import Arc, Control, ControlKind, MultiAgentVectorEnv, Network, NetworkError, Node, Role
 from cirl_marl.compartments import DiscreteTimeModel, Releasing, RewardState, model_class
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Episode, Law, Objective, Service
@@ -113,7 +113,7 @@ def network(nth: int = 3, work: int = 20, starts: tuple[float, ...] = (0.0, 10.0
     )
 
 
-def drive(env: VectorEnv) -> dict[str, Floats]:
+def drive(env: MultiAgentVectorEnv) -> dict[str, Floats]:
     """Return the action of a driver who aims for the truck's destination: a damped spring."""
     rows = {name: i for i, name in enumerate(env.dynamics.inner.names)}
     position, speed, destination = (
@@ -123,7 +123,7 @@ def drive(env: VectorEnv) -> dict[str, Floats]:
     return {"truck": (force / 12e3)[:, None]}
 
 
-def masses(env: VectorEnv) -> Floats:
+def masses(env: MultiAgentVectorEnv) -> Floats:
     """Return all the mass there is, shape (B,)."""
     total: Floats = env.physical.stock[:-1].sum(axis=0)
     return total
@@ -134,7 +134,7 @@ def masses(env: VectorEnv) -> Floats:
 @given(seed=st.integers(0, 2**31), nth=st.integers(1, 5), work=st.integers(1, 40))
 def test_mass_in_transit_is_conserved(seed: int, nth: int, work: int) -> None:
     """Under any driving, what left the reservoir is at a node, on the way or aboard."""
-    env = VectorEnv(network(nth, work, horizon=400), num_envs=2)
+    env = MultiAgentVectorEnv(network(nth, work, horizon=400), num_envs=2)
     env.reset(seed)
     rng = np.random.default_rng(seed)
     for _ in range(400):
@@ -147,7 +147,7 @@ def test_mass_in_transit_is_conserved(seed: int, nth: int, work: int) -> None:
 @pytest.mark.parametrize(("nth", "success"), [(1, 0.0), (2, 0.5), (4, 0.75), (9, 1.0)])
 def test_stages_of_circularity(nth: int, success: float) -> None:
     """λ is −m, then −(m + m_u), then −2m for each batch, at the realised T_s and arrival times."""
-    env = VectorEnv(network(nth), num_envs=1)
+    env = MultiAgentVectorEnv(network(nth), num_envs=1)
     env.reset(0)
     found, arrivals = [], []
     for _ in range(env.network.episode.horizon):
@@ -173,7 +173,7 @@ def test_stages_of_circularity(nth: int, success: float) -> None:
 
 def test_a_batch_arrives_after_its_delay() -> None:
     """A batch sent at the start of interval i arrives at the end of interval i + n − 1, whole."""
-    env = VectorEnv(network(starts=(0.4,)), num_envs=1)
+    env = MultiAgentVectorEnv(network(starts=(0.4,)), num_envs=1)
     env.reset(0)
     sorter, leaves, arrives = [], round(0.4 / INTERVAL), round(2.4 / INTERVAL)
     for step in range(arrives + 1):
@@ -198,7 +198,7 @@ def test_an_empty_donor_sends_what_it_has(stocks: list[float], asked: list[float
             for i, mass in enumerate(asked)
         ),
     )
-    env = VectorEnv(network, num_envs=len(stocks))
+    env = MultiAgentVectorEnv(network, num_envs=len(stocks))
     env.reset(seed=0)
     stock = env.physical.stock.copy()
     stock[0] = stocks
@@ -210,7 +210,7 @@ def test_an_empty_donor_sends_what_it_has(stocks: list[float], asked: list[float
 
 def test_load_makes_the_truck_slower() -> None:
     """The same force moves a truck with 400 kg less far than an empty one, by the ratio of the masses."""
-    env = VectorEnv(network(nth=1), num_envs=1)
+    env = MultiAgentVectorEnv(network(nth=1), num_envs=1)
     env.reset(0)
     rows = {name: i for i, name in enumerate(env.dynamics.inner.names)}
     speeds = {}
@@ -233,7 +233,7 @@ def test_load_makes_the_truck_slower() -> None:
 @pytest.mark.medium
 def test_snapshot_with_mass_on_the_way() -> None:
     """From a snapshot with slots, dock and truck in use all comes again; copies do not mix over restarts."""
-    env = VectorEnv(network(horizon=500), num_envs=3)
+    env = MultiAgentVectorEnv(network(horizon=500), num_envs=3)
     env.reset(0)
     for _ in range(300):
         env.step(drive(env))
@@ -252,7 +252,7 @@ def test_snapshot_with_mass_on_the_way() -> None:
 
 def test_service_of_material_on_the_way() -> None:
     """A service may ask for mass on a batch arc."""
-    env = VectorEnv(network(nth=9), num_envs=1)
+    env = MultiAgentVectorEnv(network(nth=9), num_envs=1)
     env.reset(0)
     levels = [env.advance(env.stack(drive(env))).service_level[0] for _ in range(200)]
     assert levels[0] == 0.0
@@ -330,7 +330,7 @@ def test_over_removal_in_batches_is_no_merit_under_abs(net_zero: str, circularit
         episode=Episode(horizon=3),
         objective=Objective(net_zero=net_zero),
     )
-    env = VectorEnv(network, num_envs=2)
+    env = MultiAgentVectorEnv(network, num_envs=2)
     env.reset(seed=0)
     outcome = env.advance(np.empty((0, 2)))
     np.testing.assert_allclose(outcome.circularity, circularity)

@@ -21,7 +21,7 @@ from pages import shown
 from small_networks import ONE_OF_EACH
 
 import cirl_marl
-from cirl_marl import Arc, Control, ControlKind, Law, Network, Node, VectorEnv, cli, learners
+from cirl_marl import Arc, Control, ControlKind, Law, MultiAgentVectorEnv, Network, Node, cli, learners
 from cirl_marl.cli import demonstration
 from cirl_marl.controllers.rollout import beginning, first_seed
 from cirl_marl.definitions.catalogue import folder
@@ -768,7 +768,7 @@ def test_show_simulate_and_plan_start_alike(
         ((), "start: the middle of all initial ranges"),
         (("--seed", "2"), "start: the first episode of evaluation 2"),
     ):
-        env = VectorEnv(found, num_envs=1)
+        env = MultiAgentVectorEnv(found, num_envs=1)
         beginning(env, 2 if seed else None).reset(env)
         started = env.state()[0, : len(found.nodes)]
         if seed:

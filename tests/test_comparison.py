@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.contenders import differences
@@ -282,7 +282,7 @@ def test_reports_keep_the_gap(runs: list[Path]) -> None:
 def test_what_makes_another_episode_is_named(changes: dict[str, dict[str, object]], message: str | None) -> None:
     """One change, one reason; rewards and observations are no reason not to compare."""
     network = load_network("copper_net")
-    env, other = (VectorEnv(n, num_envs=1) for n in (network.with_options(**changes), network))
+    env, other = (MultiAgentVectorEnv(n, num_envs=1) for n in (network.with_options(**changes), network))
     found = list(differences(env, other))
     assert not found if message is None else len(found) == 1 and re.search(message, found[0])
 
@@ -293,22 +293,22 @@ def test_services_do_not_hide_compartments_of_their_name(bottles: Network) -> No
     named = replace(bottles, services=(replace(bottles.services[0], id=node.id), *bottles.services[1:]))
     wider = replace(node, initial=(bottles.initial[0, 1], bottles.initial[1, 1] + 1.0))
     other = replace(named, nodes=(bottles.nodes[0], wider, *bottles.nodes[2:]))
-    (found,) = differences(VectorEnv(named, num_envs=1), VectorEnv(other, num_envs=1))
+    (found,) = differences(MultiAgentVectorEnv(named, num_envs=1), MultiAgentVectorEnv(other, num_envs=1))
     assert f"'{node.id}'" in found
 
 
 def test_other_parts_and_agents_make_another_episode() -> None:
     """Compartments and services that differ are named, as are those who act, and no more than five of them."""
     network = load_network("copper_net")
-    env = VectorEnv(network, num_envs=1)
-    fewer = VectorEnv(network, num_envs=1, agents=["mine"])
+    env = MultiAgentVectorEnv(network, num_envs=1)
+    fewer = MultiAgentVectorEnv(network, num_envs=1, agents=["mine"])
     assert list(differences(fewer, env)) == [f"agents ['mine'], not {list(env.agents)}"]
     for part in ("nodes", "arcs", "services"):
         first, *rest = getattr(network, part)
         field = "low" if part == "services" else "scale"
         other: Any = {part: (replace(first, **{field: 3.0 * getattr(first, field)}), *rest)}
         changed = replace(network, **other)
-        assert list(differences(VectorEnv(changed, num_envs=1), env)) == [f"the definition of '{first.id}'"]
+        assert list(differences(MultiAgentVectorEnv(changed, num_envs=1), env)) == [f"the definition of '{first.id}'"]
     nodes = tuple(replace(node, scale=3.0 * node.scale) for node in network.nodes)
-    (many,) = differences(VectorEnv(replace(network, nodes=nodes), num_envs=1), env)
+    (many,) = differences(MultiAgentVectorEnv(replace(network, nodes=nodes), num_envs=1), env)
     assert re.fullmatch(r"the definition of ('\w+', ){4}'\w+' and others", many)

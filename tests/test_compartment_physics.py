@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from paper_classes import PAPER
 from scipy.integrate import solve_ivp
 
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.compartments import models
 from cirl_marl.compartments.atmosphere import Atmosphere
 from cirl_marl.compartments.delivery_truck import DeliveryTruck
@@ -134,7 +134,7 @@ def check_atmosphere() -> None:
 
 def test_atmosphere_is_the_stock_of_a_network() -> None:
     """Of net_zero, whose node has no model: fed with the flows of its arcs the box holds what the node holds."""
-    env, box, kg_per_mmol = VectorEnv("net_zero", num_envs=3, horizon=20), Atmosphere(), 44.01e-6
+    env, box, kg_per_mmol = MultiAgentVectorEnv("net_zero", num_envs=3, horizon=20), Atmosphere(), 44.01e-6
     env.reset(seed=0)
     air, rng = env.network.node_index["atmosphere"], np.random.default_rng(0)
     assert env.network.nodes[air].model is None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from series_definition import SOURCE, column, definition, written
 
-from cirl_marl import CirlError, DefinitionError, Network, RecipeError, VectorEnv, load_network
+from cirl_marl import CirlError, DefinitionError, MultiAgentVectorEnv, Network, RecipeError, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import Definition, write_network
@@ -86,7 +86,7 @@ def test_a_copy_stands_for_each_region(folder: Path) -> None:
         ("china_in_use", "china_use", "China: ore in use"),
     ]
     assert "dump" not in found.node_index and "japan_dump" in found.node_index
-    run = rollout(VectorEnv(found, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(found, num_envs=1), Neutral())
     flow = {arc.id: run.flow[:, k] for k, arc in enumerate(found.arcs)}
     np.testing.assert_allclose(flow["japan_ore"], [10, 20, 30, 40])
     np.testing.assert_allclose(flow["china_ore"], [1, 1, 3, 3])
@@ -177,7 +177,7 @@ def test_a_copy_is_of_a_region(folder: Path) -> None:
 def test_copies_are_folded_in_pictures(folder: Path) -> None:
     """Each is a box; what it takes and loses are boxes of all; stocks and flows add up; one may be shown as it is."""
     found = network(folder)
-    run = rollout(VectorEnv(found, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(found, num_envs=1), Neutral())
     stock, flow = run.stock[-1], run.flow[-1]
     seen, held, moved = folded(found, stock, flow)
     assert {node.id for node in seen.nodes} == {

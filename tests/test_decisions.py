@@ -10,7 +10,7 @@ from openpyxl import load_workbook
 from small_networks import ONE_OF_EACH
 from typer.testing import CliRunner
 
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.cli import app
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.schedule import Schedule, schedule
@@ -21,7 +21,7 @@ EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
 
 def planned(network: str, held: dict[str, float], scenario: str | None = None) -> Schedule:
     """Return an episode in which some agents hold an action and the others are neutral."""
-    env = VectorEnv(network, num_envs=1, scenario=scenario)
+    env = MultiAgentVectorEnv(network, num_envs=1, scenario=scenario)
     neutral = {agent: float(action[0, 0]) for agent, action in env.neutral_action.items()}
     return schedule(env, Constant({**neutral, **held}))
 

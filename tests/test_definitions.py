@@ -19,10 +19,10 @@ from cirl_marl import (
     Arc,
     CirlError,
     DefinitionError,
+    MultiAgentVectorEnv,
     Network,
     Node,
     Role,
-    VectorEnv,
     load_network,
     parallel_env,
 )
@@ -89,7 +89,7 @@ def test_schema_refuses_what_the_library_refuses() -> None:
 
 def initial_circularity(name: str, scenario: str) -> tuple[dict[str, float], float]:
     """Return the stocks and λ at the start under neutral control."""
-    env = VectorEnv(name, scenario=scenario, num_envs=1)
+    env = MultiAgentVectorEnv(name, scenario=scenario, num_envs=1)
     env.reset(0)
     stock = env.physical.stock[:-1]
     return dict(zip(env.network.node_index, stock[:, 0].tolist(), strict=True)), float(

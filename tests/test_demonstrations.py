@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from cirl_marl import ControlError, DefinitionError, RecipeError, VectorEnv
+from cirl_marl import ControlError, DefinitionError, MultiAgentVectorEnv, RecipeError
 from cirl_marl.controllers import Controller, Scripted
 from cirl_marl.environments.goal import GoalEnv
 from cirl_marl.learners import Recipe, Training, load_recipe, resume, train
@@ -60,7 +60,7 @@ def buffer_of(training: Training, name: str) -> Any:
 
 def shown_by(controller: Controller, seed: int, view_of: Any, steps: int) -> Iterator[Transition]:
     """Yield what ``controller``, started anew with each episode, does and sees in the copies that a run steps."""
-    env = VectorEnv("copper_net", num_envs=COPIES, agents=AGENTS, horizon=HORIZON)
+    env = MultiAgentVectorEnv("copper_net", num_envs=COPIES, agents=AGENTS, horizon=HORIZON)
     view: View = view_of(env)
     observations = env.reset(seed=[derived_seed(SEED, "copies", i) for i in range(COPIES)])
     for t in range(steps):
@@ -385,7 +385,7 @@ def test_controllers_are_those_of_the_library() -> None:
 
 def test_current_observations_are_those_last_returned() -> None:
     """After a reset, within an episode, where the next begins, and after going back."""
-    env = VectorEnv("net_zero", num_envs=2, horizon=2)
+    env = MultiAgentVectorEnv("net_zero", num_envs=2, horizon=2)
     with pytest.raises(ControlError, match=r"call reset\(\) first"):
         env.observations()
     actions = {agent: np.full_like(neutral, 0.5) for agent, neutral in env.neutral_action.items()}

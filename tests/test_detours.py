@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from benchmarks.generated import yearly_network
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, VectorEnv
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Series
 from cirl_marl.dynamics.detours import Detours, Onward, contracted, woven
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.network import RowSum
@@ -62,10 +62,10 @@ def keeping(kept: Iterable[int]) -> Any:
 def played(network: Network, seed: int, *, short: bool = True, kept: Iterable[int] | None = None) -> list[Floats]:
     """Return flows and stocks of an episode of random actions in two copies."""
     if kept is None:
-        env = VectorEnv(network, num_envs=2)
+        env = MultiAgentVectorEnv(network, num_envs=2)
     else:
         with keeping(kept):
-            env = VectorEnv(network, num_envs=2)
+            env = MultiAgentVectorEnv(network, num_envs=2)
     if not short:
         assert env.dynamics._taylor is not None
         env.dynamics._taylor._shortcut = None
@@ -166,7 +166,7 @@ def test_contraction_keeps_what_sources_send(seed: int, hubs: int) -> None:
 def test_a_cycle_of_500_nodes_keeps_few() -> None:
     """In the network that speed is measured on, the world markets and those who decide; batch = lone, mass kept."""
     network = yearly_network()
-    env = VectorEnv(network, num_envs=3)
+    env = MultiAgentVectorEnv(network, num_envs=3)
     passing = network.nodes[len(network.stores) :]
     assert (len(network.nodes), len(passing)) == (501, 400)
     kept = {passing[i].id for i in env.dynamics.routing.detours.kept}
@@ -174,7 +174,7 @@ def test_a_cycle_of_500_nodes_keeps_few() -> None:
     assert len(kept) <= 20
     env.reset(seed=4)
     start = env.physical.stock.sum(axis=0)
-    lone = VectorEnv(network, num_envs=1)
+    lone = MultiAgentVectorEnv(network, num_envs=1)
     lone.reset(seed=6)
     actions = np.random.default_rng(0).uniform(-1, 1, (len(env.agents), 3))
     flow, own = env.advance(actions).flow, lone.advance(actions[:, 2:]).flow
@@ -189,7 +189,7 @@ def test_a_flow_that_is_cut_in_one_copy_leaves_the_others_as_they_are() -> None:
     nodes = (*network.nodes, Node(id="pot", initial=(0.0, 2e3)))
     network = Network(name="pulled", nodes=nodes, arcs=(*network.arcs, pull), episode=network.episode)
     held = np.array([1e3, 1e-3, 1e3])
-    env = VectorEnv(network, num_envs=3)
+    env = MultiAgentVectorEnv(network, num_envs=3)
     env.reset(seed=0, options={"initial_state": {"pot": held}})
     actions = np.random.default_rng(0).uniform(-1, 1, (len(env.agents), 3))
     flow, stock = env.advance(actions).flow, env.physical.stock
@@ -197,7 +197,7 @@ def test_a_flow_that_is_cut_in_one_copy_leaves_the_others_as_they_are() -> None:
     assert pulled[1] == pytest.approx(1e-3)
     assert pulled[[0, 2]].min() > 0.1
     for i in range(3):
-        lone = VectorEnv(network, num_envs=1)
+        lone = MultiAgentVectorEnv(network, num_envs=1)
         lone.reset(seed=i, options={"initial_state": {"pot": held[i]}})
         np.testing.assert_array_equal(lone.advance(actions[:, i : i + 1]).flow[:, 0], flow[:, i])
         np.testing.assert_array_equal(lone.physical.stock[:, 0], stock[:, i])

@@ -16,12 +16,12 @@ from cirl_marl import (
     ControlKind,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     Network,
     Node,
     Objective,
     Role,
     Service,
-    VectorEnv,
     load_network,
 )
 from cirl_marl.cli.episodes import simulate
@@ -71,16 +71,16 @@ def test_each_service_is_held(demanded: Levels) -> None:
     assert (found.levels >= np.array(demanded) - 1e-6).all()
     played = {
         "improved": achieved(improved(found)),
-        "optimum": rollout(VectorEnv(town(), num_envs=1), Optimum(min_service=demanded)),
-        "mpc": rollout(VectorEnv(town(), num_envs=1), MPC(min_service=demanded)),
-        "window": rollout(VectorEnv(town(), num_envs=1), MPC(min_service=demanded, horizon=4)),
+        "optimum": rollout(MultiAgentVectorEnv(town(), num_envs=1), Optimum(min_service=demanded)),
+        "mpc": rollout(MultiAgentVectorEnv(town(), num_envs=1), MPC(min_service=demanded)),
+        "window": rollout(MultiAgentVectorEnv(town(), num_envs=1), MPC(min_service=demanded, horizon=4)),
     }
     for name, run in played.items():
         assert (run.episode_levels[0] >= np.array(demanded) - 1e-3).all(), name
         assert abs(found.gap(run.episode_circularity)[0]) < 0.01, name
     searched = search(town(), min_service=demanded, knots=2, iterations=20)
     assert (searched.levels >= np.array(demanded) - 2e-3).all()
-    replayed = rollout(VectorEnv(town(), num_envs=1), Plan(searched))
+    replayed = rollout(MultiAgentVectorEnv(town(), num_envs=1), Plan(searched))
     np.testing.assert_allclose(replayed.episode_levels[0], searched.levels)
     assert searched.service == pytest.approx(searched.levels.mean())
 
@@ -121,7 +121,7 @@ def test_levels_are_broadcast() -> None:
     with pytest.raises(CirlError, match=r"shape \(3,\), expected \(3, 2\)"):
         envelope(town(), starts, min_service=[0.1, 0.2, 0.3])
     with pytest.raises(CirlError, match=r"shape \(1, 2\), expected \(2,\)"):
-        rollout(VectorEnv(town(), num_envs=1), MPC(min_service=[[0.1, 0.2]]))
+        rollout(MultiAgentVectorEnv(town(), num_envs=1), MPC(min_service=[[0.1, 0.2]]))
     with pytest.raises(CirlError, match=r"min_service 1\.2 must lie in"):
         found.at(min_service=[0.5, 1.2])
 
@@ -134,7 +134,9 @@ def test_the_service_that_cannot_be_had_is_named() -> None:
         with pytest.raises(CirlError, match=rf"no actions reach a mean service level of 1 of '{name}' \(at m") as told:
             bound(poor, min_service=levels)
         most[name] = float(str(told.value).split("(at most ")[1].rstrip(")"))
-    reached = rollout(VectorEnv(poor, num_envs=1), Constant({"to_cars": 1.0, "to_homes": 1.0})).episode_levels[0]
+    reached = rollout(
+        MultiAgentVectorEnv(poor, num_envs=1), Constant({"to_cars": 1.0, "to_homes": 1.0})
+    ).episode_levels[0]
     np.testing.assert_allclose([most["mobility"], most["housing"]], reached, rtol=1e-2)
     scarce = town(reserve=12.0, cars=0.0, homes=0.0)
     together = highest_service(scarce)
@@ -145,7 +147,7 @@ def test_the_service_that_cannot_be_had_is_named() -> None:
 
 def test_mpc_approaches_one_demand_and_leaves_the_other() -> None:
     """Homes come as near as they can, for which cars neither starve nor are built beyond what is asked."""
-    env = VectorEnv(town(cars=0.0, homes=1.0), num_envs=1)
+    env = MultiAgentVectorEnv(town(cars=0.0, homes=1.0), num_envs=1)
     most = rollout(env, Constant({"to_cars": 1.0, "to_homes": 1.0})).episode_levels[0, 1]
     for horizon in (None, 4):
         run = rollout(env, MPC(min_service=[0.3, 0.99], horizon=horizon))
@@ -184,7 +186,7 @@ def test_sweep_ends_where_all_services_can_be_had(tmp_path_factory: pytest.TempP
 
 def test_episodes_sum_up_each_service() -> None:
     """Over a restart and a snapshot too; what is reported beside λ is the mean of the services."""
-    env = VectorEnv(town(), num_envs=2, horizon=3)
+    env = MultiAgentVectorEnv(town(), num_envs=2, horizon=3)
     env.reset(seed=0)
     actions = {"to_cars": np.full((2, 1), -1.0), "to_homes": np.full((2, 1), 1.0)}
     expected: NDArray[np.float64] = np.zeros((2, 2))
@@ -217,7 +219,7 @@ def test_networks_without_services() -> None:
         run = achieved(improved(found, rounds=2))
         assert (found.service, found.levels.shape, run.episode_levels.shape) == (1.0, (0,), (1, 0))
         assert run.least_service == run.episode_service == 1.0
-    env = VectorEnv(still, num_envs=2, horizon=2)
+    env = MultiAgentVectorEnv(still, num_envs=2, horizon=2)
     assert rollout(env, MPC(min_service=0.9)).levels.shape == (2, 0, 2)
     assert search(still, min_service=0.9, knots=1, iterations=1).levels.shape == (0,)
     env.restore(env.snapshot())
@@ -252,7 +254,7 @@ def test_a_simulation_says_the_level_of_each(
     write_network(town(cars=0.0), Path("town.toml"))
     simulate("town.toml", set_=[], control=["neutral"])
     printed = " ".join(capsys.readouterr().out.split())
-    run = rollout(VectorEnv("town.toml", num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv("town.toml", num_envs=1), Neutral())
     mobility, housing = run.episode_levels[0]
     assert f"service levels: mobility {mobility:.4f}, housing {housing:.4f}" in printed
     assert mobility < housing

@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from small_networks import constant
 
-from cirl_marl import Arc, ControlKind, Episode, Law, Network, Node, Role, VectorEnv
+from cirl_marl import Arc, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role
 
 RESERVOIR, TIP = Role.NONRENEWABLE_RESERVOIR, Role.LANDFILL
 
@@ -39,7 +39,7 @@ def test_at_the_end_of_a_decay(solver: str, step: float | None, tolerance: float
         arcs=(Arc(id="extraction", donor="mine", recipient="use", rate=0.6),),
         episode=Episode(control_interval=0.5, horizon=3, solver=solver, solver_step=step),
     ).with_options(objective={"reference_interval": 2.0})
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     for interval in (1, 2, 3):
         outcome = env.advance(np.zeros((0, 1)))
@@ -60,7 +60,7 @@ def test_at_the_end_of_a_filling() -> None:
         ),
         episode=Episode(control_interval=1.5, horizon=1),
     )
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     outcome = env.advance(np.zeros((0, 1)))
     assert outcome.circularity[0] == pytest.approx(3.0 * math.expm1(-0.4 * 1.5), rel=1e-12)
@@ -81,7 +81,7 @@ def test_a_scheduled_flow_at_the_end_is_the_one_realised() -> None:
         ),
         episode=Episode(control_interval=1.0, horizon=1),
     )
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     assert env.dynamics.substeps == 2
     env.reset(seed=0)
     outcome = env.advance(np.zeros((0, 1)))
@@ -94,7 +94,7 @@ def test_it_follows_from_the_stocks_at_the_end(network: Network, seed: int) -> N
     """With flows driven by their donors, λ at the end is −Δ·σᵀ(v·a·x) of the stocks at the end."""
     assume(not network.changing and not any(arc.law is Law.SHARE for arc in network.arcs))
     network = _stock_driven(network)
-    env = VectorEnv(network, num_envs=3)
+    env = MultiAgentVectorEnv(network, num_envs=3)
     env.reset(seed=seed)
     rng = np.random.default_rng(seed)
     acting = [network.node_index[agent] for agent in env.agents]

@@ -19,9 +19,9 @@ from cirl_marl import (
     Control,
     ControlError,
     ControlKind,
+    MultiAgentVectorEnv,
     Network,
     Node,
-    VectorEnv,
     aec_env,
     load_network,
     parallel_env,
@@ -122,7 +122,7 @@ def test_seeds_of_copies() -> None:
     np.testing.assert_array_equal(first, env.state()[::-1])
 
 
-def outcomes(reward: str, **options: Any) -> tuple[VectorEnv, list[Any]]:
+def outcomes(reward: str, **options: Any) -> tuple[MultiAgentVectorEnv, list[Any]]:
     """Return an environment and what ten random steps of it brought."""
     env = vector_env("copper_net", num_envs=2, reward=reward, **options)
     env.reset(1)
@@ -183,7 +183,7 @@ def test_difference_rewards_stay_within_their_memory(monkeypatch: pytest.MonkeyP
         for j in range(8)
         if i != j
     )
-    env = VectorEnv(Network(name="dense", nodes=nodes, arcs=arcs), num_envs=3, reward="difference")
+    env = MultiAgentVectorEnv(Network(name="dense", nodes=nodes, arcs=arcs), num_envs=3, reward="difference")
     actions = np.random.default_rng(0).uniform(-1, 1, (len(arcs), 3))
     env.reset(1)
     here = env.snapshot()
@@ -278,7 +278,7 @@ def test_what_cannot_be_imagined_names_its_agent() -> None:
         ),
         episode=Episode(control_interval=300.0, horizon=3, solver="euler", solver_step=1.0),
     )
-    env = VectorEnv(network, num_envs=2, reward="difference")
+    env = MultiAgentVectorEnv(network, num_envs=2, reward="difference")
     env.reset(options={"initial_state": {"b": np.array([0.0, 1.0])}})
     before = env.state()
     with pytest.raises(CirlError, match=r"^with agent 'fast' neutral.*: network 'brink': stock of node 'b' in copy 1"):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from small_networks import NO_STATES, advanced, small, start
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, VectorEnv
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role
 from cirl_marl.compartments import ContinuousModel, Outflowing, RewardState
 from cirl_marl.dynamics.motion import Dynamics
 
@@ -98,7 +98,7 @@ def test_recipient_on_exhausted_reservoir() -> None:
         Node(id="plant", initial=(10.0, 10.0), control=Control(kind=ControlKind.RATE, low=0, neutral=1, high=1)),
     )
     network = Network(name="small", nodes=nodes, arcs=(arc,), episode=Episode(horizon=4))
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(0)
     neutral = env.stack({"plant": np.ones((1, 1))})
     first = env.advance(neutral)
@@ -160,7 +160,7 @@ def test_models_give_no_more_than_there_is(outputs: list[float], share: float) -
 
 def test_models_do_not_reverse_flows() -> None:
     """A negative output moves nothing, at the start, in the step and at its end."""
-    env = VectorEnv(emptied(-1.0, (3.0,), 5.0), num_envs=1)
+    env = MultiAgentVectorEnv(emptied(-1.0, (3.0,), 5.0), num_envs=1)
     env.reset(seed=0)
     assert env.physical.flow[0, 0] == 0.0
     transition = env.dynamics.advance(env.physical.stock, env.physical.inner, np.empty((0, 1)), env.physical.step)
@@ -180,13 +180,13 @@ def test_empty_donors_give_nothing_at_the_start() -> None:
     """The flow that is observed first is none that cannot be."""
     pull = Arc(id="pull", donor="a", recipient="b", law=Law.RECIPIENT, rate=0.5)
     for held, flow in ((0.0, 0.0), (1.0, 1.0), (100.0, 5.0)):
-        env = VectorEnv(small({"a": held, "b": 10.0}, [pull]), num_envs=1)
+        env = MultiAgentVectorEnv(small({"a": held, "b": 10.0}, [pull]), num_envs=1)
         env.reset(seed=0)
         assert env.physical.flow[0, 0] == pytest.approx(flow, rel=1e-12)
 
 
 def test_start_flows_are_what_the_donors_hold() -> None:
     """The first observation does not promise a flow from an empty store."""
-    env = VectorEnv("copper_net", num_envs=1)
+    env = MultiAgentVectorEnv("copper_net", num_envs=1)
     env.reset(seed=0, options={"initial_state": {"use": 0.0}})
     assert env.physical.flow[env.network.arc_index["use_to_collection"], 0] == 0.0

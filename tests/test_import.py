@@ -15,14 +15,14 @@ from openpyxl import Workbook
 from scipy.optimize import lsq_linear, minimize
 from typer.testing import CliRunner
 
-from cirl_marl import CirlError, VectorEnv, load_network
+from cirl_marl import CirlError, MultiAgentVectorEnv, load_network
 from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.importing.assembly import Imported, imported
 from cirl_marl.importing.balances import Processes, ProcessKind, _closest
 from cirl_marl.importing.definition import identifiers, shares_of
-from cirl_marl.importing.tables import Connection, read_flows
+from cirl_marl.importing.flow_table import Connection, read_flows
 from cirl_marl.network.elements import Role
 
 Row = Sequence[object]
@@ -61,7 +61,7 @@ def cycle(years: int = 3, region: str = "", scale: float = 1.0) -> list[list[obj
 def simulated(path: Path | str) -> dict[tuple[str, int], float]:
     """Return the flows of a network without agents, by arc and year."""
     network = load_network(path)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     begun = beginning(env)
     run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
     start = network.episode.start

@@ -12,7 +12,7 @@ import pytest
 from paper_classes import PAPER, trajectory
 from scipy.integrate import solve_ivp
 
-from cirl_marl import Arc, Control, ControlKind, Network, NetworkError, Node, Role, VectorEnv, parallel_env
+from cirl_marl import Arc, Control, ControlKind, MultiAgentVectorEnv, Network, NetworkError, Node, Role, parallel_env
 from cirl_marl.compartments import model_class
 from cirl_marl.compartments.digester import Digester
 from cirl_marl.definitions.reading import Definition, write_network
@@ -95,7 +95,7 @@ def test_published_environments_as_the_one_agent_case(kind: str, name: str) -> N
 
 def final(network: Network, dilution: float) -> Floats:
     """Return stocks and inner states after two days at a constant dilution."""
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     start = network.nodes[0].model.equilibrium(0.5)  # type: ignore[union-attr]
     names = [f"digester.{name}" for name in network.nodes[0].model.state_names]  # type: ignore[union-attr]
     env.reset(seed=0, options={"initial_state": dict(zip(names, start * 1.1, strict=True))})
@@ -146,7 +146,7 @@ def test_empty_store_sends_no_more_than_it_holds() -> None:
     """A model that asks for more than its node holds gets what is there; stocks stay non-negative."""
     network = digester_network()
     node = replace(network.nodes[0], initial=(0.5, 0.5))
-    env = VectorEnv(replace(network, nodes=(node, network.nodes[1])), num_envs=3)
+    env = MultiAgentVectorEnv(replace(network, nodes=(node, network.nodes[1])), num_envs=3)
     env.reset(seed=0)
     for _ in range(4):
         env.step({"digester": np.ones((3, 1))})
@@ -161,8 +161,8 @@ def test_environments_with_inner_physics_conform() -> None:
     """The conformance suite, batch equality and bit-exact snapshots hold with inner states too."""
     network = digester_network(horizon=6)
     check_parallel_env(lambda: parallel_env(network))
-    check_vector_env(lambda: VectorEnv(network, num_envs=3))
-    batch, lone = VectorEnv(network, num_envs=3), VectorEnv(network, num_envs=1)
+    check_vector_env(lambda: MultiAgentVectorEnv(network, num_envs=3))
+    batch, lone = MultiAgentVectorEnv(network, num_envs=3), MultiAgentVectorEnv(network, num_envs=1)
     batch.reset(seed=5)
     lone.reset(seed=7)
     rng = np.random.default_rng(0)
@@ -193,7 +193,7 @@ def test_going_back_shows_what_was_measured() -> None:
     network = digester_network(horizon=2)
     digester, air = network.nodes
     network = replace(network, nodes=(replace(digester, model=MeteredDigester()), air))
-    env, wide = VectorEnv(network, num_envs=2), VectorEnv(network, num_envs=2, observe="full")
+    env, wide = MultiAgentVectorEnv(network, num_envs=2), MultiAgentVectorEnv(network, num_envs=2, observe="full")
     place = env.observation_names["digester"].index("digester.dilution_per_day")
     shown, expected = env.reset(seed=0), wide.reset(seed=0)
     for action, dilution in ((1.0, 0.7), (-0.5, 0.4), (0.5, 0.6), (0.0, 0.5)):

@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from small_networks import PLAYED
 
-from cirl_marl import Law, Network, SingleAgentEnv, VectorEnv, load_network, parallel_env
+from cirl_marl import Law, MultiAgentVectorEnv, Network, SingleAgentEnv, load_network, parallel_env
 from cirl_marl.network.elements import REWARDS
 from cirl_marl.testing import check_parallel_env, check_vector_env
 from cirl_marl.testing.nested import same_or_raise
@@ -25,7 +25,7 @@ anything = pytest.mark.parametrize(("name", "scenario"), CATALOGUE)
 random_networks = given(network=st.from_type(Network), seed=st.integers(0, 2**31))
 
 
-def draw(env: VectorEnv, rng: np.random.Generator) -> Actions:
+def draw(env: MultiAgentVectorEnv, rng: np.random.Generator) -> Actions:
     """Draw actions, a third of them at the bounds."""
     shapes = {agent: (env.num_envs, *env.action_spaces[agent].shape) for agent in env.agents}
     drawn = {agent: np.clip(rng.uniform(-1.5, 1.5, shape), -1, 1) for agent, shape in shapes.items()}
@@ -37,7 +37,7 @@ def lone(actions: Actions, i: int) -> Actions:
     return {agent: action[i] for agent, action in actions.items()}
 
 
-def episode(env: VectorEnv, seed: int) -> Iterator[Actions]:
+def episode(env: MultiAgentVectorEnv, seed: int) -> Iterator[Actions]:
     """Reset and yield the actions of one episode."""
     rng = np.random.default_rng(seed)
     env.reset(seed)
@@ -47,7 +47,7 @@ def episode(env: VectorEnv, seed: int) -> Iterator[Actions]:
 
 def assert_conserves(network: Network, seed: int) -> None:
     """Mass to round-off, stocks finite and, in the physical mode, not negative."""
-    env = VectorEnv(network, num_envs=3)
+    env = MultiAgentVectorEnv(network, num_envs=3)
     moved = np.zeros(3)
     start = largest = None
     for step, actions in enumerate(episode(env, seed), start=1):
@@ -84,7 +84,7 @@ def test_catalogue_conserves_mass(name: str, scenario: str) -> None:
 
 def assert_batch_is_lone(network: Network, seed: int, reward: str) -> None:
     """Copy i of a batch equals a lone environment with seed + i, bit for bit."""
-    batch = VectorEnv(network, num_envs=3, reward=reward)
+    batch = MultiAgentVectorEnv(network, num_envs=3, reward=reward)
     alone = [parallel_env(network, reward=reward) for _ in range(3)]
     seen = batch.reset(seed)
     for i, env in enumerate(alone):
@@ -147,19 +147,19 @@ def test_single_equals_parallel(name: str, scenario: str) -> None:
 def test_random_networks_conform(network: Network, seed: int) -> None:
     """Determinism and membership, over whole episodes and restarts."""
     check_parallel_env(lambda: parallel_env(network), seed=seed)
-    check_vector_env(lambda: VectorEnv(network, num_envs=2), steps=6, seed=seed)
+    check_vector_env(lambda: MultiAgentVectorEnv(network, num_envs=2), steps=6, seed=seed)
 
 
 @given(network=st.from_type(Network), seed=st.integers(0, 2**31), mode=st.sampled_from(["neighbours", "full"]))
 @example(network=random_network(14662095, 8, 0, lifetimes=True), seed=0, mode="neighbours")  # what comes out of slots
 def test_wider_observations_conform(network: Network, seed: int, mode: str) -> None:
     """Membership in the other observation modes."""
-    check_vector_env(lambda: VectorEnv(network, num_envs=2, observe=mode), steps=6, seed=seed)
+    check_vector_env(lambda: MultiAgentVectorEnv(network, num_envs=2, observe=mode), steps=6, seed=seed)
 
 
 def assert_window_circularity(network: Network, seed: int) -> None:
     """λ̄ = −(Δ·(finite-time sustainable mass that flowed)/T + mean of m_fb)."""
-    env = VectorEnv(network, num_envs=3)
+    env = MultiAgentVectorEnv(network, num_envs=3)
     interval, horizon = network.episode.control_interval, network.episode.horizon
     infos: dict[str, dict[str, Any]] = {}
     moved = np.zeros((len(network.arcs), 3))
@@ -189,7 +189,7 @@ def test_window_circularity_is_mass_moved(network: Network, seed: int) -> None:
 def test_window_circularity_is_read_off_the_stocks() -> None:
     """In copper_net the mine's loss and the landfill's gain are all that counts."""
     network = load_network("copper_net")
-    env = VectorEnv(network, num_envs=2)
+    env = MultiAgentVectorEnv(network, num_envs=2)
     mine, landfill = network.node_index["mine"], network.node_index["landfill"]
     means = np.zeros(2)
     start = end = np.zeros((2, 1))
@@ -207,7 +207,7 @@ def test_window_circularity_is_read_off_the_stocks() -> None:
 @random_networks
 def test_snapshot_replays(network: Network, seed: int) -> None:
     """From a snapshot in mid-episode, also a pickled one, all comes again, restarts included."""
-    env = VectorEnv(network, num_envs=2)
+    env = MultiAgentVectorEnv(network, num_envs=2)
     rng = np.random.default_rng(seed)
     shown = env.reset(seed)
     for _ in range(network.episode.horizon // 2):
@@ -217,7 +217,7 @@ def test_snapshot_replays(network: Network, seed: int) -> None:
     stored = pickle.dumps(snapshot)
     actions = [draw(env, rng) for _ in range(network.episode.horizon + 1)]
     first = [(*env.step(a)[:2], env.state().copy()) for a in actions]
-    fresh = VectorEnv(network, num_envs=2)
+    fresh = MultiAgentVectorEnv(network, num_envs=2)
     for other, source in ((env, snapshot), (fresh, pickle.loads(stored))):
         same_or_raise(shown, other.restore(source), "observations of the snapshot and after going back")
         np.testing.assert_array_equal(other.state(), before)

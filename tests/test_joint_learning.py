@@ -18,7 +18,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 import cirl_marl
-from cirl_marl import DefinitionError, Network, VectorEnv, vector_env
+from cirl_marl import DefinitionError, MultiAgentVectorEnv, Network, vector_env
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import load_recipe, train
 from cirl_marl.learners.central_critic import CentralCriticPolicy
@@ -67,7 +67,7 @@ def test_shared_policy_sees_and_does_what_supersuit_pads(name: str) -> None:
 @given(network=st.from_type(Network), copies=st.integers(1, 3), seed=st.integers(0, 1000))
 def test_views_lose_nothing(network: Network, copies: int, seed: int) -> None:
     """Whatever the view, each agent's observation, action and reward is in its place, in every copy."""
-    env = VectorEnv(network, num_envs=copies)
+    env = MultiAgentVectorEnv(network, num_envs=copies)
     observations, rng = env.reset(seed=seed), np.random.default_rng(seed)
     rewards = {agent: rng.normal(size=copies) for agent in env.agents}
     views: list[View] = [SharedPolicy(env, env.agents), AllAtOnce(env, env.agents)]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.controllers import Constant, Controller, Neutral
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.learners import RunDirectory, load_recipe, train
@@ -21,13 +21,13 @@ BETTER = {
 
 def run(network: str, controller: Controller) -> Rollout:
     """Return 16 episodes of the default scenario."""
-    return rollout(VectorEnv(network, num_envs=16), controller)
+    return rollout(MultiAgentVectorEnv(network, num_envs=16), controller)
 
 
 @pytest.mark.parametrize("network", sorted(BETTER))
 def test_stopping_everything_is_not_the_best_policy(network: str) -> None:
     """It has the best λ̄ of the three but fails the service, and its return is the worst."""
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     stop = run(network, Constant(dict.fromkeys(env.agents, -1.0)))
     neutral, better = run(network, Neutral()), run(network, Constant(BETTER[network]))
     assert stop.episode_circularity.mean() > neutral.episode_circularity.mean()

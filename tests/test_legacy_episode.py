@@ -36,7 +36,7 @@ def test_legacy_episodes_give_the_published_saturated_returns(name: str, action:
 def test_published_spread_is_that_of_starts_within_a_unit() -> None:
     """Full control of CopperNet from starts within ±1 kt: the spread is of the size that the paper's log shows, 8e4."""
     network = cirl_marl.load_network("copper_net", scenario="paper")
-    env = cirl_marl.VectorEnv(network, num_envs=4000)
+    env = cirl_marl.MultiAgentVectorEnv(network, num_envs=4000)
     random = np.random.default_rng(0)
     env.reset(seed=0)
     around = {

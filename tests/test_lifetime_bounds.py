@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from test_lifetimes import INFLOW, LIVES, town
 
 from benchmarks.products import product_cycle
-from cirl_marl import Series, Service, VectorEnv
+from cirl_marl import MultiAgentVectorEnv, Series, Service
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network.elements import Lifetime
@@ -82,7 +82,7 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     matrix, to = lifetimes.rows(layout, start, range(years))
     steps = layout.pieces * FINE
     short = network.with_options(episode={"control_interval": 1.0 / steps, "horizon": years * steps})
-    run = rollout(VectorEnv(short, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(short, num_envs=1), Neutral())
     left = weighted(run.flow[:, network.arc_index["discard"]].reshape(-1, FINE), 2).reshape(years, -1)
     (each,) = lifetimes.lived
     values = np.zeros((years, layout.size))
@@ -108,10 +108,10 @@ def test_what_leaves_at_once_is_allowed(mean: float, deviation: float, degree: i
     network = town(lifetime, inflow, initial=0.0)
     found = bound(network, degree=degree)
     assert float(achieved(found).episode_circularity[0]) <= found.objective * (1 - 1e-9)
-    run = rollout(VectorEnv(network, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     low = float(run.flow[:, network.arc_index["discard"]].max())
     served = replace(network, services=(Service(id="old", provider="discard", quantity="flow", low=low),))
-    level = float(rollout(VectorEnv(served, num_envs=1), Neutral()).episode_levels[0, 0])
+    level = float(rollout(MultiAgentVectorEnv(served, num_envs=1), Neutral()).episode_levels[0, 0])
     assert bound(served, min_service=level * (1 - 1e-6), degree=degree).levels[0] >= level * (1 - 1e-5)
 
 
@@ -137,7 +137,7 @@ def test_a_cycle_of_four_products_is_planned() -> None:
     together = envelope(network, starts, min_service=0.9, solves=2)
     solved = [bound(network, start, min_service=0.9).objective for start in starts]
     assert (together.at(starts) >= np.array(solved) - 1e-6).all()
-    controlled = rollout(VectorEnv(network, num_envs=1), MPC(min_service=0.9))
+    controlled = rollout(MultiAgentVectorEnv(network, num_envs=1), MPC(min_service=0.9))
     assert controlled.episode_levels[0].min() >= 0.89
     assert 0.0 <= found.gap(controlled.episode_circularity)[0] < 0.05
 

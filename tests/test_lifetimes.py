@@ -23,16 +23,16 @@ from cirl_marl import (
     ControlKind,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     NetworkError,
     Node,
     Role,
     Series,
-    VectorEnv,
     load_network,
 )
 from cirl_marl.controllers import Constant, Neutral
+from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.pyramids import pyramids
-from cirl_marl.controllers.remarks import remarks
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.dynamics.stages import staged
@@ -81,7 +81,7 @@ def town(
 
 def lived(network: Network, action: float | None = None) -> tuple[Floats, Floats]:
     """Return the discards in each interval and the stock in use at its end."""
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     discards, stocks = [], []
     for _ in range(network.episode.horizon):
@@ -163,7 +163,7 @@ def test_fixed_lifetime_is_a_delay(delay: int) -> None:
 def test_slots_lose_nothing() -> None:
     """Not even what rounding keeps from coming out in its interval, which comes with what is next."""
     network = town(Lifetime(mean=1.0, distribution="fixed"), np.full(300, 7.3))
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     before = env.physical.stock[:-1].sum()
     for _ in range(300):
@@ -208,7 +208,7 @@ def test_what_has_grown_goes_on_growing(lifetime: Lifetime, growth: float) -> No
             np.testing.assert_allclose(stock / grown[560:], stock[0] / grown[560], rtol=3e-3)
             np.testing.assert_allclose(discards / grown[560:], discards[0] / grown[560], rtol=3e-3)
         else:
-            env = VectorEnv(town(lifetime, grown[560:], initial=80.0, **kept), num_envs=1)
+            env = MultiAgentVectorEnv(town(lifetime, grown[560:], initial=80.0, **kept), num_envs=1)
             env.reset(seed=0)
             parts = env.physical.stock[env.rows.stages[1], 0]
             long = remaining(town(lifetime, grown[560:], history=history).nodes[1], 1.0)
@@ -236,7 +236,7 @@ def test_stages_belong_to_their_node() -> None:
     """Agents see the whole stock; a start is given for the node, or stage by stage, and a snapshot holds stages."""
     control = Control(kind=ControlKind.STRETCH, low=1.0, neutral=1.0, high=2.0)
     network = town(LIVES[0], initial=40.0, control=control, set_point=30.0)
-    env = VectorEnv(network, num_envs=2, observe="local")
+    env = MultiAgentVectorEnv(network, num_envs=2, observe="local")
     seen = env.reset(seed=0)
     assert seen["use"][0, env.observation_names["use"].index("stock of use")] == pytest.approx(40.0)
     assert env.observation_spaces["use"].contains(seen["use"][0])
@@ -303,7 +303,7 @@ def test_ages_are_those_of_cohorts(lifetime: Lifetime, stretch: float | Series) 
     changing: dict[str, Any] = {} if lifetime.distribution == "fixed" else {"stretch": stretch}
     history = Series(times=tuple(range(-40, 0)), values=tuple(INFLOW[:40]))
     network = town(lifetime, np.append(INFLOW[40:60], np.zeros(4)), initial=None, history=history, **changing)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     run = rollout(env, Neutral())
@@ -333,21 +333,21 @@ def test_shorter_lives_are_within_what_is_observed() -> None:
     """Flows that a stretch below 1 makes larger lie in the space, and are solved with as many steps as they need."""
     control = Control(kind=ControlKind.STRETCH, low=0.05, neutral=1.0, high=2.0)
     network = town(LIVES[0], np.full(6, 5.0), initial=45.0, control=control)
-    env = VectorEnv(network, num_envs=1, observe="full")
+    env = MultiAgentVectorEnv(network, num_envs=1, observe="full")
     seen = env.reset(seed=0)
     for _ in range(5):
         assert env.observation_spaces["use"].contains(seen["use"][0])
         seen = env.step({"use": np.array([[-1.0]])})[0]
     short = replace(network.nodes[1], control=None, lifetime=replace(LIVES[0], mean=0.45, deviation=0.15))
     other = replace(network, nodes=(network.nodes[0], short, network.nodes[2]))
-    assert env.dynamics.substeps == VectorEnv(other, num_envs=1).dynamics.substeps
+    assert env.dynamics.substeps == MultiAgentVectorEnv(other, num_envs=1).dynamics.substeps
 
 
 def test_a_stretch_that_agents_set_makes_stocks_older() -> None:
     """The pyramid follows what they did."""
     control = Control(kind=ControlKind.STRETCH, low=0.5, neutral=1.0, high=2.0)
     network = town(LIVES[0], np.full(30, 5.0), initial=45.0, control=control)
-    env, means = VectorEnv(network, num_envs=1), []
+    env, means = MultiAgentVectorEnv(network, num_envs=1), []
     for action in (-1.0, -1 / 3, 1.0):
         env.reset(seed=0)
         start = env.rows.stocks(env.physical.stock)[:, 0].copy()
@@ -360,7 +360,7 @@ def test_a_stretch_that_agents_set_makes_stocks_older() -> None:
 
 def test_an_episode_is_written_with_its_ages(tmp_path: Path) -> None:
     """Mean ages in the table, masses by age in a second one, and a picture."""
-    env = VectorEnv(town(LIVES[0], INFLOW[:5], initial=30.0), num_envs=1)
+    env = MultiAgentVectorEnv(town(LIVES[0], INFLOW[:5], initial=30.0), num_envs=1)
     begun = beginning(env)
     run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
     files = write_trajectory(tmp_path, "town", env, begun, run, "a town")
@@ -381,7 +381,7 @@ def test_an_episode_is_written_with_its_ages(tmp_path: Path) -> None:
 def test_the_oldest_stay_in_their_class() -> None:
     """Of what nothing is added to, all that is left is old, and none of it is lost from the pyramid."""
     network = town(LIVES[0], np.zeros(16), initial=40.0)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     run = rollout(env, Neutral())
@@ -402,9 +402,9 @@ def test_lifetimes_are_shown() -> None:
 def test_narrow_lifetimes_are_remarked_on() -> None:
     """With the error of their chain; others are not."""
     narrow = Lifetime(mean=20.0, deviation=1.0, distribution="normal")
-    (said,) = [each for each in remarks(town(narrow, initial=1.0)) if "lifetime" in each]
+    (said,) = [each for each in lint_warnings(town(narrow, initial=1.0)) if "lifetime" in each]
     assert narrow.chain is not None and f"within {narrow.chain.error:.1%}" in said and "20 ± 1 year" in said
-    assert not [each for each in remarks(town(LIVES[0], initial=1.0)) if "lifetime" in each]
+    assert not [each for each in lint_warnings(town(LIVES[0], initial=1.0)) if "lifetime" in each]
 
 
 ENDED, LATE = Series(times=(-5.0,), values=(1.0,), until=-2.0), Series(times=(1.0,), values=(1.0,))

@@ -11,7 +11,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from cirl_marl import LearnerError, VectorEnv
+from cirl_marl import LearnerError, MultiAgentVectorEnv
 from cirl_marl.learners.lockstep import Interrupted, Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.seat import Seat
 from cirl_marl.learners.streams import Streams
@@ -22,7 +22,7 @@ COPIES = 3
 
 def make_world(agents: list[str] | None = None) -> NetworkWorld:
     """Seat the agents of a short copper_net."""
-    env = VectorEnv("copper_net", num_envs=COPIES, agents=agents, horizon=HORIZON)
+    env = MultiAgentVectorEnv("copper_net", num_envs=COPIES, agents=agents, horizon=HORIZON)
     return NetworkWorld(env, seeds=[11, 12, 13])
 
 
@@ -62,11 +62,11 @@ def participants(world: NetworkWorld, learn: dict[str, Callable[[], None]]) -> l
 
 
 def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
-    """Every seat sees exactly what ``VectorEnv`` gives its agent, and the true last observation at a time limit."""
+    """Every seat sees just what ``MultiAgentVectorEnv`` gives its agent, and the true last observation at the end."""
     world = make_world()
     first = {agent: seat.handed.seen for agent, seat in world.seats.items()}
     seen = run_scripted(world, dict.fromkeys(world.seats, HORIZON + 2))
-    env = VectorEnv("copper_net", num_envs=COPIES, horizon=HORIZON)
+    env = MultiAgentVectorEnv("copper_net", num_envs=COPIES, horizon=HORIZON)
     by_hand = env.reset(seed=[11, 12, 13])
     actions = {agent: np.zeros((COPIES, 1)) for agent in env.agents}
     assert all(np.array_equal(np.asarray(first[agent]), by_hand[agent]) for agent in env.agents)

@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 
-from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Network, Node, VectorEnv, load_network
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    load_network,
+)
 from cirl_marl.controllers import LQR, LinearSystem
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network import Floats
@@ -19,9 +30,9 @@ from cirl_marl.network.series import Series
 MEASURED = ("urban_air",)
 
 
-def started(name: str = "carbo_net", scenario: str | None = "paper", **options: Any) -> tuple[LQR, VectorEnv]:
+def started(name: str = "carbo_net", scenario: str | None = "paper", **options: Any) -> tuple[LQR, MultiAgentVectorEnv]:
     """Return a controller that was started in the initial state of a network, and the environment."""
-    env = VectorEnv(name, num_envs=1, scenario=scenario)
+    env = MultiAgentVectorEnv(name, num_envs=1, scenario=scenario)
     env.reset(0)
     controller = LQR(**options)
     controller.start(env, 0)
@@ -127,7 +138,7 @@ def cost_until(time: float, closed: Floats, weight: Floats, distance: Floats) ->
 @pytest.mark.parametrize("name", ["carbo_net", "copper_net"])
 def test_system_is_what_the_simulator_does(name: str) -> None:
     """A, B and c predict the Euler step of the paper scenario from random stocks and controls."""
-    env = VectorEnv(name, num_envs=20, scenario="paper")
+    env = MultiAgentVectorEnv(name, num_envs=20, scenario="paper")
     system = LinearSystem.of(env.network)
     rng = np.random.default_rng(3)
     initial: dict[str, Any] = {node: rng.uniform(100.0, 1000.0, 20) for node in system.states}
@@ -169,7 +180,7 @@ def held_loop(interval: float, steps: int) -> tuple[Floats, LQR]:
     """Return the simulated states of carbo_net, exactly solved, after each interval of full-state feedback."""
     options = {"control_interval": interval, "solver": "exact", "solver_step": None, "horizon": steps + 1}
     network = load_network("carbo_net", scenario="paper").with_options(episode=options)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     observations = env.reset(0)
     controller = LQR()
     controller.start(env, 0)
@@ -205,7 +216,7 @@ def test_gains_are_those_of_continuous_time() -> None:
 
 def test_demand_is_clipped_to_the_bounds() -> None:
     """In the default scenario of carbo_net a demand below 0 captures nothing, one above 800 t/d just that."""
-    env = VectorEnv("carbo_net", num_envs=2, agents=["urban_to_capture"])
+    env = MultiAgentVectorEnv("carbo_net", num_envs=2, agents=["urban_to_capture"])
     initial: dict[str, Any] = {"urban_air": np.array([100.0, 3000.0]), "vehicles": 100.0, "heaters": 100.0}
     observations = env.reset(0, options={"initial_state": {**initial, "adjacent_air": 500.0}})
     controller = LQR(set_points={"urban_air": 100.0})
@@ -219,7 +230,7 @@ def test_agents_that_it_does_not_drive_are_neutral() -> None:
     """With agents=... it acts where others have rate controls, as it would alone."""
     controller, env = started("copper_net", None, agents=["use_to_collection"])
     alone = LQR()
-    env_alone = VectorEnv("copper_net", num_envs=1, agents=["use_to_collection"])
+    env_alone = MultiAgentVectorEnv("copper_net", num_envs=1, agents=["use_to_collection"])
     env_alone.reset(0)
     alone.start(env_alone, 0)
     actions = controller.act({})
@@ -250,7 +261,7 @@ def chain(**changes: Any) -> Network:
 def test_store_without_outflow_of_its_own() -> None:
     """A stock that only control empties is an integrator in reach: it is brought to its set-point."""
     controller = LQR()
-    run = rollout(VectorEnv(chain(), num_envs=2), controller)
+    run = rollout(MultiAgentVectorEnv(chain(), num_envs=2), controller)
     assert controller.system.states == ("a", "b")
     np.testing.assert_allclose(np.concatenate(controller.system.equilibrium()), [10.0, 4.0, 2.0], rtol=1e-12)
     np.testing.assert_allclose(run.stock[-1, 1:3], [10.0, 4.0], rtol=1e-3)

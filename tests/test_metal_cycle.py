@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cirl_marl import VectorEnv, load_network
+from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Constant
-from cirl_marl.controllers.remarks import remarks
+from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.rollout import beginning, rollout
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
@@ -48,7 +48,7 @@ def test_flows_of_thirty_years_against_closed_forms(action: float | None, mining
 
     Without ore the stock falls short of a demand that grows, by a share that is another in each year.
     """
-    env = VectorEnv(load_network(EXAMPLE), num_envs=1)
+    env = MultiAgentVectorEnv(load_network(EXAMPLE), num_envs=1)
     begun = beginning(env)
     held = {} if action is None else {"old_scrap": action}
     run = rollout(env, Constant(held if mining else held | {"smelting": -1.0}), seed=begun.seed, start=begun.given)
@@ -70,7 +70,7 @@ def test_flows_of_thirty_years_against_closed_forms(action: float | None, mining
 def test_the_difference_is_to_what_is_neutral_that_year(circularity: str) -> None:
     """λ − λ of a second network, put into the same state, in which that agent did what is neutral in this year."""
     envs = [
-        VectorEnv(load_network(EXAMPLE), num_envs=2, reward=reward, circularity=circularity)
+        MultiAgentVectorEnv(load_network(EXAMPLE), num_envs=2, reward=reward, circularity=circularity)
         for reward in ("difference", "circularity")
     ]
     env, imagined = envs
@@ -96,4 +96,4 @@ def test_the_difference_is_to_what_is_neutral_that_year(circularity: str) -> Non
 
 def test_nothing_is_remarked_on() -> None:
     """Neither a source too small nor a valve taken for a share."""
-    assert not list(remarks(load_network(EXAMPLE)))
+    assert not list(lint_warnings(load_network(EXAMPLE)))

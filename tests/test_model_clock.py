@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from cirl_marl import Arc, Episode, Law, Network, Node, VectorEnv
+from cirl_marl import Arc, Episode, Law, MultiAgentVectorEnv, Network, Node
 from cirl_marl.compartments import ContinuousModel, Outflowing, OwnStepModel, RewardState
 from cirl_marl.network import Floats
 
@@ -65,7 +65,7 @@ def test_a_model_in_hours_decays_in_a_network_of_days(model: _Continuous | _OwnS
         episode=Episode(control_interval=0.25, horizon=2, solver="rk4", solver_step=0.0125),
         time_unit="day",
     )
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     outcome = env.advance(np.zeros((0, 1)))
     assert env.physical.inner[0, 0] == pytest.approx(5.0 * math.exp(-0.6), rel=1e-7)

@@ -16,12 +16,12 @@ from cirl_marl import (
     ControlKind,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     Network,
     Node,
     Objective,
     Role,
     Service,
-    VectorEnv,
 )
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.optimum import NoCertificate, Plan, bound, envelope
@@ -50,14 +50,14 @@ def test_single_valve() -> None:
     """Extraction a·w·x from a reserve is least at the lowest w: λ̄ = −x_0 (1 − e^{−a w̲ T})/T."""
     arc = Arc(id="extraction", donor="reserve", recipient="use", rate=0.4, control=VALVE)
     network = Network(name="valve", nodes=(RESERVE, USE), arcs=(arc,), episode=Episode(control_interval=0.5, horizon=8))
-    run = rollout(VectorEnv(network, num_envs=1), MPC())
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), MPC())
     assert run.episode_circularity[0] == pytest.approx(-100 * (1 - math.exp(-0.4 * 0.5 * 4)) / 4, rel=1e-6)
 
 
 @pytest.mark.parametrize("replan", [1, 3])
 def test_equals_the_open_loop_plan_where_the_program_is_exact(replan: int) -> None:
     """A stock x in use that decays at the rate a needs U = a·x mined and loses as much: λ̄ = −2·a·x."""
-    env = VectorEnv(in_use(), num_envs=1)
+    env = MultiAgentVectorEnv(in_use(), num_envs=1)
     found = bound(in_use(), min_service=1.0, degree=4)
     planned = rollout(env, Plan(found))
     run = rollout(env, MPC(min_service=1.0, degree=4, replan=replan))
@@ -69,14 +69,16 @@ def test_equals_the_open_loop_plan_where_the_program_is_exact(replan: int) -> No
 @pytest.mark.parametrize("horizon", [1, 3])
 def test_a_short_window_sees_what_comes_after(horizon: int) -> None:
     """With prices on its last stocks a window as short as one interval plans as the whole episode does."""
-    run = rollout(VectorEnv(in_use(), num_envs=1), MPC(horizon=horizon, min_service=1.0, degree=4, replan=1))
+    run = rollout(MultiAgentVectorEnv(in_use(), num_envs=1), MPC(horizon=horizon, min_service=1.0, degree=4, replan=1))
     assert run.episode_circularity[0] == pytest.approx(-6.0, rel=1e-3)
     np.testing.assert_allclose(run.service, 1.0, atol=1e-4)
 
 
 def test_a_service_out_of_reach_is_approached() -> None:
     """From a stock of 2 a level of 1 throughout cannot be had: all is mined until the stock is there, then kept."""
-    run = rollout(VectorEnv(in_use(stock=2.0, horizon=10), num_envs=1), MPC(min_service=1.0, degree=3, replan=1))
+    run = rollout(
+        MultiAgentVectorEnv(in_use(stock=2.0, horizon=10), num_envs=1), MPC(min_service=1.0, degree=3, replan=1)
+    )
     rising = 2.0 * np.exp(-0.15 * np.arange(1, 3)) + 30.0 * (1 - np.exp(-0.15 * np.arange(1, 3)))
     np.testing.assert_allclose(run.service[0, :2], rising / 10, rtol=1e-6)
     np.testing.assert_allclose(run.service[0, 4:], 1.0, atol=1e-3)
@@ -106,7 +108,9 @@ def test_a_short_window_sees_what_comes_after_where_the_service_is_out_of_reach(
         objective=Objective(circularity_scale=scale),
     )
     whole, short = (
-        rollout(VectorEnv(chain, num_envs=1), MPC(horizon=horizon, min_service=1.0, replan=2)).episode_service[0]
+        rollout(
+            MultiAgentVectorEnv(chain, num_envs=1), MPC(horizon=horizon, min_service=1.0, replan=2)
+        ).episode_service[0]
         for horizon in (None, 4)
     )
     assert short == pytest.approx(whole, rel=0.005)
@@ -114,7 +118,7 @@ def test_a_short_window_sees_what_comes_after_where_the_service_is_out_of_reach(
 
 def test_weight_decides_whether_service_is_worth_its_price() -> None:
     """Without a weight nothing is mined; with a large one the service is kept."""
-    env = VectorEnv(in_use(), num_envs=1)
+    env = MultiAgentVectorEnv(in_use(), num_envs=1)
     idle, busy = (rollout(env, MPC(service_weight=weight)) for weight in (0.0, 100.0))
     assert idle.flow[:, 0].max() < 1e-6
     assert busy.episode_service[0] > 0.999
@@ -124,7 +128,7 @@ def test_weight_decides_whether_service_is_worth_its_price() -> None:
 @pytest.mark.parametrize(("name", "horizon"), [("copper_net", None), ("copper_net", 12), ("carbo_net", None)])
 def test_keeps_the_service_from_random_starts(name: str, horizon: int | None) -> None:
     """From drawn starts it meets the demanded level, nearer than open-loop plans, within 3 % of the bound."""
-    env = VectorEnv(name, num_envs=2, horizon=24)
+    env = MultiAgentVectorEnv(name, num_envs=2, horizon=24)
     env.reset(seed=11)
     starts = env.physical.stock[: len(env.network.nodes)].T.copy()
     demanded = 0.9
@@ -142,13 +146,13 @@ def test_keeps_the_service_from_random_starts(name: str, horizon: int | None) ->
 
 def test_every_copy_has_its_own_plan() -> None:
     """Copies side by side do what each does alone, and a second episode is planned from its own start."""
-    together = VectorEnv("carbo_net", num_envs=2, horizon=6)
+    together = MultiAgentVectorEnv("carbo_net", num_envs=2, horizon=6)
     run = rollout(together, MPC(min_service=0.9), seed=3)
     for i in range(2):
-        alone = rollout(VectorEnv("carbo_net", num_envs=1, horizon=6), MPC(min_service=0.9), seed=3 + i)
+        alone = rollout(MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=6), MPC(min_service=0.9), seed=3 + i)
         np.testing.assert_allclose(run.circularity[i], alone.circularity[0], rtol=1e-12)
     assert np.abs(run.circularity[0] - run.circularity[1]).max() > 1e-3
-    controller, lone = MPC(min_service=0.9), VectorEnv("carbo_net", num_envs=1, horizon=6)
+    controller, lone = MPC(min_service=0.9), MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=6)
     observations = lone.reset(seed=3)
     controller.start(lone, 0)
     for _ in range(6):  # the last of these starts the second episode
@@ -169,7 +173,7 @@ def test_every_copy_has_its_own_plan() -> None:
 )
 def test_networks_that_it_refuses(name: str, scenario: str | None, said: str) -> None:
     """Networks without linear flow laws are refused before the episode starts, with the reason."""
-    env = VectorEnv(name, num_envs=1, scenario=scenario)
+    env = MultiAgentVectorEnv(name, num_envs=1, scenario=scenario)
     env.reset(seed=0)
     with pytest.raises(NoCertificate, match=said):
         MPC().start(env, 0)
@@ -178,7 +182,7 @@ def test_networks_that_it_refuses(name: str, scenario: str | None, said: str) ->
 def test_a_new_episode_is_planned_anew() -> None:
     """After a restart within a step, a reset in mid-plan and a snapshot, the plan is one for the stocks there are."""
     network = replace(in_use(), nodes=(RESERVE, replace(USE, initial=(5.0, 20.0)), TIP))
-    env = VectorEnv(network, num_envs=1, horizon=4)
+    env = MultiAgentVectorEnv(network, num_envs=1, horizon=4)
     controller = MPC()
     env.reset(0)
     start = env.snapshot()
@@ -203,7 +207,7 @@ def test_a_new_episode_is_planned_anew() -> None:
 
 def test_the_episode_ends() -> None:
     """There is nothing to plan after the last decision."""
-    env = VectorEnv(in_use(), num_envs=1)
+    env = MultiAgentVectorEnv(in_use(), num_envs=1)
     controller = MPC()
     rollout(env, controller)
     with pytest.raises(ControlError, match="over after 8 steps"):

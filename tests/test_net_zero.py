@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cirl_marl import Network, VectorEnv, load_network
+from cirl_marl import MultiAgentVectorEnv, Network, load_network
 from cirl_marl.compartments import model_class
 from cirl_marl.network import Floats
 
@@ -27,7 +27,7 @@ def models(network: Network) -> tuple[Any, Any]:
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_circularity_is_removal_less_emission(scenario: str) -> None:
     """λ = −Δ(ṁ12 − ṁ23) at the end of each interval, and its mean follows from the atmosphere's stock."""
-    env = VectorEnv("net_zero", num_envs=3, scenario=scenario, horizon=10)
+    env = MultiAgentVectorEnv("net_zero", num_envs=3, scenario=scenario, horizon=10)
     env.reset(seed=0)
     network, rng = env.network, np.random.default_rng(0)
     digester, culture = models(network)
@@ -49,7 +49,7 @@ def test_circularity_is_removal_less_emission(scenario: str) -> None:
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_episode_closes_the_balance(scenario: str) -> None:
     """Carbon dioxide only changes its place, and λ̄ of an episode is the rate at which the atmosphere lost it."""
-    env = VectorEnv("net_zero", num_envs=3, scenario=scenario, horizon=30)
+    env = MultiAgentVectorEnv("net_zero", num_envs=3, scenario=scenario, horizon=30)
     env.reset(seed=4)
     start, rng, horizon = env.physical.stock[:3].copy(), np.random.default_rng(1), 30
     flow = np.zeros((2, 3))
@@ -139,7 +139,7 @@ def episodes(scenario: str) -> dict[str, Episode]:
     """Return an episode of each policy, all from the same start."""
     held = np.array(list(POLICIES.values())).T
     size = held.shape[1]
-    env = VectorEnv("net_zero", num_envs=size, scenario=scenario)
+    env = MultiAgentVectorEnv("net_zero", num_envs=size, scenario=scenario)
     env.reset(seed=[0] * size)
     actions = (held - [[0.5], [75.0]]) / [[0.2], [75.0]]
     actions = np.clip(actions, -1.0, 1.0)  # 0.7 − 0.5 is a bit more than 0.2
@@ -167,7 +167,7 @@ JUMPS = np.array([[0.9, -0.9], [-1.0, 1.0], [0.3, -0.2], [1.0, 0.4]])
 
 def day(network: Network) -> tuple[Floats, Floats]:
     """Return stocks and inner states before and after a day of jumping controls."""
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=3)
     start = np.concatenate([env.physical.stock[:3, 0], env.physical.inner[:, 0]])
     for actions in JUMPS:

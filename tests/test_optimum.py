@@ -23,11 +23,11 @@ from cirl_marl import (
     ControlKind,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     Network,
     Node,
     Role,
     Service,
-    VectorEnv,
     load_network,
 )
 from cirl_marl.controllers import Neutral
@@ -93,7 +93,7 @@ def episodes(network: Network, seed: int) -> tuple[Floats, Floats, Floats, Float
     The first copies hold extremes that change from step to step, the next uniform actions, the next constant extremes;
     the last is neutral.
     """
-    env = VectorEnv(network, num_envs=COPIES)
+    env = MultiAgentVectorEnv(network, num_envs=COPIES)
     env.reset(seed=0)
     rng = np.random.default_rng(seed)
     entries = len(env.stack(env.neutral_action))
@@ -168,7 +168,7 @@ def test_reach(network: Network, interval: float, seed: int) -> None:
     reached = ComparisonSystem(admissible).reach(starting_stocks(single, None), range(single.episode.horizon))
     *_, highest = episodes(single, seed)
     assert (highest <= reached.upper[:, : len(highest)].max(axis=0) * (1 + 1e-9) + 1e-12).all()
-    run = rollout(VectorEnv(single, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(single, num_envs=1), Neutral())
     dynamics = FlowLaws(single)
     steps = np.arange(single.episode.horizon)
     asked = dynamics.rate(np.repeat(dynamics.neutral[:, :1], len(steps), axis=1), steps).T
@@ -296,7 +296,7 @@ def test_exogenous_series_that_is_cut_still_bounds() -> None:
     """A demand above what the reserve holds moves all there is at most, and the bound claims no more than none."""
     arc = Arc(id="demand", donor="reserve", recipient="use", law=Law.EXOGENOUS, flow=80.0)
     found = bound(small([RESERVE, USE], [arc]))
-    run = rollout(VectorEnv(small([RESERVE, USE], [arc]), num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(small([RESERVE, USE], [arc]), num_envs=1), Neutral())
     assert run.episode_circularity[0] == pytest.approx(-100 / 4, rel=1e-9)
     assert run.episode_circularity[0] <= found.objective <= 0
 
@@ -307,7 +307,7 @@ def test_controls_held_to_first_order_lie_below_the_bound() -> None:
     start = starting_stocks(admissible.network, None)
     free, held = (Programs(admissible, 2, None, held=each).program(start) for each in (False, True))
     best, planned = (-float(problem.cost @ solve(problem).plan) for problem in (free, held))
-    neutral = rollout(VectorEnv("copper_net", num_envs=1, horizon=8), Neutral()).episode_circularity[0]
+    neutral = rollout(MultiAgentVectorEnv("copper_net", num_envs=1, horizon=8), Neutral()).episode_circularity[0]
     assert neutral < planned <= best + 1e-9
 
 
@@ -318,7 +318,7 @@ def test_gap_falls_with_the_degree() -> None:
         Arc(id="loss", donor="use", recipient="tip", rate=1.3),
     ]
     network = small([RESERVE, USE, TIP], arcs)
-    happens = rollout(VectorEnv(network, num_envs=1), Neutral()).episode_circularity[0]
+    happens = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral()).episode_circularity[0]
     gaps = [bound(network, degree=d).objective - happens for d in (1, 2, 3, 4)]
     assert min(gaps) > -1e-9
     assert all(later < earlier / 3 for earlier, later in pairwise(gaps)), gaps
@@ -387,7 +387,7 @@ def test_multipliers_of_one_level_bound_another() -> None:
 @pytest.mark.slow
 def test_few_solutions_bound_many_starts() -> None:
     """Ten days of copper from 12 drawn starts: three solutions prove within 1 % of what twelve do."""
-    env = VectorEnv("copper_net", num_envs=12, horizon=40)
+    env = MultiAgentVectorEnv("copper_net", num_envs=12, horizon=40)
     env.reset(seed=0)
     starts = env.physical.stock[: len(env.network.nodes)].T
     found = envelope("copper_net", starts, min_service=0.9, horizon=40, degree=1)
@@ -435,7 +435,7 @@ def test_plan_comes_close_to_the_bound(name: str) -> None:
     run = achieved(better)
     assert run.episode_service[0] > 0.99 - 1e-4
     assert 0 <= better.gap(run.episode_circularity)[0] < 0.01
-    env = VectorEnv(pinned(found), num_envs=1)
+    env = MultiAgentVectorEnv(pinned(found), num_envs=1)
     assert found.gap(rollout(env, Neutral()).episode_circularity)[0] > 0.3
 
 
@@ -449,7 +449,7 @@ def test_improvement_never_loses() -> None:
 
 def test_each_copy_follows_its_own_plan() -> None:
     """Plans for the starts of three copies, side by side, achieve what each achieves alone."""
-    env = VectorEnv("carbo_net", num_envs=3, horizon=6)
+    env = MultiAgentVectorEnv("carbo_net", num_envs=3, horizon=6)
     env.reset(seed=5)
     starts = env.physical.stock[: len(env.network.nodes)].T
     bounds = [bound("carbo_net", start, horizon=6) for start in starts]
@@ -463,14 +463,14 @@ def test_plan_refuses_what_it_was_not_made_for() -> None:
     """Another network, horizon, choice of agents, start or number of copies is an error, and so is a step too many."""
     found = bound("carbo_net", horizon=3)
     for env, said in (
-        (VectorEnv("copper_net", num_envs=1, horizon=3), "not for 'copper_net'"),
-        (VectorEnv("carbo_net", num_envs=1, horizon=4), "3 steps"),
-        (VectorEnv("carbo_net", num_envs=1, horizon=3, agents=["vehicles"]), "agents"),
-        (VectorEnv("carbo_net", num_envs=1, horizon=3), "it starts from"),
+        (MultiAgentVectorEnv("copper_net", num_envs=1, horizon=3), "not for 'copper_net'"),
+        (MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=4), "3 steps"),
+        (MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=3, agents=["vehicles"]), "agents"),
+        (MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=3), "it starts from"),
     ):
         with pytest.raises(ControlError, match=said):
             rollout(env, Plan(found))
-    env = VectorEnv(pinned(found), num_envs=3)
+    env = MultiAgentVectorEnv(pinned(found), num_envs=3)
     with pytest.raises(ControlError, match="2 plans for 3 copies"):
         rollout(env, Plan([found, found]))
     plan = Plan(replace(found, network=pinned(found)))
@@ -538,7 +538,7 @@ def test_a_network_of_five_thousand_nodes() -> None:
     programs = Programs(Admissible.of(network), degree, None)
     problem = programs.program(starting_stocks(network, None))
     assert problem.equal.shape[1] == 3 * programs.layout.size
-    run = rollout(VectorEnv(network, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     ends_of = problem.high.reshape(3, -1)[:, programs.layout.last]
     assert (run.stock <= ends_of * (1 + 1e-9)).all()
 

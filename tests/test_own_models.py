@@ -18,10 +18,10 @@ from cirl_marl import (
     DefinitionError,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     Network,
     Node,
     Role,
-    VectorEnv,
     load_network,
 )
 from cirl_marl.compartments import kind_of, model_class
@@ -58,7 +58,7 @@ def test_own_models_are_kept_and_come_back(tmp_path: Path, ppo_recipe: Recipe) -
     assert again.compartments == network.compartments
     lambdas = []
     for each in (network, again):
-        env = VectorEnv(each, num_envs=3)
+        env = MultiAgentVectorEnv(each, num_envs=3)
         env.reset(seed=0)
         for _ in range(20):
             infos = env.step({"tank": np.full((3, 1), 0.3)})[-1]

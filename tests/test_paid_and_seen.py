@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Service, VectorEnv
+from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Service
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.streams import Streams
 
@@ -43,7 +43,7 @@ SHIPPED = Network(
 @example(network=SHIPPED, seed=0)
 def test_who_is_neutral_makes_no_difference(circularity: str, network: Network, seed: int) -> None:
     """D = λ − λ had the agent been neutral is 0 for whoever is, whatever the others do and has been shipped before."""
-    env = VectorEnv(network, num_envs=2, reward="difference", circularity=circularity)
+    env = MultiAgentVectorEnv(network, num_envs=2, reward="difference", circularity=circularity)
     env.reset(seed)
     rng = np.random.default_rng(seed)
     for _ in range(network.episode.horizon):
@@ -57,7 +57,7 @@ def test_who_is_neutral_makes_no_difference(circularity: str, network: Network, 
 
 def test_mixed_reward_with_uneven_weights() -> None:
     """The reward is w·λ/scale + (1 − w)·local with w = 0.9; at a half nobody could tell the weights apart."""
-    env = VectorEnv("carbo_net", num_envs=2, reward="mixed", circularity_weight=0.9)
+    env = MultiAgentVectorEnv("carbo_net", num_envs=2, reward="mixed", circularity_weight=0.9)
     env.reset(3)
     rng = np.random.default_rng(0)
     for _ in range(4):
@@ -68,7 +68,7 @@ def test_mixed_reward_with_uneven_weights() -> None:
 
 def test_an_arc_sees_both_its_ends() -> None:
     """Its own flow, then the stocks that it leads from and to, each divided by the scale of its compartment."""
-    env = VectorEnv(SHIPPED, num_envs=1, agents=["belt"], observe="local")
+    env = MultiAgentVectorEnv(SHIPPED, num_envs=1, agents=["belt"], observe="local")
     env.reset(0)
     assert env.observation_names["belt"] == ("flow of belt", "stock of mine", "stock of works", "time")
     outcome = env.advance(np.zeros((1, 1)))
@@ -79,7 +79,7 @@ def test_an_arc_sees_both_its_ends() -> None:
 
 def test_a_delivery_is_seen_as_a_mass() -> None:
     """What a batch arc delivers in an interval is shown divided by its scale, not by the length of the interval."""
-    env = VectorEnv(SHIPPED, num_envs=1, agents=["mine"], observe="full")
+    env = MultiAgentVectorEnv(SHIPPED, num_envs=1, agents=["mine"], observe="full")
     env.reset(0)
     seen = env.observation_names["mine"].index("flow of ship")
     assert [env.advance(np.zeros((1, 1))).observation[seen, 0] for _ in range(3)] == pytest.approx([3.0, 1.2, 0.0])
@@ -87,11 +87,11 @@ def test_a_delivery_is_seen_as_a_mass() -> None:
 
 def test_an_episode_reports_the_means_over_its_own_steps() -> None:
     """λ̄ and the service level of an episode are means over its intervals; those of the one before do not count."""
-    env = VectorEnv("carbo_net", num_envs=2, horizon=3)
+    env = MultiAgentVectorEnv("carbo_net", num_envs=2, horizon=3)
     env.reset(0)
     rng = np.random.default_rng(0)
     service: list[Any] = []
-    twin = VectorEnv("carbo_net", num_envs=2, horizon=3)
+    twin = MultiAgentVectorEnv("carbo_net", num_envs=2, horizon=3)
     twin.reset(0)
     mean: list[Any] = []
     for step in range(1, 10):
@@ -108,7 +108,7 @@ def test_an_episode_reports_the_means_over_its_own_steps() -> None:
 
 def test_a_second_episode_has_a_return_of_its_own() -> None:
     """The return and the length that a learner is told are those of the episode that ended, and of no other."""
-    world = NetworkWorld(VectorEnv("carbo_net", num_envs=2, horizon=4), seeds=[1, 2])
+    world = NetworkWorld(MultiAgentVectorEnv("carbo_net", num_envs=2, horizon=4), seeds=[1, 2])
     seen: dict[str, list[Any]] = {name: [] for name in world.seats}
 
     def learner(name: str, steps: int) -> None:
@@ -139,6 +139,6 @@ def test_a_band_from_nothing_has_no_lower_end(stock: float, low: float, level: f
         arcs=(),
         services=(Service(id="kept", provider="heap", quantity="stock", low=low, high=8.0),),
     )
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(0)
     assert env.advance(np.zeros((0, 1))).service_level[0] == pytest.approx(level)

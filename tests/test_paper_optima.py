@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 import cirl_marl
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING, rollout
 from cirl_marl.network import Floats
@@ -36,7 +36,7 @@ def best_return(name: str, steps: int) -> float:
     tracked = network.objective.tracked
     rows = [network.node_index[node] for node in tracked]
     targets = np.array([[network.compartments[node].set_point, network.compartments[node].scale] for node in tracked])
-    env = VectorEnv(network, num_envs=steps + 1)
+    env = MultiAgentVectorEnv(network, num_envs=steps + 1)
 
     def play(actions: Floats) -> tuple[Floats, Floats]:
         """Return the residuals, shape (steps·tracked, copies), and the returns of ``actions``, (copies, steps)."""
@@ -94,10 +94,10 @@ def test_constant_actions_return_what_the_paper_reports(name: str, action: float
     assert evaluate(*made).mean < found.mean
 
 
-def play(name: str, act: Callable[[VectorEnv], Floats], seed: int) -> float:
+def play(name: str, act: Callable[[MultiAgentVectorEnv], Floats], seed: int) -> float:
     """Return the mean return in the evaluation episodes of a seed; ``act`` returns actions, shape (copies,)."""
     made = gymnasium.registry[ENVIRONMENTS[name].id].kwargs
-    env = VectorEnv(made["network"], num_envs=EVALUATION_COPIES, scenario=made["scenario"])
+    env = MultiAgentVectorEnv(made["network"], num_envs=EVALUATION_COPIES, scenario=made["scenario"])
     env.reset(seed=seed)
     returns = np.zeros(env.num_envs)
     episodes = EVALUATION_EPISODES // EVALUATION_COPIES
@@ -106,12 +106,12 @@ def play(name: str, act: Callable[[VectorEnv], Floats], seed: int) -> float:
     return float(returns.mean() / episodes)
 
 
-def hold(action: float) -> Callable[[VectorEnv], Floats]:
+def hold(action: float) -> Callable[[MultiAgentVectorEnv], Floats]:
     """Return constant control."""
     return lambda env: np.full(env.num_envs, action)
 
 
-def burn(env: VectorEnv) -> Floats:
+def burn(env: MultiAgentVectorEnv) -> Floats:
     """Bring the freeboard to 1000 °C as fast as can be; its temperature after a step is affine in the action."""
     row = env.dynamics.inner.names.index("incinerator.freeboard_degc")
     here, reached = env.snapshot(), []
@@ -134,7 +134,7 @@ def burn(env: VectorEnv) -> Floats:
     ],
 )
 def test_tuned_policies_against_the_best_in_the_same_episodes(
-    name: str, best: Callable[[VectorEnv], Floats], within: float
+    name: str, best: Callable[[MultiAgentVectorEnv], Floats], within: float
 ) -> None:
     """No force, heat where it lacks, no light, full light; and the optima of the tables are their means."""
     found = []
@@ -151,7 +151,7 @@ def test_tuned_policies_against_the_best_in_the_same_episodes(
 
 def test_light_makes_hardly_a_difference_to_droop() -> None:
     """From the same starts full light and none differ by 0.02 %, while the starts spread the returns by 28 %."""
-    env = VectorEnv("net_zero", num_envs=100, scenario="paper_droop")
+    env = MultiAgentVectorEnv("net_zero", num_envs=100, scenario="paper_droop")
     light, dark = (rollout(env, Constant({"microalgae": action})).returns[0] for action in (1.0, -1.0))
     assert 1e-4 < light.mean() / dark.mean() - 1 < 3e-4
     assert 0.2 < light.std() / light.mean() < 0.35

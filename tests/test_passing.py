@@ -21,17 +21,17 @@ from cirl_marl import (
     ControlKind,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     Network,
     NetworkError,
     Node,
     Role,
     Series,
     Service,
-    VectorEnv,
     parallel_env,
 )
 from cirl_marl.controllers import Constant
-from cirl_marl.controllers.remarks import remarks
+from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.dynamics.passes import Passes
@@ -62,7 +62,7 @@ def markets(count: int, arcs: list[Arc], **options: Any) -> Network:
 
 def moved(network: Network, action: float | None = None) -> dict[str, float]:
     """Return the mean flows of the first interval, under neutral control or with all controls at one action."""
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     actions = env.neutral_action if action is None else {a: np.full((1, 1), action) for a in env.agents}
     outcome = env.advance(env.stack(actions) if env.agents else np.empty((0, 1)))
@@ -115,7 +115,7 @@ def test_what_enters_leaves(seed: int, count: int) -> None:
         if i != j:
             arcs.append(share(f"m{i}", f"m{j}", float(rng.uniform(0, 0.1)), f"pass_{k}"))
     network = markets(count, arcs)
-    env = VectorEnv(network, num_envs=3)
+    env = MultiAgentVectorEnv(network, num_envs=3)
     env.reset(seed=seed)
     outcome = env.advance(np.empty((0, 3)))
     entering = np.zeros((len(network.nodes), 3))
@@ -185,7 +185,7 @@ def test_a_source_without_a_known_reserve_starts_with_what_may_be_asked() -> Non
     network = Network(name="endless", nodes=(replace(MINE, control=valve), USE), arcs=arcs, episode=Episode(horizon=4))
     asked = 1.5 * (3 + 5 + 5 + 5 + 2 + 2 + 4 + 4)
     np.testing.assert_allclose(network.initial[:, 0], asked, rtol=2e-6)
-    run = rollout(VectorEnv(network, num_envs=1), Constant({"mine": 1.0, "asked": 1.0}))
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Constant({"mine": 1.0, "asked": 1.0}))
     np.testing.assert_allclose(run.unmet, 0.0)
     np.testing.assert_allclose(run.stock[-1], [1e-6 * asked, asked], rtol=1e-3)
     longer = network.with_options(episode={"horizon": 6})
@@ -223,7 +223,7 @@ def test_series_of_shares_demands_and_bounds() -> None:
     arcs[1] = share("m0", "use", Series(times=(0.0, 2.0), values=(0.2, 0.4)), "b")
     service = Service(id="fed", provider="a", quantity="flow", low=Series(times=(0.0, 4.0), values=(1.0, 9.0)))
     network = markets(1, arcs, episode=Episode(horizon=4), services=(service,))
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     for step, neutral in enumerate((0.15, 0.25, 0.35, 0.45)):
         outcome = env.advance(env.stack(env.neutral_action))
@@ -239,7 +239,7 @@ def test_what_never_changes_takes_one_column() -> None:
     network = markets(3, arcs, episode=Episode(horizon=1_000_000))
     tracemalloc.start()
     try:
-        env = VectorEnv(network, num_envs=2, agents=["m0_m1"])
+        env = MultiAgentVectorEnv(network, num_envs=2, agents=["m0_m1"])
         env.reset(seed=0)
         tracemalloc.reset_peak()
         env.advance(env.stack(env.neutral_action))
@@ -315,7 +315,7 @@ def test_a_market_that_gets_nothing_is_remarked_on() -> None:
     """It passes nothing, which is seldom meant; one that is fed is silent."""
     network = markets(2, [share("m0", "use"), share("m1", "use")])
     said = "node 'm1': it stores nothing and nothing enters it, so that nothing ever leaves it"
-    assert [remark for remark in remarks(network) if "stores nothing" in remark] == [said]
+    assert [remark for remark in lint_warnings(network) if "stores nothing" in remark] == [said]
 
 
 @pytest.mark.parametrize("highs", [(0.7, 0.1, 0.2), (0.7, 0.2, 0.1), (0.7, 0.2, 0.1 - 1e-16), (0.7, 0.2, 0.1 - 1e-10)])

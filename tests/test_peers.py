@@ -22,7 +22,7 @@ from benchmarks.peers.watch import Judged, Lap, Record, TimeIsUp, Watch
 from cirl_marl import load_network
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.yardsticks import Yardstick
 from cirl_marl.learners import load_recipe
@@ -110,7 +110,7 @@ def test_scales_make_what_an_untrained_policy_sees_standard() -> None:
 
 def test_a_policy_of_a_peer_is_judged_by_what_it_does(scaling: Scaling) -> None:
     """Zeros, and actions beyond the bounds, are those constants to our simulator."""
-    env = VectorEnv(NETWORK, num_envs=3)
+    env = MultiAgentVectorEnv(NETWORK, num_envs=3)
     for value, given in ((0.0, 0.0), (1.0, 7.0)):
         acting = Acting(lambda seen, given=given: np.full((*seen.shape[:2], 1), given), scaling)  # type: ignore[misc]
         mine = rollout(env, acting, seed=1)
@@ -131,7 +131,7 @@ def test_the_clock_stands_still_while_policies_are_judged(tmp_path: Path, monkey
         return constant
 
     class Slow(Constant):
-        def start(self, env: VectorEnv, seed: int) -> None:
+        def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
             nonlocal now
             now += 100.0
             super().start(env, seed)

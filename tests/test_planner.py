@@ -16,7 +16,7 @@ from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Ob
 from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
 from cirl_marl.optimum import NoCertificate, Plan, achieved, bound, improved, program, search, solver
 from cirl_marl.optimum.mpc import MPC
@@ -90,7 +90,7 @@ def test_the_unit_of_mass_does_not_matter(tmp_path: Path) -> None:
         network = load_network(path)
         found = bound(network, min_service=0.98, horizon=10, degree=1)
         planned = achieved(improved(found))
-        env = VectorEnv(network, num_envs=1, horizon=6)
+        env = MultiAgentVectorEnv(network, num_envs=1, horizon=6)
         controlled = rollout(env, MPC(min_service=0.98), seed=3)
         masses = [found.objective, planned.episode_circularity[0], controlled.episode_circularity[0]]
         services = [found.service, planned.episode_service[0], controlled.episode_service[0]]
@@ -137,7 +137,7 @@ def test_the_first_settings_may_lie(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_mpc_goes_on_where_a_plan_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     """By its older plan, then neutrally; it says so, and plans anew once it can."""
     network = load_network("copper_net")
-    env = VectorEnv(network, num_envs=1, horizon=12)
+    env = MultiAgentVectorEnv(network, num_envs=1, horizon=12)
     usual = rollout(env, MPC(min_service=0.9), seed=1)
     controller, asked = MPC(min_service=0.9), 0
     solve = MPC._solved
@@ -192,7 +192,7 @@ def test_controllers_that_plan_set_shares() -> None:
     """MPC, the improved plan and the plan found by search beat neutral control where shares are set; none the bound."""
     network = cycle(hoarded=500.0)
     found = bound(network, service_weight=1.0)
-    env = VectorEnv(network, num_envs=2)
+    env = MultiAgentVectorEnv(network, num_envs=2)
     starts = starting_states(env) if env.reset(seed=0) else np.empty(0)
     assert starts[0] == pytest.approx(found.initial)
 

@@ -18,7 +18,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from small_networks import cycle, plain_networks
 
-from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Service, VectorEnv
+from cirl_marl import (
+    Arc,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    Objective,
+    Role,
+    Service,
+)
 from cirl_marl.network.series import Series
 from cirl_marl.network.splits import splits
 from cirl_marl.optimum import NoCertificate, bound
@@ -113,7 +125,7 @@ def play(
     Raises:
         AssertionError: if the oracle and the simulator disagree.
     """
-    env = VectorEnv(network, num_envs=1, agents=agents)
+    env = MultiAgentVectorEnv(network, num_envs=1, agents=agents)
     env.reset(seed=0)
     start = env.physical.stock[: len(network.stores), 0].copy()
     held: list[Controls] = []

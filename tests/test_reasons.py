@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pages import shown
 
 import cirl_marl
-from cirl_marl import CirlError, Network, RunError, VectorEnv, load_network
+from cirl_marl import CirlError, MultiAgentVectorEnv, Network, RunError, load_network
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.learners import train
@@ -44,7 +44,7 @@ FIRST = first_seed(0)
 class Known(Policies):
     """Agents that do what functions of their observations say, which can be differentiated."""
 
-    def __init__(self, env: VectorEnv, does: dict[str, Callable[[torch.Tensor], torch.Tensor]]) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, does: dict[str, Callable[[torch.Tensor], torch.Tensor]]) -> None:
         """Let each agent of ``env`` act by its function, the others do nothing."""
         policies = {}
         for agent in env.agents:
@@ -63,10 +63,10 @@ class Known(Policies):
         }
 
 
-def copper(copies: int = 4, horizon: int = 12) -> VectorEnv:
+def copper(copies: int = 4, horizon: int = 12) -> MultiAgentVectorEnv:
     """Return a few copies of a short copper_net with two agents."""
     agents = ["use_to_collection", "mine_to_refinery"]
-    return VectorEnv("copper_net", num_envs=copies, horizon=horizon, agents=agents)
+    return MultiAgentVectorEnv("copper_net", num_envs=copies, horizon=horizon, agents=agents)
 
 
 def test_a_linear_policy_is_attributed_exactly() -> None:
@@ -104,7 +104,7 @@ def dated(network: Network) -> Network:
 def test_a_rule_is_found_again() -> None:
     """From 2031 on, while a stock is above a number, and not else: the tree says so, in years and in mass."""
     network = dated(load_network("copper_net"))
-    env = VectorEnv(network, num_envs=32, agents=["use_to_collection", "mine_to_refinery"])
+    env = MultiAgentVectorEnv(network, num_envs=32, agents=["use_to_collection", "mine_to_refinery"])
     names = env.observation_names["use_to_collection"]
     time, stock = names.index("time"), names.index("stock of use")
     scale = network.compartments["use"].scale

@@ -13,7 +13,7 @@ import pytest
 from small_networks import ONE_OF_EACH
 
 import cirl_marl
-from cirl_marl import CirlError, DefinitionError, RecipeError, VectorEnv
+from cirl_marl import CirlError, DefinitionError, MultiAgentVectorEnv, RecipeError
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.learners import Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import algorithms, parameter_mistakes, parameters_of
@@ -205,12 +205,12 @@ def test_mistakes_of_all_kinds_are_named_together(tmp_path: Path) -> None:
 
 
 def test_options_are_those_of_the_environment() -> None:
-    """Recipes may say what ``VectorEnv`` takes, in its words."""
-    taken = set(inspect.signature(VectorEnv).parameters) - {"network", "num_envs", "agents"}
+    """Recipes may say what ``MultiAgentVectorEnv`` takes, in its words."""
+    taken = set(inspect.signature(MultiAgentVectorEnv).parameters) - {"network", "num_envs", "agents"}
     assert set(Options.model_fields) == taken
     words = get_args(Options.model_fields["circularity"].annotation)
     with pytest.raises(CirlError, match=rf"unknown circularity 'ends'.* Known: {', '.join(words)}\."):
-        VectorEnv("copper_net", num_envs=1, circularity="ends")
+        MultiAgentVectorEnv("copper_net", num_envs=1, circularity="ends")
 
 
 def test_mistakes_that_need_the_network_are_named(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from paper_classes import trajectory
 from scipy.integrate import solve_ivp
 from small_networks import constant
 
-from cirl_marl import CirlError, Law, VectorEnv, load_network, parallel_env, single_agent_env
+from cirl_marl import CirlError, Law, MultiAgentVectorEnv, load_network, parallel_env, single_agent_env
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.environments.registration import PAPER_ENVIRONMENTS
 
@@ -81,7 +81,7 @@ def test_euler_of_the_networks_is_first_order(name: str) -> None:
     for refine in (1, 2, 4):
         step = 5e-5 / refine
         episode = {"control_interval": step, "solver_step": step, "horizon": round(span / step)}
-        env = VectorEnv(network.with_options(episode=episode), num_envs=1)
+        env = MultiAgentVectorEnv(network.with_options(episode=episode), num_envs=1)
         env.reset(seed=0)
         if refine == 1:
             start = env.physical.stock[:, 0].copy()
@@ -117,7 +117,7 @@ def test_one_agent_is_all_agents_with_the_others_neutral(network: str, agent: st
     first, _ = one.reset(seed=5)
     np.testing.assert_array_equal(first, all_.reset(seed=5)[0][agent])
     rng = np.random.default_rng(0)
-    held = VectorEnv(network, num_envs=1).neutral_action  # in float64, as nobody acting holds it
+    held = MultiAgentVectorEnv(network, num_envs=1).neutral_action  # in float64, as nobody acting holds it
     neutral = {each: action[0] for each, action in held.items()}
     for _ in range(30):
         action = rng.uniform(-1, 1, one.action_space.shape).astype(np.float32)
@@ -158,7 +158,7 @@ def test_eigenvalues(name: str, eigenvalues: list[float]) -> None:
 def test_equilibrium_of_copper_net() -> None:
     """At u = 1 kt/d the set-points are the equilibrium, and λ = −5.28 kt."""
     network = load_network("copper_net", scenario="paper")
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(0, options={"initial_state": {n.id: n.set_point for n in network.nodes if n.set_point is not None}})
     before = env.physical.stock[:-1].copy()
     outcome = env.advance(np.array([[1e-6]]))

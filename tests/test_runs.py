@@ -14,7 +14,7 @@ from small_networks import constant
 from stable_baselines3.common.vec_env import VecNormalize
 
 import cirl_marl
-from cirl_marl import RunError, VectorEnv
+from cirl_marl import MultiAgentVectorEnv, RunError
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners import run as learners_run
@@ -205,8 +205,8 @@ def test_policies_act_on_what_they_learnt_to_see(copper_run: Path) -> None:
     """An environment that shows something else is refused, with what it shows; options make the difference."""
     policy = Trained(copper_run)
     with pytest.raises(RunError, match=r"learnt from other observations .* with the options of the run"):
-        policy.start(VectorEnv("copper_net", num_envs=2, observe="full"), seed=0)
-    rollout(VectorEnv("copper_net", num_envs=2, horizon=3), policy, seed=0)
+        policy.start(MultiAgentVectorEnv("copper_net", num_envs=2, observe="full"), seed=0)
+    rollout(MultiAgentVectorEnv("copper_net", num_envs=2, horizon=3), policy, seed=0)
 
 
 def test_failed_writing_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:

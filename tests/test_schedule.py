@@ -12,13 +12,13 @@ from small_networks import constant
 from cirl_marl.controllers import Constant, Neutral, Random
 from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.controllers.schedule import schedule
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 
 
 def test_neutral_plan_holds_the_neutral_controls() -> None:
     """Valve factors and orders are the definition's neutral values, at every interval, in its units."""
-    env = VectorEnv("copper_net", num_envs=1, horizon=4)
+    env = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=4)
     found = schedule(env, Neutral())
     table = dict(zip(found.header, found.columns, strict=True))
     np.testing.assert_allclose(table["from (day)"], [0.0, 0.25, 0.5, 0.75])
@@ -33,7 +33,7 @@ def test_neutral_plan_holds_the_neutral_controls() -> None:
 
 def test_orders_have_the_unit_of_a_flow() -> None:
     """A control that sets a flow is tabulated in mass/time, at the value that the action stands for."""
-    env = VectorEnv("carbo_net", num_envs=1, horizon=2)
+    env = MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=2)
     agent, control = next(
         (a, c) for a in env.agents if (c := env.network.compartments[a].control) is not None and c.kind.value == "flow"
     )
@@ -45,21 +45,21 @@ def test_orders_have_the_unit_of_a_flow() -> None:
 
 def test_inputs_of_models_are_named() -> None:
     """Inputs carry the name of the model, which ends in the unit; the physics runs from mid-range stocks."""
-    found = schedule(VectorEnv("net_zero", num_envs=1, horizon=3), Neutral())
+    found = schedule(MultiAgentVectorEnv("net_zero", num_envs=1, horizon=3), Neutral())
     assert {"digester: dilution_per_day", "microalgae: light_umol_m2_s"} <= set(found.header)
     assert np.isfinite(found.columns).all()
 
 
 def test_batches_are_no_outflow() -> None:
     """What leaves a node in batches is not counted as its outflow, of which their arrivals would be no measure."""
-    found = schedule(VectorEnv("solids_net", num_envs=1, scenario="reacher", horizon=3), Neutral())
+    found = schedule(MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher", horizon=3), Neutral())
     assert any(name.startswith("sorter: ") for name in found.header)
     assert not any("total outflow" in name for name in found.header)
 
 
 def test_seeded_plan_is_an_episode_of_the_evaluation() -> None:
     """With a seed the plan is the first episode that an evaluation with this seed sees; else it starts mid-range."""
-    env = VectorEnv("copper_net", num_envs=1, horizon=3)
+    env = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=3)
     found = schedule(env, Random(), seed=2)
     again = rollout(env, Random(), seed=first_seed(2))
     np.testing.assert_array_equal(found.rollout.circularity, again.circularity)
@@ -68,7 +68,7 @@ def test_seeded_plan_is_an_episode_of_the_evaluation() -> None:
 
 def test_file(tmp_path: Path) -> None:
     """A header and a row for each interval; no folder, no file."""
-    found = schedule(VectorEnv("copper_net", num_envs=1, horizon=5), Neutral())
+    found = schedule(MultiAgentVectorEnv("copper_net", num_envs=1, horizon=5), Neutral())
     found.write(tmp_path / "plan.csv")
     with (tmp_path / "plan.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
@@ -81,4 +81,4 @@ def test_file(tmp_path: Path) -> None:
 def test_several_copies_are_refused() -> None:
     """A plan is of one episode."""
     with pytest.raises(CirlError, match="of one copy"):
-        schedule(VectorEnv("copper_net", num_envs=2), Neutral())
+        schedule(MultiAgentVectorEnv("copper_net", num_envs=2), Neutral())

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_networks import PLAYED
 
-from cirl_marl import CirlError, ControlError, VectorEnv, load_network
+from cirl_marl import CirlError, ControlError, MultiAgentVectorEnv, load_network
 from cirl_marl.compartments import model_class, models
 from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.controllers import Neutral, Scripted
@@ -30,7 +30,7 @@ def script_of(model: Any) -> bool:
 @pytest.mark.parametrize(("name", "scenario"), CATALOGUE)
 def test_agents_without_a_script_are_neutral(name: str, scenario: str) -> None:
     """The others act, if not at once then somewhere in the observation space."""
-    env = VectorEnv(name, num_envs=3, scenario=scenario)
+    env = MultiAgentVectorEnv(name, num_envs=3, scenario=scenario)
     observations = env.reset(0)
     controller, neutral = Scripted(), Neutral()
     controller.start(env, 0)
@@ -70,14 +70,16 @@ def test_actions_are_bounded(data: st.DataObject, scenario: str) -> None:
     env.stack(controller.act(seen))
 
 
-ENVS = {scenario: VectorEnv("solids_net", num_envs=2, scenario=scenario) for scenario in ("default", "reacher")}
+ENVS = {
+    scenario: MultiAgentVectorEnv("solids_net", num_envs=2, scenario=scenario) for scenario in ("default", "reacher")
+}
 
 
 @pytest.mark.parametrize("scenario", ["default", "reacher"])
 def test_copies_do_not_notice_each_other(scenario: str) -> None:
     """The action of a copy is a function of what that copy sees, and the script keeps no memory."""
-    env = VectorEnv("solids_net", num_envs=3, scenario=scenario)
-    alone = VectorEnv("solids_net", num_envs=1, scenario=scenario)
+    env = MultiAgentVectorEnv("solids_net", num_envs=3, scenario=scenario)
+    alone = MultiAgentVectorEnv("solids_net", num_envs=1, scenario=scenario)
     many, one = Scripted(), Scripted()
     many.start(env, 0)
     one.start(alone, 0)
@@ -95,7 +97,7 @@ def test_copies_do_not_notice_each_other(scenario: str) -> None:
 
 def test_held_agents_do_not_listen() -> None:
     """A constant is held for an agent with a script and for one without; unknown agents and values are errors."""
-    env = VectorEnv("solids_net", num_envs=2)
+    env = MultiAgentVectorEnv("solids_net", num_envs=2)
     observations = env.reset(0)
     controller = Scripted({"truck": 0.25})
     controller.start(env, 0)
@@ -113,7 +115,7 @@ def test_started_again_it_serves_another_network() -> None:
     """Nothing of the first network is left."""
     controller = Scripted()
     controller.start(ENVS["default"], 0)
-    env = VectorEnv("copper_net", num_envs=2)
+    env = MultiAgentVectorEnv("copper_net", num_envs=2)
     controller.start(env, 0)
     assert set(controller.act(env.reset(0))) == set(env.agents)
 
@@ -121,7 +123,7 @@ def test_started_again_it_serves_another_network() -> None:
 def test_what_is_not_seen_is_named() -> None:
     """An agent that observes stocks alone cannot follow its script, and the error says what is missing."""
     network = load_network("solids_net").with_options(observation={"nodes": ("reservoir", "sorter"), "mode": "stocks"})
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     controller = Scripted()
     controller.start(env, 0)
     with pytest.raises(ControlError, match="scripted control of 'sorter' needs to see its state 'grip_x'"):
@@ -131,7 +133,10 @@ def test_what_is_not_seen_is_named() -> None:
 @pytest.mark.parametrize("observe", ["neighbours", "full"])
 def test_wider_observations_change_nothing(observe: str) -> None:
     """The script reads its own states by name, wherever they are."""
-    usual, wide = VectorEnv("solids_net", num_envs=2), VectorEnv("solids_net", num_envs=2, observe=observe)
+    usual, wide = (
+        MultiAgentVectorEnv("solids_net", num_envs=2),
+        MultiAgentVectorEnv("solids_net", num_envs=2, observe=observe),
+    )
     actions = []
     for env in (usual, wide):
         controller = Scripted()
@@ -172,12 +177,12 @@ def test_the_incinerator_s_script_knows_its_set_point() -> None:
     for target in (900.0, 1000.0):
         model = Incinerator(target_degc=target)
         nodes = tuple(replace(each, model=model) if each.id == "incinerator" else each for each in base.nodes)
-        env = VectorEnv(replace(base, nodes=nodes), num_envs=1, horizon=2000)
+        env = MultiAgentVectorEnv(replace(base, nodes=nodes), num_envs=1, horizon=2000)
         run = rollout(env, Scripted({"sorter": 0.0}), seed=6)
         assert inside(env, "incinerator.freeboard_degc", run)[-1] == pytest.approx(target, abs=30.0)
 
 
-def inside(run_of: VectorEnv, name: str, run: Any) -> Floats:
+def inside(run_of: MultiAgentVectorEnv, name: str, run: Any) -> Floats:
     """Return a visible inner state of the first copy over time, shape (steps,)."""
     names = [run_of.dynamics.inner.names[row] for row in run_of.dynamics.inner.visible]
     values: Floats = run.inner[:, names.index(name)]
@@ -187,7 +192,7 @@ def inside(run_of: VectorEnv, name: str, run: Any) -> Floats:
 @pytest.mark.medium
 def test_scripts_are_worth_having() -> None:
     """The truck brings 3 items in 4 s and rests at home; from half-way the freeboard is nearer to 1000 °C."""
-    env = VectorEnv("solids_net", num_envs=1, scenario="reacher")
+    env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")
     scripted, neutral = (rollout(env, controller, seed=6) for controller in (Scripted({"sorter": 0.0}), Neutral()))
     aboard = inside(env, "truck.destination_m", scripted) > 0.0
     trips = np.diff(np.flatnonzero(np.diff(aboard.astype(int))))[::2] * 0.02

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from small_networks import PLAYED
 
-from cirl_marl import Arc, CirlError, ControlError, Network, Node, Role, VectorEnv, load_network
+from cirl_marl import Arc, CirlError, ControlError, MultiAgentVectorEnv, Network, Node, Role, load_network
 from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.optimum import Incumbent, Plan, bound, search, search_each, standard_candidates
@@ -26,7 +26,7 @@ EVERYWHERE = PLAYED
 def test_plan_achieves_what_it_says_and_no_less_than_its_candidates(name: str, scenario: str | None) -> None:
     """In each network a lone copy that replays the plan earns the figures that it was chosen for."""
     found = search(name, scenario=scenario, horizon=6, service_weight=1.0, knots=2, population=8, iterations=2)
-    env = VectorEnv(name, scenario=scenario, num_envs=1, horizon=6)
+    env = MultiAgentVectorEnv(name, scenario=scenario, num_envs=1, horizon=6)
     run = rollout(env, Plan(found))
     assert run.episode_circularity[0] == pytest.approx(found.circularity, rel=1e-12)
     assert run.episode_service[0] == pytest.approx(found.service, rel=1e-12)
@@ -89,7 +89,7 @@ def test_same_seed_finds_the_same_plan() -> None:
 @pytest.mark.medium
 def test_starts_are_searched_side_by_side_as_they_are_alone() -> None:
     """Plans from three starts, inner states included, equal those found one by one, and each copy follows its own."""
-    env = VectorEnv("net_zero", num_envs=3, horizon=4)
+    env = MultiAgentVectorEnv("net_zero", num_envs=3, horizon=4)
     env.reset(seed=EVALUATION_SEEDS)
     starts = starting_states(env)
     assert (starts[0] != starts[1]).any()
@@ -105,7 +105,7 @@ def test_starts_are_searched_side_by_side_as_they_are_alone() -> None:
 def test_starts_by_name() -> None:
     """Stocks and inner states may be given by name; the others are those of the first evaluated episode."""
     first = search("net_zero", horizon=2, knots=1, iterations=0)
-    env = VectorEnv("net_zero", num_envs=1, horizon=2)
+    env = MultiAgentVectorEnv("net_zero", num_envs=1, horizon=2)
     named = env.state_names[len(env.network.nodes)]
     row = len(env.network.nodes)
     other = search("net_zero", {named: first.initial[row] * 1.01}, horizon=2, knots=1, iterations=0)
@@ -120,12 +120,12 @@ def test_optimum_control_searches_where_nothing_is_proved(monkeypatch: pytest.Mo
     """Each copy of net_zero follows the plan found from its own start, and the controller says that it is no more."""
     monkeypatch.setattr("cirl_marl.optimum.controller.search_each", partial(search_each, population=8, iterations=2))
     controller = Optimum(service_weight=1.0)
-    run = rollout(VectorEnv("net_zero", num_envs=2, horizon=3), controller)
+    run = rollout(MultiAgentVectorEnv("net_zero", num_envs=2, horizon=3), controller)
     assert controller.note.startswith("best plan found, no certificate: network 'net_zero'")
     found = [plan.circularity for plan in controller.plans if isinstance(plan, Incumbent)]
     assert len(found) == 2
     np.testing.assert_allclose(run.episode_circularity, found, rtol=1e-12)
-    rollout(VectorEnv("carbo_net", num_envs=1, horizon=3), controller)
+    rollout(MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=3), controller)
     assert controller.note == ""
 
 
@@ -133,14 +133,14 @@ def test_any_controller_may_be_a_candidate() -> None:
     """A random controller can only be replayed: the plan is what it did in the best copy."""
     found = search("carbo_net", horizon=5, candidates={"random": Random()}, population=8, iterations=2, knots=1)
     assert found.origin == "random"
-    env = VectorEnv("carbo_net", num_envs=1, horizon=5)
+    env = MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=5)
     assert rollout(env, Plan(found)).episode_circularity[0] == pytest.approx(found.circularity, rel=1e-12)
 
 
 def test_actions_are_cut_to_their_bounds_and_deviations_with_them() -> None:
     """Added to neutral control, 0.1 for three decisions and 5 for three: the latter comes through as 1 − neutral."""
     network = load_network("copper_net").with_options(episode={"horizon": 6})
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=EVALUATION_SEEDS)
     copies = Population(network, None, starting_states(env), 2)
     neutral = np.concatenate([each[0] for each in env.neutral_action.values()])

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cirl_marl import RecipeError, RunError, VectorEnv
+from cirl_marl import MultiAgentVectorEnv, RecipeError, RunError
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation import compare
 from cirl_marl.learners import RunDirectory, resume, train
@@ -59,7 +59,7 @@ def test_the_best_checkpoint_acts(tmp_path: Path, demanded: float | None) -> Non
     assert status["joint_steps"] == rows[best]["joint_step"]
     assert run.chosen.name == status["checkpoint"] == f"{6 * (best + 1):09d}-best"
     assert max(i for i in range(8) if rows[i]["best"]) == best
-    env = VectorEnv("copper_net", num_envs=3, horizon=HORIZON, reward="team")
+    env = MultiAgentVectorEnv("copper_net", num_envs=3, horizon=HORIZON, reward="team")
     again = rollout(env, Trained(run), seed=SEEDS)
     assert float(again.episode_circularity.mean()) == pytest.approx(rows[best]["circularity"], rel=1e-9)
     assert float(again.returns.sum(axis=0).mean()) == pytest.approx(rows[best]["paid"], rel=1e-9)
@@ -133,7 +133,7 @@ def test_a_status_of_something_else_is_refused(tmp_path: Path, best: object) -> 
 @pytest.mark.parametrize(("assured", "step"), [(0.5, 0.2), (0.985, 0.1), (0.99, 0.0), (0.995, -0.1), (1.0, -0.2)])
 def test_the_price_moves_by_what_lacks(assured: float, step: float, damping: float) -> None:
     """In closed form, at once in what is paid, and never without end."""
-    env = VectorEnv("copper_net", num_envs=2, reward="team", circularity="mean", circularity_weight=0.8)
+    env = MultiAgentVectorEnv("copper_net", num_envs=2, reward="team", circularity="mean", circularity_weight=0.8)
     price = ServicePrice(env, 0.99, 0.2, damping)
     price.heed(0.0)
     price.heed(assured)
@@ -184,7 +184,7 @@ def test_a_price_needs_what_it_needs(tmp_path: Path) -> None:
 
 def test_an_evaluation_has_episodes_of_its_own() -> None:
     """The same each time, and none that a report plays."""
-    env = VectorEnv("copper_net", num_envs=2, horizon=HORIZON)
+    env = MultiAgentVectorEnv("copper_net", num_envs=2, horizon=HORIZON)
     from cirl_marl.learners.policies import Policies
 
     evaluation = Selection(env)

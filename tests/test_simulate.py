@@ -14,7 +14,18 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from small_networks import advanced, neutral_rate, plain_networks, small, start
 
-from cirl_marl import Arc, CirlError, Control, ControlKind, Episode, Law, Network, Node, VectorEnv, parallel_env
+from cirl_marl import (
+    Arc,
+    CirlError,
+    Control,
+    ControlKind,
+    Episode,
+    Law,
+    MultiAgentVectorEnv,
+    Network,
+    Node,
+    parallel_env,
+)
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.motion import Dynamics
@@ -179,7 +190,7 @@ def test_hundred_thousand_compartments() -> None:
         Arc(id=f"a{i}", donor=f"n{i}", recipient=f"n{(i + int(hop)) % size}", rate=float(rate))
         for i, (rate, hop) in enumerate(zip(rates, ends, strict=True))
     )
-    env = VectorEnv(Network(name="large", nodes=nodes, arcs=arcs, episode=Episode(horizon=3)), num_envs=2)
+    env = MultiAgentVectorEnv(Network(name="large", nodes=nodes, arcs=arcs, episode=Episode(horizon=3)), num_envs=2)
     env.reset(0)
     before = env.state()[:, :-1].sum(axis=1)
     for _ in range(3):
@@ -217,7 +228,7 @@ def test_rates_that_no_solver_can_follow_are_refused() -> None:
 def test_network_without_controls_can_be_simulated() -> None:
     """A pure material-flow model has no agents; it runs under nobody's control, but no agent environment is made."""
     network = small({"a": 8.0, "b": 0.0}, [Arc(id="f", donor="a", recipient="b", rate=0.5)])
-    run = rollout(VectorEnv(network, num_envs=2), Neutral())
+    run = rollout(MultiAgentVectorEnv(network, num_envs=2), Neutral())
     assert run.stock[-1].sum() == pytest.approx(8.0, rel=1e-12)
     with pytest.raises(CirlError, match="nothing can act"):
         parallel_env(network)

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from cirl_marl import Network, SingleAgentEnv, VectorEnv, load_network, parallel_env
+from cirl_marl import MultiAgentVectorEnv, Network, SingleAgentEnv, load_network, parallel_env
 from cirl_marl.compartments.delivery_truck import DeliveryTruck
 from cirl_marl.controllers import Constant, Neutral, Random, Scripted
 from cirl_marl.controllers.basic import Arrays, Controller
@@ -39,7 +39,7 @@ class Mixed(Controller):
         self._erratic = erratic
         self._scripted, self._random = Scripted(), Random()
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Start both."""
         self._env, self._steps = env, 0
         self._scripted.start(env, seed)
@@ -67,13 +67,13 @@ CONTROLLERS: dict[str, tuple[Controller, bool]] = {
 controlled = pytest.mark.parametrize("name", CONTROLLERS)
 
 
-def column(env: VectorEnv, state: str) -> Floats:
+def column(env: MultiAgentVectorEnv, state: str) -> Floats:
     """Return an inner state, shape (B,)."""
     values: Floats = env.physical.inner[env.dynamics.inner.names.index(state)]
     return values
 
 
-def mass(env: VectorEnv, row: str) -> Floats:
+def mass(env: MultiAgentVectorEnv, row: str) -> Floats:
     """Return the mass in a row of a batch arc, shape (B,)."""
     values: Floats = env.physical.stock[env.rows.batches][env.rows.batch_names.index(row)]
     return values
@@ -100,7 +100,7 @@ BOOKS = tuple(f"sorter.{name}" for name in ("sorted_now", "missed_now", "complet
 WAITING = ("truck.packed", "truck.aboard")
 
 
-def record(env: VectorEnv, controller: Controller, seed: int) -> Recorded:
+def record(env: MultiAgentVectorEnv, controller: Controller, seed: int) -> Recorded:
     """Run an episode; check that at every interval all mass is somewhere."""
     observations = env.reset(seed)
     controller.start(env, seed)
@@ -186,7 +186,7 @@ def staged(found: list[Stages], time: Floats, interval: float) -> Floats:
 def test_circularity_is_the_sum_of_the_stages(scenario: str, name: str) -> None:
     """Mass is conserved, λ(t) is the staged formula for the realised s, T_s and arrivals, and its mean is its mean."""
     controller, arrives = CONTROLLERS[name]
-    run = record(VectorEnv("solids_net", num_envs=2, scenario=scenario), controller, 5)
+    run = record(MultiAgentVectorEnv("solids_net", num_envs=2, scenario=scenario), controller, 5)
     interval = run.network.episode.control_interval
     for copy in range(2):
         found = stages(run, copy)
@@ -221,7 +221,7 @@ def quick(scenario: str, **episode: Any) -> Network:
     return replace(network, nodes=nodes, arcs=arcs)
 
 
-def draw(env: VectorEnv, rng: np.random.Generator) -> dict[str, NDArray[np.float32]]:
+def draw(env: MultiAgentVectorEnv, rng: np.random.Generator) -> dict[str, NDArray[np.float32]]:
     """Draw the actions of all copies."""
     return {
         agent: rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)
@@ -232,9 +232,9 @@ def draw(env: VectorEnv, rng: np.random.Generator) -> dict[str, NDArray[np.float
 AGAIN = """
 import pickle, sys
 import numpy as np
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 network, snapshot, actions, states = pickle.load(open(sys.argv[1], "rb"))
-env = VectorEnv(network, num_envs=2)
+env = MultiAgentVectorEnv(network, num_envs=2)
 env.restore(snapshot)
 for action, state in zip(actions, states, strict=True):
     env.step(action)
@@ -248,7 +248,7 @@ print("the same", len(states))
 def test_snapshot_in_the_middle_of_an_attempt(scenario: str, tmp_path: Path) -> None:
     """From there all comes again bit for bit, MuJoCo included: here, in a fresh environment, in another process."""
     network = quick(scenario, horizon=70)
-    env, rng = VectorEnv(network, num_envs=2), np.random.default_rng(3)
+    env, rng = MultiAgentVectorEnv(network, num_envs=2), np.random.default_rng(3)
     env.reset(9)
     shown = [env.step(draw(env, rng))[0] for _ in range(16)][-1]
     assert (column(env, "sorter.busy") == 1).all()
@@ -258,7 +258,7 @@ def test_snapshot_in_the_middle_of_an_attempt(scenario: str, tmp_path: Path) -> 
     actions = [draw(env, rng) for _ in range(80)]  # over a restart
     first_time = [(*env.step(action)[:2], env.state().copy()) for action in actions]
     assert column(env, "sorter.attempt").max() > 1
-    for other, source in ((env, snapshot), (VectorEnv(network, num_envs=2), pickle.loads(stored))):
+    for other, source in ((env, snapshot), (MultiAgentVectorEnv(network, num_envs=2), pickle.loads(stored))):
         same_or_raise(shown, other.restore(source), "observations of the snapshot and after going back")
         np.testing.assert_array_equal(other.state(), seen)
         for action, (observed, rewards, state) in zip(actions, first_time, strict=True):
@@ -277,7 +277,7 @@ def test_snapshot_in_the_middle_of_an_attempt(scenario: str, tmp_path: Path) -> 
 def test_views_and_copies_agree(scenario: str) -> None:
     """A batch of three, restarting by itself, is three lone environments, under PettingZoo and under Gymnasium."""
     network = quick(scenario, horizon=30)
-    batch = VectorEnv(network, num_envs=3, agents=["sorter"])
+    batch = MultiAgentVectorEnv(network, num_envs=3, agents=["sorter"])
     lone = [parallel_env(network, agents=["sorter"]) for _ in range(3)]
     single = [SingleAgentEnv(network, "sorter") for _ in range(3)]
     seen = batch.reset(2)["sorter"]
@@ -312,7 +312,7 @@ def test_views_and_copies_agree(scenario: str) -> None:
 def test_reward_mode_does_not_touch_the_physics(scenario: str, reward: str) -> None:
     """Counterfactuals of the difference reward use the same robot; the real one does not notice."""
     network = quick(scenario, horizon=25)
-    usual, other = VectorEnv(network, num_envs=2), VectorEnv(network, num_envs=2, reward=reward)
+    usual, other = MultiAgentVectorEnv(network, num_envs=2), MultiAgentVectorEnv(network, num_envs=2, reward=reward)
     usual.reset(1)
     other.reset(1)
     rng = np.random.default_rng(1)
@@ -325,7 +325,7 @@ def test_reward_mode_does_not_touch_the_physics(scenario: str, reward: str) -> N
 
 def test_truck_moves_by_its_mass() -> None:
     """Every interval of a trip is m v̇ = F − rolling − drag with m = 3 t and what is aboard, integrated by SciPy."""
-    env = VectorEnv("solids_net", num_envs=1, scenario="reacher")
+    env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")
     controller: Controller = Scripted({"sorter": 0.0})
     observations = env.reset(0)
     controller.start(env, 0)
@@ -357,7 +357,7 @@ def test_truck_moves_by_its_mass() -> None:
 
 def test_a_loaded_truck_takes_no_more() -> None:
     """While it stands at the sorter with a batch aboard, the next one waits, packed; nothing is lost or mixed."""
-    env = VectorEnv("solids_net", num_envs=1, scenario="reacher")
+    env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")
     held: Controller = Scripted({"sorter": 0.0, "truck": 0.0})
     run = record(env, held, 0)
     assert run.rows["truck.aboard"][-1, 0] == run.rows["truck.packed"][-1, 0] == BATCH_KG
@@ -384,7 +384,7 @@ def test_truck_knows_where_it_is() -> None:
 @both
 def test_incinerator_runs_on_its_own_clock(scenario: str) -> None:
     """Its equations are per minute, the network's clock counts seconds: SciPy gives the same after 3 s."""
-    env = VectorEnv("solids_net", num_envs=1, scenario=scenario, agents=["incinerator"])
+    env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario=scenario, agents=["incinerator"])
     env.reset(8)
     model: Any = env.network.compartments["incinerator"].model
     rows = env.dynamics.inner.rows["incinerator"]
@@ -401,8 +401,8 @@ def test_incinerator_runs_on_its_own_clock(scenario: str) -> None:
 @both
 def test_delivery_cools_and_feeds_the_incinerator(scenario: str) -> None:
     """What the truck brings is added to the waste at 20 °C: the bed keeps its heat, so its temperature falls."""
-    env = VectorEnv(quick(scenario, horizon=250), num_envs=1)
-    twin = VectorEnv(env.network, num_envs=1)
+    env = MultiAgentVectorEnv(quick(scenario, horizon=250), num_envs=1)
+    twin = MultiAgentVectorEnv(env.network, num_envs=1)
     controller: Controller = Scripted({"sorter": 0.0})
     observations = env.reset(0)
     controller.start(env, 0)
@@ -432,7 +432,7 @@ def test_delivery_cools_and_feeds_the_incinerator(scenario: str) -> None:
 @pytest.mark.parametrize(("scenario", "copies"), [("default", 8), ("reacher", 20)])
 def test_scripted_sorter_succeeds(scenario: str, copies: int) -> None:
     """At least 95 % of the items are sorted: of 48 by Fetch, of 120 by Reacher, from what an agent sees."""
-    run = record(VectorEnv("solids_net", num_envs=copies, scenario=scenario), Scripted({"truck": 0.0}), 100)
+    run = record(MultiAgentVectorEnv("solids_net", num_envs=copies, scenario=scenario), Scripted({"truck": 0.0}), 100)
     good, missed = (run.rows[f"sorter.{name}"].sum() for name in ("sorted_now", "missed_now"))
     assert good + missed == 2 * ITEMS * copies
     assert good / (good + missed) >= 0.95
@@ -453,7 +453,7 @@ def one_batch(window: int) -> Network:
 def test_summary_reports_the_time_window(controller: Controller, sorted_items: int) -> None:
     """It is 2·c·λ̄, and for one batch and a window of its stages the closed form of CIRO7.2."""
     interval, use, after = 0.02, round(4.0 / 0.02), 50
-    run = rollout(VectorEnv(one_batch(700), num_envs=1), controller, seed=4)
+    run = rollout(MultiAgentVectorEnv(one_batch(700), num_envs=1), controller, seed=4)
     held, aboard = run.stock[:, 1], run.load[:, 2]
     entered = int(np.argmax(held > 0.0)) + 1
     empty = int(np.argmax(held[entered:] == 0.0)) + entered + 1
@@ -463,7 +463,7 @@ def test_summary_reports_the_time_window(controller: Controller, sorted_items: i
     assert entered == use
     assert round(success * ITEMS / 100.0) == sorted_items
 
-    env = VectorEnv(one_batch(empty + use + after), num_envs=1)
+    env = MultiAgentVectorEnv(one_batch(empty + use + after), num_envs=1)
     assert [line.id for line in env.dynamics.batches.lines][2] == "truck"
     run = rollout(env, controller, seed=4)
     found = summary(env, {"neutral": run})["controllers"]["neutral"]["time_window_circularity"]["value"]
@@ -482,7 +482,7 @@ def test_summary_reports_the_time_window(controller: Controller, sorted_items: i
 
 def test_networks_without_criticality_have_no_time_window() -> None:
     """The figure is reported only where the material has a criticality."""
-    env = VectorEnv("copper_net", num_envs=1, horizon=2)
+    env = MultiAgentVectorEnv("copper_net", num_envs=1, horizon=2)
     figures = summary(env, {"neutral": rollout(env, Neutral(), seed=0)})
     assert "time_window_circularity" not in figures["controllers"]["neutral"]
     solids = load_network("solids_net")
@@ -492,7 +492,7 @@ def test_networks_without_criticality_have_no_time_window() -> None:
 
 def test_robots_failures_decide_the_coupling() -> None:
     """A robot that stands still loads the truck with everything, leaves nothing in second use, and lowers λ̄."""
-    env = VectorEnv("solids_net", num_envs=1)
+    env = MultiAgentVectorEnv("solids_net", num_envs=1)
     controllers = (Scripted(), Scripted({"sorter": 0.0}), Constant())
     good, bad, stopped = (rollout(env, controller, seed=0) for controller in controllers)
     truck = [line.id for line in env.dynamics.batches.lines].index("truck")
@@ -507,7 +507,7 @@ def test_robots_failures_decide_the_coupling() -> None:
 @pytest.mark.parametrize("scenario", ["default", "reacher"])
 def test_staying_away_does_not_pay(scenario: str) -> None:
     """A truck that never loads is good for λ, but it owes that nothing piles up, and earns less than one at work."""
-    env = VectorEnv("solids_net", num_envs=1, scenario=scenario)
+    env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario=scenario)
     drives = rollout(env, Scripted({"sorter": 0.0}), seed=0)
     stays = rollout(env, Scripted({"sorter": 0.0, "truck": -0.05}), seed=0)
     truck = env.agents.index("truck")

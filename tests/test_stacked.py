@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from cirl_marl import CirlError, RecipeError, VectorEnv
+from cirl_marl import CirlError, MultiAgentVectorEnv, RecipeError
 from cirl_marl.learners import RunDirectory, Training, export, resume, train
 from cirl_marl.learners.launch import train_seeds
 from cirl_marl.learners.learner import derived_seed
@@ -143,7 +143,7 @@ def test_candidates_side_by_side_against_policies_stepped_by_hand() -> None:
     run = search.run.model_copy(update={"steps": copies * horizon, "common_random_numbers": True})
     search = search.model_copy(update={"run": run})
     stacked = train("copper_net", search, engine="stacked", agents=AGENTS, horizon=horizon, seed=3)
-    env = VectorEnv("copper_net", num_envs=copies, agents=AGENTS, horizon=horizon)
+    env = MultiAgentVectorEnv("copper_net", num_envs=copies, agents=AGENTS, horizon=horizon)
     observations = env.reset(seed=[derived_seed(3, "copies", 0)] * copies)
     assert all(np.ptp(seen, axis=0).max() == 0 for seen in observations.values())  # all copies begin alike
     models, deltas = {}, {}

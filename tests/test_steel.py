@@ -12,12 +12,12 @@ from scipy.stats import norm
 
 from benchmarks import steel
 from benchmarks.steel import PRIMARY, RAW_EXPORTS, SECTORS, SPLITS, TABLE, YEARS, Country, countries, pasts, simulated
-from cirl_marl import NetworkError, VectorEnv, load_network
+from cirl_marl import MultiAgentVectorEnv, NetworkError, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.importing.definition import identifiers
-from cirl_marl.importing.tables import read_flows
+from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network.elements import Role
 from cirl_marl.optimum import achieved, bound, gap, improved
 
@@ -122,7 +122,7 @@ def test_hindcasts_beat_persistence(everyone: list[Country]) -> None:
 def test_business_as_usual_is_served(network: str, everyone: list[Country]) -> None:
     """Primary iron makes up for what the stock in use lacks, and λ counts all of it, imports too."""
     found = load_network(network)
-    env = VectorEnv(found, num_envs=1)
+    env = MultiAgentVectorEnv(found, num_envs=1)
     begun = beginning(env)
     run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
     flow = {arc.id: run.flow[:, k] for k, arc in enumerate(found.arcs)}
@@ -139,7 +139,9 @@ def test_business_as_usual_is_served(network: str, everyone: list[Country]) -> N
     assert (primary >= 0).all() and primary.max() > 0
     assert sum(flow[arc].sum() for arc in RAW_EXPORTS) == 0.0
     later = rollout(
-        VectorEnv(load_network(network, scenario="high_circularity"), num_envs=1), Neutral(), start=begun.given
+        MultiAgentVectorEnv(load_network(network, scenario="high_circularity"), num_envs=1),
+        Neutral(),
+        start=begun.given,
     )
     assert later.episode_circularity[0] > run.episode_circularity[0]
 

@@ -12,11 +12,11 @@ import pytest
 from benchmarks import steel, steel_world
 from benchmarks.steel import PRIMARY, TABLE, Country, countries
 from benchmarks.steel_world import GOODS, RAW, STEEL, markets, write_trade
-from cirl_marl import Network, VectorEnv, load_network, parallel_env
+from cirl_marl import MultiAgentVectorEnv, Network, load_network, parallel_env
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import Rollout, beginning, rollout
 from cirl_marl.importing.definition import identifiers
-from cirl_marl.importing.tables import read_flows
+from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Role
 from cirl_marl.testing import check_parallel_env
@@ -37,7 +37,7 @@ def world() -> Network:
 @pytest.fixture(scope="module")
 def usual(world: Network) -> Rollout:
     """Return the episode in which nobody acts."""
-    env = VectorEnv(world, num_envs=1)
+    env = MultiAgentVectorEnv(world, num_envs=1)
     begun = beginning(env)
     return rollout(env, Neutral(), seed=begun.seed, start=begun.given)
 
@@ -109,10 +109,10 @@ def test_business_as_usual_is_served(world: Network, usual: Rollout, everyone: l
 @pytest.mark.slow
 def test_mass_is_conserved(world: Network) -> None:
     """Under any actions, in every copy, and a batch is what its copies are alone."""
-    env = VectorEnv(world, num_envs=3, horizon=3)
+    env = MultiAgentVectorEnv(world, num_envs=3, horizon=3)
     random = np.random.default_rng(5)
     actions = [{agent: random.uniform(-1, 1, (3, 1)) for agent in env.agents} for _ in range(3)]
-    lone = VectorEnv(world, num_envs=1, horizon=3)
+    lone = MultiAgentVectorEnv(world, num_envs=1, horizon=3)
     env.reset(seed=[1, 2, 3])
     lone.reset(seed=[2])
     before = env.snapshot().state.stock.sum(axis=0)
@@ -128,7 +128,7 @@ def test_mass_is_conserved(world: Network) -> None:
 @pytest.mark.slow
 def test_what_stays_at_home_saves_ore_there_and_is_missed_elsewhere(world: Network, usual: Rollout) -> None:
     """Scrap that Japan does not export is melted in Japan; those who bought it take more ore."""
-    env = VectorEnv(world, num_envs=1, agents=["japan_scrap_exports"])
+    env = MultiAgentVectorEnv(world, num_envs=1, agents=["japan_scrap_exports"])
     begun = beginning(env)
 
     run = rollout(env, Constant({"japan_scrap_exports": -1.0}), seed=begun.seed, start=begun.given)
@@ -168,8 +168,8 @@ def test_conformance(scenario: str) -> None:
 @pytest.mark.slow
 def test_all_that_can_be_had_is_had(world: Network, usual: Rollout) -> None:
     """Where nobody acts and all improves by 2050, λ is better."""
-    env = VectorEnv(load_network("steel_world", scenario="high_circularity"), num_envs=1)
-    begun = beginning(VectorEnv(world, num_envs=1))
+    env = MultiAgentVectorEnv(load_network("steel_world", scenario="high_circularity"), num_envs=1)
+    begun = beginning(MultiAgentVectorEnv(world, num_envs=1))
     later = rollout(env, Neutral(), start=begun.given)
     assert later.episode_circularity[0] > 0.9 * usual.episode_circularity[0]
     assert len(load_network("steel_world", scenario="longer_lives").acting) == 17 * 30

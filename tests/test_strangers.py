@@ -18,7 +18,7 @@ import pytest
 from fuzz import fuzzed
 from test_own_models import brewery
 
-from cirl_marl import CirlError, RunError, VectorEnv, load_network, single_agent_env
+from cirl_marl import CirlError, MultiAgentVectorEnv, RunError, load_network, single_agent_env
 from cirl_marl.cli import main
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import write_network
@@ -184,7 +184,7 @@ def test_definitions_import_nothing_unless_they_may(tmp_path: Path, monkeypatch:
     path = tmp_path / "brewery.toml"
     write_network(brewery(), path)
     path.write_text(path.read_text().replace("own_models:", f"{name}:"))
-    for use in (lambda: load_network(path), lambda: VectorEnv(path, num_envs=1)):
+    for use in (lambda: load_network(path), lambda: MultiAgentVectorEnv(path, num_envs=1)):
         with pytest.raises(CirlError, match=rf"kind '{name}:Fermenter' would import '{name}'.*--allow-code"):
             use()
     assert not (tmp_path / "proof").exists()
@@ -270,11 +270,11 @@ def test_what_is_no_network_agent_or_seed(tmp_path: Path) -> None:
     """Errors are of ours, also for what nobody would write by mistake."""
     text = (folder("envs") / "copper_net.toml").read_text()
     (path := tmp_path / "x.toml").write_text(text)
-    env, alone = VectorEnv(path, num_envs=1), single_agent_env("copper_net", agent="mine")
+    env, alone = MultiAgentVectorEnv(path, num_envs=1), single_agent_env("copper_net", agent="mine")
     wrong: list[tuple[Any, str]] = [
         (lambda: load_network("a\0b.toml"), "no name of a network"),
         (lambda: load_network(path, scenario=[]), "unknown scenario"),  # type: ignore[arg-type]
-        (lambda: VectorEnv(path, num_envs=1, agents=[["mine"]]), "agents must be a sequence of ids"),  # type: ignore[list-item]
+        (lambda: MultiAgentVectorEnv(path, num_envs=1, agents=[["mine"]]), "agents must be a sequence of ids"),  # type: ignore[list-item]
         (lambda: env.restore(None), "a snapshot is needed"),  # type: ignore[arg-type]
         *((lambda seed=seed: alone.reset(seed=seed), "must be a non-negative integer") for seed in (-1, "a", 1.5, [1])),
     ]

@@ -10,7 +10,7 @@ import pytest
 from stable_baselines3 import PPO
 
 import cirl_marl
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.streams import Streams
 
@@ -58,7 +58,7 @@ def test_three_defects_of_the_vector_bridge_are_not_ours() -> None:
     assert np.all(dones)
     assert not any("TimeLimit.truncated" in info for info in infos)
 
-    ours = NetworkWorld(VectorEnv("copper_net", num_envs=2, agents=AGENTS, horizon=4), seeds=[1, 2])
+    ours = NetworkWorld(MultiAgentVectorEnv("copper_net", num_envs=2, agents=AGENTS, horizon=4), seeds=[1, 2])
     seat = ours.seats["refinery"]
     mine = np.asarray(seat.handed.seen)
     assert not np.array_equal(mine[0], mine[1])

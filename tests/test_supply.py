@@ -18,17 +18,17 @@ from cirl_marl import (
     ControlKind,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     NetworkError,
     Node,
     Role,
     Series,
     Service,
-    VectorEnv,
     load_network,
     parallel_env,
 )
 from cirl_marl.controllers import Constant, Neutral
-from cirl_marl.controllers.remarks import remarks
+from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.controllers.shortages import unsupplied
 from cirl_marl.definitions.reading import write_network
@@ -62,7 +62,7 @@ def demanded(network: Network) -> Floats:
 def test_supply_is_what_lacks(scenario: str) -> None:
     """Whatever the others do: the stock is the demand, unless nothing or all that can be had is supplied."""
     network = cycle(scenario)
-    env, rng = VectorEnv(network, num_envs=3, agents=["old_scrap"]), np.random.default_rng(1)
+    env, rng = MultiAgentVectorEnv(network, num_envs=3, agents=["old_scrap"]), np.random.default_rng(1)
     env.reset(seed=0, options={"initial_state": {"use": np.array([1050.0, 1100.0, 1150.0])}})
     met = np.zeros(3, dtype=int)
     for year, demand in enumerate(demanded(network)):
@@ -78,7 +78,7 @@ def test_supply_is_what_lacks(scenario: str) -> None:
 def test_the_first_flows_are_those_of_business_as_usual() -> None:
     """What is seen before anybody acts: nothing is mined unless something lacks."""
     network = cycle()
-    env = VectorEnv(network, num_envs=2)
+    env = MultiAgentVectorEnv(network, num_envs=2)
     env.reset(seed=0, options={"initial_state": {"use": np.array([900.0, 1150.0])}})
     first = env.physical.flow[0].copy()
     neutral = env.advance(env.stack(env.neutral_action)).flow[0]
@@ -89,7 +89,7 @@ def test_the_first_flows_are_those_of_business_as_usual() -> None:
 def test_a_chain_falls_short_as_far_as_its_bounds_say() -> None:
     """Then all that can be had is supplied, and the level of the service tells what lacks."""
     network = cycle(high=60.0)
-    run = rollout(VectorEnv(network, num_envs=1, agents=["old_scrap"]), Neutral())
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1, agents=["old_scrap"]), Neutral())
     mined = run.controls[:, 0]
     short = run.levels[0, 0] < 1.0 - 1e-3
     assert short.any() and (mined[short] == 60.0).all()
@@ -100,19 +100,19 @@ def test_a_chain_falls_short_as_far_as_its_bounds_say() -> None:
     first = int(np.argmax(short))
     assert f"'supply' falls to {run.levels.min():.4f}, short first at {first} year ({2020 + first})" in said
     assert "'smelting' 60 Mt/year" in said
-    assert any(said in remark for remark in remarks(network)) and not list(remarks(cycle()))
-    assert not list(unsupplied(rollout(VectorEnv(cycle(), num_envs=1), Neutral()), cycle()))
+    assert any(said in remark for remark in lint_warnings(network)) and not list(lint_warnings(cycle()))
+    assert not list(unsupplied(rollout(MultiAgentVectorEnv(cycle(), num_envs=1), Neutral()), cycle()))
 
 
 def test_an_agent_that_acts_overrides_it() -> None:
     """Its action is what it carries; neutral, it supplies what lacks beside what the others do."""
     network = cycle()
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     outcome = env.advance(np.array([[0.5], [0.0]]))
     assert outcome.flow[0, 0] == pytest.approx(300.0)
     for action in (-1.0, 0.3, 1.0):
-        alone = rollout(VectorEnv(network, num_envs=1, agents=["old_scrap"]), Constant({"old_scrap": action}))
+        alone = rollout(MultiAgentVectorEnv(network, num_envs=1, agents=["old_scrap"]), Constant({"old_scrap": action}))
         beside = rollout(env, Constant({"old_scrap": action}))
         np.testing.assert_allclose(beside.flow, alone.flow, rtol=1e-9, atol=1e-9)
 
@@ -121,8 +121,8 @@ def test_an_agent_that_acts_overrides_it() -> None:
 def test_counterfactuals_supply_anew(acting: list[str]) -> None:
     """The difference to a second network, in which the agent is neutral and mining makes up for what then lacks."""
     network = cycle()
-    env = VectorEnv(network, num_envs=2, agents=acting, reward="difference")
-    other = VectorEnv(network, num_envs=2, agents=acting, reward="circularity")
+    env = MultiAgentVectorEnv(network, num_envs=2, agents=acting, reward="difference")
+    other = MultiAgentVectorEnv(network, num_envs=2, agents=acting, reward="circularity")
     for each in (env, other):
         each.reset(3, options={"initial_state": {"use": 1000.0}})
     rng = np.random.default_rng(0)
@@ -180,7 +180,7 @@ def town(weights: tuple[float | None, float | None], high: tuple[float, float] =
 def test_several_services_are_solved_together() -> None:
     """What is mined for cars builds homes, too, of which so much less is imported; sources keep their weights."""
     network = town((0.25, 0.75))
-    run = rollout(VectorEnv(network, num_envs=2), Neutral())
+    run = rollout(MultiAgentVectorEnv(network, num_envs=2), Neutral())
     a, b, imported = run.controls.T
     np.testing.assert_allclose((a - 1.0) * 3, b - 1.0, rtol=1e-9)
     exact = (imported > 1.0) & (a > 1.0)
@@ -214,7 +214,7 @@ def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0
 @pytest.mark.parametrize(("stock", "export"), [(12.0, 0.0), (1000.0, 0.0), (120.0, 10.0)])
 def test_a_small_reserve_gives_no_more_than_is_needed(stock: float, export: float, most: float) -> None:
     """However wide the bounds of the control; when it is used up the service falls short."""
-    run = rollout(VectorEnv(reserve(stock, most, export=export), num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(reserve(stock, most, export=export), num_envs=1), Neutral())
     use, left = run.stock[:, 1], run.stock[:, 0]
     enough = left > 1e-6
     np.testing.assert_allclose(use[enough], 47.0, rtol=1e-9)
@@ -226,7 +226,7 @@ def test_a_small_reserve_gives_no_more_than_is_needed(stock: float, export: floa
 def test_where_one_is_at_its_bound_others_supply_more(high: tuple[float, float]) -> None:
     """Of arcs that share a service; and of services, one that cannot be met leaves the others as they should be."""
     network = town((0.5, 0.5), high=(1.0 + high[0], high[1]))
-    run = rollout(VectorEnv(network, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     cars = run.stock[:, network.node_index["cars"]]
     wanted = np.array(network.held(network.services[0].low))
     np.testing.assert_allclose(cars, np.maximum(cars, wanted), rtol=1e-9)
@@ -238,7 +238,7 @@ def test_where_one_is_at_its_bound_others_supply_more(high: tuple[float, float])
         for arc in network.arcs
     )
     short = replace(network, arcs=arcs, services=(network.services[0], replace(network.services[1], low=120.0)))
-    run = rollout(VectorEnv(short, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(short, num_envs=1), Neutral())
     assert run.levels[0, 1].max() < 1.0 and (run.controls[:, 2] == 0.5).all()
     np.testing.assert_allclose(run.stock[:, network.node_index["cars"]], wanted, rtol=1e-9)
 
@@ -249,7 +249,7 @@ def test_services_that_hang_together_are_all_met() -> None:
     homes = {"weight": None, "makes_up_for": "living"}
     changed: dict[str, dict[str, Any]] = {"mine_a": {"weight": None}, "mine_b": homes}
     arcs = [replace(arc, **changed.get(arc.id, {})) for arc in network.arcs if arc.id != "import"]
-    run = rollout(VectorEnv(replace(network, arcs=tuple(arcs)), num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(replace(network, arcs=tuple(arcs)), num_envs=1), Neutral())
     wanted = np.array([network.held(service.low) for service in network.services])
     stock = run.stock[:, [network.node_index[each] for each in ("cars", "homes")]].T
     lowest = (stock / wanted).min(axis=0)
@@ -261,7 +261,7 @@ def test_services_that_hang_together_are_all_met() -> None:
 def test_copies_are_lone_environments(network: Network) -> None:
     """To the bit."""
     acting = [network.agents[-1]]
-    batch = VectorEnv(network, num_envs=3, agents=acting)
+    batch = MultiAgentVectorEnv(network, num_envs=3, agents=acting)
     batch.reset(7)
     alone = [parallel_env(network, agents=acting) for _ in range(3)]
     for i, env in enumerate(alone):
@@ -283,7 +283,7 @@ def test_bounds_allow_all_that_may_be_supplied() -> None:
     assert "may supply" not in str(bound(cycle(), min_service=0.9, horizon=3))
     run = achieved(improved(found))
     assert float(run.episode_circularity[0]) <= found.objective
-    neutral = rollout(VectorEnv(network, num_envs=1), Neutral())
+    neutral = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     assert float(run.episode_circularity[0]) > float(neutral.episode_circularity[0])
     assert run.episode_levels[0].min() > 0.999 - 1e-6
 
@@ -314,7 +314,7 @@ def test_supplies_keep_the_proportions_that_the_program_knows(
     reached = Reach(np.zeros((steps, len(planned.nodes))), uncut, np.zeros(steps))
     rows, limits = supplies(programs.admissible, reached, layout, range(steps))
     played = np.random.default_rng(seed).uniform(-1, 1, (steps, 1, 1))
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed)
     values = np.zeros((steps, layout.size))
     starts = [layout.flow(j) for j in layout.moments]

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from cirl_marl import VectorEnv, load_network
+from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.network import Floats
@@ -17,8 +17,8 @@ STEPS = 40
 
 def test_temperature_follows_the_stock() -> None:
     """The stocks are those of the default scenario, and the temperature obeys the radiation balance driven by them."""
-    plain = rollout(VectorEnv("carbo_net", num_envs=1, horizon=STEPS), Neutral(), seed=0)
-    env = VectorEnv("carbo_net", num_envs=1, horizon=STEPS, scenario="temperature")
+    plain = rollout(MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=STEPS), Neutral(), seed=0)
+    env = MultiAgentVectorEnv("carbo_net", num_envs=1, horizon=STEPS, scenario="temperature")
     warm = rollout(env, Neutral(), seed=0)
     np.testing.assert_allclose(warm.stock, plain.stock, rtol=1e-7)
     assert env.dynamics.inner.names == ("urban_air.temperature_k",)
@@ -42,7 +42,7 @@ def test_temperature_follows_the_stock() -> None:
 
 def test_neutral_control_leaves_the_model_s_range_within_eleven_days() -> None:
     """Beyond 3750 t of carbon in the urban air no radiation leaves, as docs/compartments.md says."""
-    env = VectorEnv("carbo_net", num_envs=1, scenario="temperature")
+    env = MultiAgentVectorEnv("carbo_net", num_envs=1, scenario="temperature")
     run, day = rollout(env, Neutral(), seed=0), env.network.episode.control_interval
     air = run.stock[:, env.network.node_index["urban_air"]]
     assert 10.0 < (int(np.argmax(air > 3750.0)) + 1) * day <= 11.0
@@ -50,7 +50,7 @@ def test_neutral_control_leaves_the_model_s_range_within_eleven_days() -> None:
 
 def test_more_carbon_dioxide_is_warmer() -> None:
     """The published sign: more of it in the air, less radiation leaves."""
-    env = VectorEnv(load_network("carbo_net", scenario="temperature"), num_envs=2, horizon=20)
+    env = MultiAgentVectorEnv(load_network("carbo_net", scenario="temperature"), num_envs=2, horizon=20)
     env.reset(seed=0, options={"initial_state": {"urban_air": np.array([830.0, 1000.0])}})
     neutral = env.stack(env.neutral_action)
     for _ in range(20):

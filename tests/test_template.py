@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cirl_marl import CirlError, VectorEnv, load_network
+from cirl_marl import CirlError, MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.basic import Constant
 from cirl_marl.controllers.rollout import rollout
@@ -29,7 +29,7 @@ def test_what_was_told_comes_back(
     told: dict[str, Any] = {"in_use": in_use, "lifetime": lifetime, "recycled": recycled, "growth": growth}
     write_first(FirstCycle(material="zinc", mass="kt", years=years, **told), path)
     network = load_network(path)
-    run = rollout(VectorEnv(network, num_envs=1), Neutral(), seed=0)
+    run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral(), seed=0)
     assert network.agents == ("recycling",)
     assert np.allclose(run.levels, 1.0, atol=1e-6)
     place = [node.id for node in network.stores].index("in_use")
@@ -44,7 +44,7 @@ def test_what_was_told_comes_back(
 def test_more_recycling_is_better(tmp_path: Path) -> None:
     """The agent can raise the circularity, without a lack of service."""
     write_first(FirstCycle(**ZINC), tmp_path / "zinc.toml")
-    env = VectorEnv(tmp_path / "zinc.toml", num_envs=1)
+    env = MultiAgentVectorEnv(tmp_path / "zinc.toml", num_envs=1)
     usual, best = rollout(env, Neutral(), seed=0), rollout(env, Constant({"recycling": 1.0}), seed=0)
     assert float(best.episode_circularity[0]) > float(usual.episode_circularity[0]) + 1
     assert np.allclose(best.levels, 1.0, atol=1e-6)

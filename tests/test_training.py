@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 import cirl_marl
-from cirl_marl import Arc, Control, ControlKind, LearnerError, Network, Node, RunError, VectorEnv
+from cirl_marl import Arc, Control, ControlKind, LearnerError, MultiAgentVectorEnv, Network, Node, RunError
 from cirl_marl.learners import Recipe, RunDirectory, Training, resume, train
 from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import LearnerSettings, Match, Run
@@ -113,7 +113,7 @@ class Draws(BaseCallback):
     def __init__(self) -> None:
         """Make the other environment."""
         super().__init__()
-        self.env = VectorEnv("copper_net", num_envs=2, horizon=5)
+        self.env = MultiAgentVectorEnv("copper_net", num_envs=2, horizon=5)
         self.calls = 0
 
     def _on_step(self) -> bool:
@@ -169,7 +169,7 @@ def two_chains() -> Network:
 class Alone(Seat):
     """The seat of a lone agent that steps its environment itself."""
 
-    def __init__(self, env: VectorEnv, seeds: list[int]) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, seeds: list[int]) -> None:
         """Seat the only agent of ``env``."""
         self.joint = env
         super().__init__(env, env.agents[0], OneAgent(env, env.agents[0]), lambda: None)
@@ -195,7 +195,7 @@ def test_lockstep_equals_plain_learning_where_agents_do_not_meet(ppo_recipe: Rec
     lone = {name: value for name, value in weights(together).items() if name.startswith("a.")}
     assert_same(lone, weights(alone))
 
-    env = VectorEnv(two_chains(), num_envs=2, reward="local", agents=["a"])
+    env = MultiAgentVectorEnv(two_chains(), num_envs=2, reward="local", agents=["a"])
     parameters = ppo_recipe.learner.parameters
     seat = Alone(env, [derived_seed(3, "copies", i) for i in range(2)])
     model = PPO("MlpPolicy", VecNormalize(seat, gamma=0.99), seed=derived_seed(3, "a"), device="cpu", **parameters)
@@ -236,17 +236,17 @@ def test_different_rollouts_and_shares_finish_cleanly(ppo_recipe: Recipe) -> Non
 def test_who_has_learnt_enough_acts_without_exploring(ppo_recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
     """Past its share a learner's actions are the mean of its policy; before, they are drawn."""
     match = Match(agents=["use"], algorithm="A2C", parameters={"n_steps": 4}, share_of_steps=0.5)
-    seen, done = VectorEnv("copper_net", num_envs=2, horizon=20).reset(seed=0)["use"], []
-    step = VectorEnv.step
+    seen, done = MultiAgentVectorEnv("copper_net", num_envs=2, horizon=20).reset(seed=0)["use"], []
+    step = MultiAgentVectorEnv.step
 
-    def recorded(env: VectorEnv, actions: Any) -> Any:
+    def recorded(env: MultiAgentVectorEnv, actions: Any) -> Any:
         nonlocal seen
         done.append((seen, actions["use"].copy()))
         result = step(env, actions)
         seen = result[0]["use"].copy()
         return result
 
-    monkeypatch.setattr(VectorEnv, "step", recorded)
+    monkeypatch.setattr(MultiAgentVectorEnv, "step", recorded)
     training = train("copper_net", ppo_recipe.model_copy(update={"match": [match]}), horizon=20)
     model, normaliser = training.learners["use"].model, training.learners["use"].env
     assert model.num_timesteps == 40

@@ -22,13 +22,13 @@ from cirl_marl import (
     ControlError,
     Episode,
     Law,
+    MultiAgentVectorEnv,
     Network,
     NetworkError,
     Node,
     Role,
     RunError,
     Series,
-    VectorEnv,
     load_network,
     parallel_env,
     single_agent_env,
@@ -103,7 +103,7 @@ def test_a_draw_is_the_network_with_other_numbers() -> None:
     assert dig.flow == replace(flow, values=(20.0, 8.0)) and leak.rate == pytest.approx(0.15)
     assert tails.share == pytest.approx(0.4) and metal.share is None
     assert not found.uncertain and network.arcs[0].flow == flow
-    run = rollout(VectorEnv(found, num_envs=1), Neutral())
+    run = rollout(MultiAgentVectorEnv(found, num_envs=1), Neutral())
     np.testing.assert_allclose(run.flow[:, 1], 0.4 * np.array([20.0, 20.0, 8.0, 8.0]))
 
 
@@ -126,7 +126,7 @@ def test_samples_are_single_simulations() -> None:
     found, more = sampled(network, samples=3, seed=4), sampled(network, samples=5, seed=4)
     np.testing.assert_array_equal(more.circularity[:3], found.circularity)
     for i, (dug, leaked) in enumerate(found.factors.tolist()):
-        run = rollout(VectorEnv(line({}, flow=10.0 * dug, leak=0.1 * leaked), num_envs=1), Neutral())
+        run = rollout(MultiAgentVectorEnv(line({}, flow=10.0 * dug, leak=0.1 * leaked), num_envs=1), Neutral())
         np.testing.assert_allclose(found.stock[i], run.stock, rtol=1e-12)
         np.testing.assert_allclose(found.flow[i], run.flow, rtol=1e-12)
         np.testing.assert_allclose(found.circularity[i], run.circularity_mean[0], rtol=1e-12)
@@ -153,7 +153,7 @@ def test_causes_are_the_shares_of_the_variance() -> None:
         factors = np.ones((2, 3))
         factors[:, k] += np.array([-1, 1]) * (0.1, 0.4)[k]
         low, high = (
-            rollout(VectorEnv(drawn(network, each.tolist()), num_envs=1), Neutral()).episode_circularity[0]
+            rollout(MultiAgentVectorEnv(drawn(network, each.tolist()), num_envs=1), Neutral()).episode_circularity[0]
             for each in factors
         )
         parts.append(((high - low) / 2) ** 2)
@@ -241,7 +241,7 @@ def uncertain_networks(draw: st.DrawFn) -> Network:
     return replace(network, uncertain=uncertain).with_options(episode=episode)
 
 
-def randomly(env: VectorEnv, steps: int, seed: int) -> Iterator[Outcome]:
+def randomly(env: MultiAgentVectorEnv, steps: int, seed: int) -> Iterator[Outcome]:
     """Act at random in a copy of an environment that has been reset."""
     rng = np.random.default_rng(seed)
     entries = sum(space.shape[0] for space in env.action_spaces.values())
@@ -252,12 +252,15 @@ def randomly(env: VectorEnv, steps: int, seed: int) -> Iterator[Outcome]:
 @given(uncertain_networks(), st.integers(0, 99))
 def test_each_copy_is_the_network_with_what_it_drew(network: Network, seed: int) -> None:
     """Simulated alone, with numbers that are certain; a copy of a batch is a lone environment, to the bit."""
-    env = VectorEnv(network, num_envs=2, uncertain=True, reward="mixed_difference")
+    env = MultiAgentVectorEnv(network, num_envs=2, uncertain=True, reward="mixed_difference")
     env.reset(seed=seed)
     start, factors = env.physical.stock[env.rows.nodes], env.physical.factors
-    lone = VectorEnv(network, num_envs=1, uncertain=True, reward="mixed_difference")
+    lone = MultiAgentVectorEnv(network, num_envs=1, uncertain=True, reward="mixed_difference")
     lone.reset(seed=seed + 1)
-    others = [VectorEnv(drawn(network, factors[:, i].tolist()), num_envs=1, reward="mixed_difference") for i in (0, 1)]
+    others = [
+        MultiAgentVectorEnv(drawn(network, factors[:, i].tolist()), num_envs=1, reward="mixed_difference")
+        for i in (0, 1)
+    ]
     names = env.rows.start_names
     # what is cut follows the substeps, of which the fastest draws need most
     assume(all(other.dynamics.substeps == env.dynamics.substeps for other in others))
@@ -276,10 +279,12 @@ def test_each_copy_is_the_network_with_what_it_drew(network: Network, seed: int)
 def test_supplies_make_up_for_what_was_drawn() -> None:
     """Business as usual meets the demand of the draw, with what the others do."""
     network = load_network(EXAMPLE).scenario("business_as_usual")
-    env = VectorEnv(network, num_envs=3, uncertain=True, reward="difference")
+    env = MultiAgentVectorEnv(network, num_envs=3, uncertain=True, reward="difference")
     run = rollout(env, Neutral(), seed=2)
     for i in range(3):
-        other = VectorEnv(drawn(network, env.physical.factors[:, i].tolist()), num_envs=3, reward="difference")
+        other = MultiAgentVectorEnv(
+            drawn(network, env.physical.factors[:, i].tolist()), num_envs=3, reward="difference"
+        )
         alone = rollout(other, Neutral(), seed=2)
         np.testing.assert_allclose(run.circularity_mean[i], alone.circularity_mean[i], rtol=1e-9)
         np.testing.assert_allclose(run.levels[i], alone.levels[i], rtol=1e-9)
@@ -290,9 +295,9 @@ def test_supplies_make_up_for_what_was_drawn() -> None:
 def test_draws_differ_and_last_an_episode() -> None:
     """From each copy's own stream, in every info and in the snapshot; starts are those of the certain environment."""
     network = load_network(EXAMPLE).scenario("business_as_usual").with_options(episode={"horizon": 3})
-    env = VectorEnv(network, num_envs=3, uncertain=True)
+    env = MultiAgentVectorEnv(network, num_envs=3, uncertain=True)
     env.reset(seed=5)
-    certain = VectorEnv(network, num_envs=3)
+    certain = MultiAgentVectorEnv(network, num_envs=3)
     certain.reset(seed=5)
     np.testing.assert_array_equal(env.physical.stock, certain.physical.stock)
     first = env.physical.factors.copy()
@@ -316,7 +321,7 @@ def test_draws_differ_and_last_an_episode() -> None:
         certain.restore(saved)
     assert "drawn" not in certain.step(certain.neutral_action)[-1][certain.agents[0]]
     with pytest.raises(CirlError, match="nothing is uncertain; give a number a deviation"):
-        VectorEnv("copper_net", uncertain=True)
+        MultiAgentVectorEnv("copper_net", uncertain=True)
 
 
 def test_every_view_draws() -> None:
@@ -347,9 +352,9 @@ def test_levels_and_neutral_actions_are_of_what_was_drawn() -> None:
     service = replace(network.services[0], high=900.0)
     uncertain = {**network.uncertain, "services.supply.high": Spread(low=0.98, high=1.5, distribution="uniform")}
     network = replace(network, services=(replace(service, low=700.0),), uncertain=uncertain)
-    env = VectorEnv(network, num_envs=8, uncertain=True, observe="full", agents=["smelting", "old_scrap"])
+    env = MultiAgentVectorEnv(network, num_envs=8, uncertain=True, observe="full", agents=["smelting", "old_scrap"])
     env.reset(seed=0, options={"initial_state": {"use": np.linspace(600.0, 1100.0, 8)}})
-    idle = VectorEnv(network, num_envs=8, uncertain=True, agents=["old_scrap"])
+    idle = MultiAgentVectorEnv(network, num_envs=8, uncertain=True, agents=["old_scrap"])
     idle.reset(seed=0, options={"initial_state": {"use": np.linspace(600.0, 1100.0, 8)}})
     rows = [tuple(network.uncertain).index(f"services.supply.{end}") for end in ("low", "high")]
     low, high = np.array([[700.0], [900.0]]) * env.physical.factors[rows]
@@ -378,7 +383,7 @@ def test_no_draw_exceeds_what_arrays_are_made_for() -> None:
     network = replace(network, nodes=tuple(mine if each.id == "mine" else each for each in network.nodes))
     factors, rates, bounds = rates_of_draws(network)
     np.testing.assert_allclose(rates.max(axis=1), bounds, rtol=1e-12)
-    assert VectorEnv(network, num_envs=1, uncertain=True).dynamics.substeps == 2
+    assert MultiAgentVectorEnv(network, num_envs=1, uncertain=True).dynamics.substeps == 2
     (mine_,) = (i for i, node in enumerate(network.stores) if node.id == "mine")
     assert network.initial[0, mine_] == pytest.approx(10.0 * 5.0 * 4)
     np.testing.assert_array_equal(drawn(network, factors[:, 7].tolist()).initial, network.initial)
@@ -389,7 +394,7 @@ def test_an_episode_is_held_against_what_it_drew(tmp_path: Path) -> None:
     """Everyone meets the same draws; the bound is that of a network with these numbers, for the service delivered."""
     network = load_network(EXAMPLE).with_options(episode={"horizon": 4})
     found = compare((), ("neutral", "optimum"), network=network, episodes=3, uncertain=True)
-    env = VectorEnv(network, num_envs=3, uncertain=True)
+    env = MultiAgentVectorEnv(network, num_envs=3, uncertain=True)
     env.reset(seed=found.first_seed)
     starts, factors = env.physical.stock[env.rows.nodes], env.physical.factors
     assert np.ptp(factors[0]) > 0.1
@@ -412,7 +417,7 @@ def test_an_episode_is_held_against_what_it_drew(tmp_path: Path) -> None:
         compare([run, certain_run], episodes=2, bounds=False)
     for asked, draws in ((None, True), (False, False)):
         neutral = compare([run], episodes=2, bounds=False, uncertain=asked).entries[1]
-        same = rollout(VectorEnv(network, num_envs=2, uncertain=draws), Neutral(), seed=found.first_seed)
+        same = rollout(MultiAgentVectorEnv(network, num_envs=2, uncertain=draws), Neutral(), seed=found.first_seed)
         np.testing.assert_array_equal(neutral.circularity, same.episode_circularity)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.definitions.catalogue import load_network
@@ -17,7 +17,7 @@ CYCLES = ("copper_world", "aluminium_world", "plastics_world")
 def usual(name: str, scenario: str | None = None, horizon: int = 3) -> tuple[Network, Rollout]:
     """Return the first years in which nobody acts."""
     network = load_network(name, scenario=scenario)
-    return network, rollout(VectorEnv(network, num_envs=1, horizon=horizon), Neutral(), seed=0)
+    return network, rollout(MultiAgentVectorEnv(network, num_envs=1, horizon=horizon), Neutral(), seed=0)
 
 
 def flow(network: Network, run: Rollout, *names: str, year: int = 0) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.peers.settings import NETWORK, SERVICE
 from benchmarks.peers.watch import Judged
-from cirl_marl import VectorEnv
+from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.evaluation import yardstick
 from cirl_marl.evaluation.comparison import starting_stocks
@@ -55,7 +55,7 @@ class Reference:
     @classmethod
     def solved(cls, levels: Sequence[float] = LEVELS, episodes: int = BOUNDED) -> Reference:
         """Solve the programs at ``levels`` of service."""
-        env = VectorEnv(NETWORK, num_envs=episodes)
+        env = MultiAgentVectorEnv(NETWORK, num_envs=episodes)
         starts = starting_stocks(env, first_seed(0))
         services = [np.full((episodes, len(env.network.services)), level) for level in levels]
         return cls(starts, yardstick(env.network, env.agents, starts, services))

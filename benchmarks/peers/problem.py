@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from benchmarks.peers.settings import ENVIRONMENT, NETWORK, SETTINGS
-from cirl_marl import VectorEnv, parallel_env
+from cirl_marl import MultiAgentVectorEnv, parallel_env
 from cirl_marl.controllers.basic import Arrays, Controller
 
 Array = NDArray[np.float32]
@@ -24,9 +24,9 @@ SAMPLE, SAMPLED = 256, 2**20
 """Episodes from which the scales come, and the seed of the first: nobody trains or is judged on them."""
 
 
-def environment(copies: int) -> VectorEnv:
+def environment(copies: int) -> MultiAgentVectorEnv:
     """Return our batched environment with the reward of the recipe."""
-    return VectorEnv(NETWORK, num_envs=copies, **ENVIRONMENT)
+    return MultiAgentVectorEnv(NETWORK, num_envs=copies, **ENVIRONMENT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Scaling:
     paid: float
 
     @classmethod
-    def measured(cls, env: VectorEnv, noise: float = float(np.exp(SETTINGS.log_std))) -> Scaling:
+    def measured(cls, env: MultiAgentVectorEnv, noise: float = float(np.exp(SETTINGS.log_std))) -> Scaling:
         """Return the scales of episodes in which every agent acts by ``noise`` alone, as an untrained policy does.
 
         Our own learners normalise as they go, peers by these: fixed scales cost them nothing, and are the same in all
@@ -68,7 +68,7 @@ class Scaling:
         return np.clip(np.asarray(paid) / self.paid, -LIMIT, LIMIT).astype(np.float32)
 
 
-def padded(env: VectorEnv, observations: Mapping[str, NDArray[np.floating]]) -> Array:
+def padded(env: MultiAgentVectorEnv, observations: Mapping[str, NDArray[np.floating]]) -> Array:
     """Return the observations of all agents, (copies, agents, longest), with zeros where an agent sees less."""
     longest = max(space.shape[0] for space in env.observation_spaces.values())
     found = np.zeros((env.num_envs, len(env.agents), longest), dtype=np.float32)
@@ -78,7 +78,7 @@ def padded(env: VectorEnv, observations: Mapping[str, NDArray[np.floating]]) -> 
     return found
 
 
-def by_agent(env: VectorEnv, actions: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
+def by_agent(env: MultiAgentVectorEnv, actions: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
     """Split actions, (copies, agents, 1), by agent; what is out of bounds is cut, as Stable-Baselines3 does."""
     return {agent: np.clip(actions[:, place], -1.0, 1.0) for place, agent in enumerate(env.agents)}
 
@@ -119,7 +119,7 @@ class Acting(Controller):
         """``act`` must be deterministic."""
         self._act, self._scaling = act, scaling
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Act in ``env`` from now on."""
         self._env = env
 

@@ -23,7 +23,7 @@ from benchmarks.peers.settings import NETWORK
 from benchmarks.peers.tables import OURS, figures, gap_table, speed_table, verdict
 from benchmarks.peers.watch import Record
 from cirl_marl import load_network
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.records.files import write_json
 from cirl_marl.records.machine import processor
@@ -105,7 +105,7 @@ def _write(records: Path, chosen: Sequence[str]) -> None:
     standings = {name: [reference.standing(each) for each in record.judged] for name, record in trained.items()}
     setups = {name: record.setup for name, record in trained.items()}
     write_json(RESULTS, {"processor": processor(), **figures(speed, standings, setups)})
-    agents = len(VectorEnv(load_network(NETWORK), num_envs=1).agents)
+    agents = len(MultiAgentVectorEnv(load_network(NETWORK), num_envs=1).agents)
     peers = [name for name in speed if CONTENDERS[name].peer]
     groups = {"With": [name for name in peers if name in BATCHED], "Without": [n for n in peers if n not in BATCHED]}
     said = [f"{how} our batched environment: {verdict(speed, names)}." for how, names in groups.items() if names]

@@ -29,7 +29,7 @@ from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Beginning, Rollout
 from cirl_marl.controllers.shortages import shortages, unsupplied
 from cirl_marl.definitions.catalogue import file_and_region, load_network, networks
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.alternatives import Alternative, alternatives, compared_quantities
 from cirl_marl.evaluation.figures import time_window
@@ -229,11 +229,13 @@ def plan(
 
 def _actor(
     source: str, control: str | None, scenario: str | None, min_service: float | None
-) -> tuple[VectorEnv, Controller]:
+) -> tuple[MultiAgentVectorEnv, Controller]:
     if control is not None and (Path(source) / "config.json").is_file():
         raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
     if control is not None:
-        return VectorEnv(source, num_envs=1, scenario=scenario), named_controller(control, min_service=min_service)
+        return MultiAgentVectorEnv(source, num_envs=1, scenario=scenario), named_controller(
+            control, min_service=min_service
+        )
     if source in networks() or file_and_region(source):
         raise CirlError(f"plan {source}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
     if scenario is not None or min_service is not None:

@@ -14,7 +14,7 @@ from cirl_marl.cli.common import NETWORKS, NetworkName, Scenario, StartSeed, app
 from cirl_marl.controllers.rollout import beginning
 from cirl_marl.definitions.catalogue import families, load_network, recipes
 from cirl_marl.definitions.reading import Definition
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 from cirl_marl.network.series import Series, extremes
@@ -81,7 +81,7 @@ def show(
     from cirl_marl.report.tables import arcs_table, nodes_table
 
     found = load_network(network, scenario=scenario)
-    env = VectorEnv(found, num_envs=1)
+    env = MultiAgentVectorEnv(found, num_envs=1)
     begun = beginning(env, seed)
     begun.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0], env.physical.flow[:, 0]
@@ -185,14 +185,16 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
 
 
 def _check_network(source: str, progress: Callable[[float], None]) -> None:
-    from cirl_marl.controllers.remarks import remarks
+    from cirl_marl.controllers.lint import lint_warnings
 
     network = load_network(source)
     assert network.source is not None
     Definition(network.source).check(network.region)
     for i, each in enumerate((network, *network.scenarios.values()), start=1):
         try:
-            VectorEnv(each, num_envs=1)  # finds what only a network that is run says, as rates no solver can follow
+            MultiAgentVectorEnv(
+                each, num_envs=1
+            )  # finds what only a network that is run says, as rates no solver can follow
             progress(i / (1 + len(network.scenarios)))
         except CirlError as error:
             raise CirlError(f"{source}, scenario '{each.scenario_name}': {error}") from error
@@ -201,5 +203,5 @@ def _check_network(source: str, progress: Callable[[float], None]) -> None:
         f"scenarios {', '.join([network.scenario_name, *network.scenarios])}: no mistakes"
     )
     for each in (network, *network.scenarios.values()):
-        for remark in remarks(each):
+        for remark in lint_warnings(each):
             say(f"{source}: remark on scenario '{each.scenario_name}': {remark}")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import ControlError, unknown
 
 Arrays = Mapping[str, NDArray[np.floating]]
@@ -21,7 +21,7 @@ class Controller(ABC):
     """Once started, what is to be said beside its figures; empty if nothing is."""
 
     @abstractmethod
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Get ready to act in ``env``, once before an evaluation; random controllers draw from ``seed`` only."""
 
     @abstractmethod
@@ -35,12 +35,12 @@ class Planner(Controller):
     ahead: float
     """About what share of the work of an episode is done before it begins."""
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Plan without telling how far it is."""
         self.plan(env, seed, lambda share: None)
 
     @abstractmethod
-    def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
+    def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Do what ``start`` does; ``progress`` is called with the share of it that is done."""
 
 
@@ -52,7 +52,7 @@ class Constant(Controller):
         self._wanted = dict(actions or {})
         self._actions: dict[str, NDArray[np.floating]] = {}
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Take the actions of ``env``'s agents; an agent that does not act or a value out of bounds is refused."""
         for agent, value in self._wanted.items():
             if agent not in env.agents:
@@ -82,7 +82,7 @@ class Neutral(Constant):
 class Random(Controller):
     """Draws every action uniformly and independently."""
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Seed the draws."""
         self._shapes = {agent: neutral.shape for agent, neutral in env.neutral_action.items()}
         self._random = np.random.default_rng([seed, 1])  # not the numbers that the start states are drawn from
@@ -100,7 +100,7 @@ class Watched(Controller):
     >>> from cirl_marl.controllers.rollout import rollout
     >>> shares = []
     >>> watched = Watched(Neutral(), shares.append)
-    >>> _ = rollout(VectorEnv("net_zero", num_envs=1, horizon=2), watched, progress=watched.acted)
+    >>> _ = rollout(MultiAgentVectorEnv("net_zero", num_envs=1, horizon=2), watched, progress=watched.acted)
     >>> shares
     [0.5, 1.0]
     """
@@ -110,7 +110,7 @@ class Watched(Controller):
         self._controller, self._progress = controller, progress
         self._ahead, self._steps = 0.0, 1
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Start the controller, and tell how far its plans are."""
         self._ahead, self._steps = 0.0, env.network.episode.horizon
         if isinstance(self._controller, Planner):

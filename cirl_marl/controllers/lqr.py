@@ -20,7 +20,7 @@ from scipy import linalg
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.environments.actuators import Actuators
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import frozen
@@ -203,7 +203,7 @@ class LQR(Controller):
     system: LinearSystem = field(init=False, repr=False)
     gain: Floats = field(init=False, repr=False)
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Keep ``env``, whose stocks it will measure, and find equilibrium and gain; ``seed`` is not used.
 
         Raises:

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
@@ -33,7 +33,7 @@ class Beginning:
     given: Annotated[Mapping[str, float], "stocks and inner states that are not drawn"]
     said: Annotated[str, "both in words"]
 
-    def reset(self, env: VectorEnv) -> Arrays:
+    def reset(self, env: MultiAgentVectorEnv) -> Arrays:
         """Begin an episode in ``env`` here, and return the observations."""
         return env.reset(seed=self.seed, options={"initial_state": self.given})
 
@@ -84,7 +84,7 @@ class Rollout:
 
 
 def rollout(
-    env: VectorEnv,
+    env: MultiAgentVectorEnv,
     controller: Controller,
     *,
     seed: int = EVALUATION_SEEDS,
@@ -94,7 +94,7 @@ def rollout(
     """Run one whole episode in every copy of ``env``, of which copy i is reset with ``seed + i``.
 
     The same seed gives every controller the same start states; what stands in ``start`` is not drawn (see
-    ``VectorEnv.reset``). ``progress`` is called with the number of intervals done.
+    ``MultiAgentVectorEnv.reset``). ``progress`` is called with the number of intervals done.
     """
     observations = env.reset(seed=seed, options={"initial_state": start or {}})
     controller.start(env, seed)
@@ -132,7 +132,7 @@ def rollout(
     return Rollout(circularity, mean, service, levels, local, returns, *seen, unmet, final, flows)
 
 
-def beginning(env: VectorEnv, seed: int | None = None) -> Beginning:
+def beginning(env: MultiAgentVectorEnv, seed: int | None = None) -> Beginning:
     """Return where the single episode begins that ``cirl show``, ``simulate`` and ``plan`` are about.
 
     That is the middle of all initial ranges, with inner states that models draw themselves as the first evaluation

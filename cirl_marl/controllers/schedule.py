@@ -11,7 +11,7 @@ import numpy as np
 from cirl_marl.controllers.basic import Arrays, Controller, Neutral
 from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, interval_ends, rollout
 from cirl_marl.environments.actuators import Actuators
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
@@ -55,10 +55,10 @@ class _Recorded(Controller):
     """A controller whose actions are kept."""
 
     controller: Controller
-    env: VectorEnv
+    env: MultiAgentVectorEnv
     actions: list[Floats] = field(default_factory=list)
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         self.controller.start(env, seed)
 
     def act(self, observations: Arrays) -> Arrays:
@@ -68,7 +68,11 @@ class _Recorded(Controller):
 
 
 def schedule(
-    env: VectorEnv, controller: Controller, *, seed: int | None = None, progress: Callable[[int], None] | None = None
+    env: MultiAgentVectorEnv,
+    controller: Controller,
+    *,
+    seed: int | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Schedule:
     """Run one episode and tabulate it, a row for each control interval.
 

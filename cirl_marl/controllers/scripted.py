@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl.compartments.incinerator import Incinerator
 from cirl_marl.controllers.basic import Arrays, Constant, Controller
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import ControlKind
@@ -121,7 +121,7 @@ class Scripted(Controller):
         self._held = frozenset(constant or ())
         self._scripts: dict[str, tuple[Script, CompartmentModel, dict[str, int]]] = {}
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Find the script of each agent and what it reads; those held constant are refused as by ``Constant``."""
         self._constant.start(env, seed)
         self._scripts, self._env = {}, env

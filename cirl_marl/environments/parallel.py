@@ -14,7 +14,7 @@ from pettingzoo.utils import conversions
 
 from cirl_marl.environments.actuators import wrong_shape
 from cirl_marl.environments.state import Outcome, Snapshot
-from cirl_marl.environments.vector import Infos, VectorEnv
+from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
 
@@ -64,11 +64,13 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        """Make the environment; ``options`` and errors are those of ``VectorEnv``."""
+        """Make the environment; ``options`` and errors are those of ``MultiAgentVectorEnv``."""
         check_options(options, OPTIONS, "scenario", "agents", "reward", "render_mode")
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise CirlError(unknown("render_mode", render_mode, RENDER_MODES))
-        self.batch = VectorEnv(network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options)
+        self.batch = MultiAgentVectorEnv(
+            network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options
+        )
         self.network = self.batch.network
         if not self.batch.agents:
             raise CirlError(f"network '{self.network.name}': no compartment has a control, so nothing can act")
@@ -220,7 +222,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
 
 
 def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParallelEnv:
-    """Return the network as a PettingZoo ParallelEnv; options are those of ``VectorEnv``, and ``render_mode``.
+    """Return the network as a PettingZoo ParallelEnv; options: of ``MultiAgentVectorEnv``, and ``render_mode``.
 
     >>> env = parallel_env("copper_net", agents=["mine", "use_to_collection"])
     >>> observations, infos = env.reset(seed=0)
@@ -236,12 +238,12 @@ def aec_env(network: str | Path | Network, **options: Any) -> AECEnv[str, Any, A
     return conversions.parallel_to_aec(NetworkParallelEnv(network, **options))
 
 
-def vector_env(network: str | Path | Network, num_envs: int = 64, **options: Any) -> VectorEnv:
-    """Return ``num_envs`` copies of the network, arrays in and out; see ``VectorEnv``.
+def vector_env(network: str | Path | Network, num_envs: int = 64, **options: Any) -> MultiAgentVectorEnv:
+    """Return ``num_envs`` copies of the network, arrays in and out; see ``MultiAgentVectorEnv``.
 
     >>> env = vector_env("copper_net", num_envs=3)
     >>> env.reset(seed=0)["mine"].shape
     (3, 4)
     """
     check_options(options, (*OPTIONS, "scenario", "agents", "reward"))
-    return VectorEnv(network, num_envs=num_envs, **options)
+    return MultiAgentVectorEnv(network, num_envs=num_envs, **options)

@@ -50,7 +50,7 @@ class Starts:
         self._width = np.concatenate([network.initial[1], inner.high]) - self._low
 
     def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
-        """Return the state in which every copy starts, shape (rows, B); see ``VectorEnv.reset``."""
+        """Return the state in which every copy starts, shape (rows, B); see ``MultiAgentVectorEnv.reset``."""
         streams = self.streams if seed is None else self._seeded(seed)
         given = self._given({} if options is None else options)
         self.streams = streams  # not before, so that what is refused changes nothing

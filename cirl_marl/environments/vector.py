@@ -31,7 +31,7 @@ _Seen = dict[str, NDArray[np.float32]]
 _Flags = dict[str, NDArray[np.bool_]]
 
 
-class VectorEnv:
+class MultiAgentVectorEnv:
     """``num_envs`` independent copies of a material network, stepped together.
 
     Observations, rewards and so on are dicts agent → array with leading axis ``num_envs``. A copy whose episode ended

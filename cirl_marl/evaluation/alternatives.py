@@ -14,7 +14,7 @@ import numpy as np
 
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, rollout
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
@@ -41,7 +41,7 @@ class Alternative:
 
     name: Annotated[str, "scenario, controller or both, whichever there are several of; empty if it is alone"]
     control: Annotated[str, "name of the controller"]
-    env: Annotated[VectorEnv, "one copy, in which it was simulated; alternatives of one scenario share it"]
+    env: Annotated[MultiAgentVectorEnv, "one copy, in which it was simulated; alternatives of one scenario share it"]
     begun: Annotated[Beginning, "where the episode began"]
     start: Annotated[Floats, "stocks there, shape (stores,), mass"]
     rollout: Annotated[Rollout, "what came of it"]
@@ -122,7 +122,7 @@ def alternatives(
             nobody takes ``held``, or if units, beginnings or durations of scenarios differ, naming both. Later, if a
             controller cannot act in a scenario; names it.
     """
-    envs = [VectorEnv(network, num_envs=1, scenario=scenario, horizon=steps) for scenario in scenarios]
+    envs = [MultiAgentVectorEnv(network, num_envs=1, scenario=scenario, horizon=steps) for scenario in scenarios]
     _refuse(envs, controls, held)
     cases = list(product(envs, controls))
     controllers = [named_controller(control, held=held if control in SETTABLE else None) for _, control in cases]
@@ -140,7 +140,7 @@ def alternatives(
     return simulated
 
 
-def _refuse(envs: Sequence[VectorEnv], controls: Sequence[str], held: Mapping[str, float] | None) -> None:
+def _refuse(envs: Sequence[MultiAgentVectorEnv], controls: Sequence[str], held: Mapping[str, float] | None) -> None:
     """Raise what ``alternatives`` raises of scenarios and controllers that exist."""
     for kind, names in (("scenario", [env.network.scenario_name for env in envs]), ("control", controls)):
         if not names:
@@ -156,7 +156,7 @@ def _refuse(envs: Sequence[VectorEnv], controls: Sequence[str], held: Mapping[st
             raise CirlError(f"network '{env.network.name}': scenarios {both} cannot be compared: {'; '.join(found)}")
 
 
-def _simulated(name: str, control: str, env: VectorEnv, watched: Watched, seed: int | None) -> Alternative:
+def _simulated(name: str, control: str, env: MultiAgentVectorEnv, watched: Watched, seed: int | None) -> Alternative:
     begun = beginning(env, seed)
     begun.reset(env)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.contenders import contenders
 from cirl_marl.evaluation.figures import gain
@@ -193,14 +193,18 @@ def compare(
     return Comparison(env.network, env.agents, first, entries, measure)
 
 
-def starting_stocks(env: VectorEnv, seed: int) -> Floats:
+def starting_stocks(env: MultiAgentVectorEnv, seed: int) -> Floats:
     """Return the stocks in which the copies of ``env`` start, shape (copies, nodes), mass."""
     env.reset(seed=seed)
     return env.physical.stock[env.rows.nodes].T.copy()
 
 
 def _measured(
-    env: VectorEnv, starts: Floats, names: Sequence[str], rollouts: Sequence[Rollout], progress: Callable[[float], None]
+    env: MultiAgentVectorEnv,
+    starts: Floats,
+    names: Sequence[str],
+    rollouts: Sequence[Rollout],
+    progress: Callable[[float], None],
 ) -> tuple[Yardstick, list[Floats | None]]:
     """Return the yardstick of all rows, and the bounds of the episodes of each rollout."""
     services: dict[str, list[Floats]] = {}
@@ -222,7 +226,11 @@ def _measured(
 
 
 def _measured_draws(
-    env: VectorEnv, starts: Floats, factors: Floats, rollouts: Sequence[Rollout], progress: Callable[[float], None]
+    env: MultiAgentVectorEnv,
+    starts: Floats,
+    factors: Floats,
+    rollouts: Sequence[Rollout],
+    progress: Callable[[float], None],
 ) -> tuple[Yardstick, list[Floats | None]]:
     """Return the bounds of the episodes of each rollout, every episode with the numbers that it drew."""
     levels = [run.episode_levels for run in rollouts]

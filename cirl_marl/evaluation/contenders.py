@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Controller
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Network
@@ -28,7 +28,7 @@ class Contender:
     seed: int | None
     run: RunDirectory | None
     controller: Callable[[], Controller]
-    env: Callable[[int], VectorEnv]
+    env: Callable[[int], MultiAgentVectorEnv]
 
 
 def contenders(
@@ -37,7 +37,7 @@ def contenders(
     network: Network | None,
     min_service: ArrayLike | None,
     uncertain: bool | None = None,
-) -> tuple[list[Contender], VectorEnv]:
+) -> tuple[list[Contender], MultiAgentVectorEnv]:
     """Return everyone who is compared, and a copy of the environment that they share.
 
     What a policy observes and is rewarded with is its own affair; network, acting agents and horizon must be the same.
@@ -53,24 +53,24 @@ def contenders(
         raise CirlError(f"controllers {list(controllers)} must be distinct")
     envs = [run.make_env(1, uncertain=uncertain) for run in runs]
     draws = bool(uncertain) if not envs else envs[0].uncertain
-    first = envs[0] if network is None else VectorEnv(network, num_envs=1, uncertain=draws)
+    first = envs[0] if network is None else MultiAgentVectorEnv(network, num_envs=1, uncertain=draws)
     if envs and envs[0].network.name == first.network.name:
-        first = VectorEnv(first.network, num_envs=1, agents=envs[0].agents, uncertain=draws)
+        first = MultiAgentVectorEnv(first.network, num_envs=1, agents=envs[0].agents, uncertain=draws)
     for run, env in zip(runs, envs, strict=True):
         where = "the network given" if network is not None else str(runs[0].path)
         if found := list(differences(env, first)):
             raise RunError(f"{run.path}: not the same environment as {where}: {'; '.join(found)}")
 
-    def shared(copies: int) -> VectorEnv:
+    def shared(copies: int) -> MultiAgentVectorEnv:
         if network is None:
             return runs[0].make_env(copies, uncertain=uncertain)
-        return VectorEnv(network, num_envs=copies, agents=first.agents, uncertain=draws)
+        return MultiAgentVectorEnv(network, num_envs=copies, agents=first.agents, uncertain=draws)
 
     plain = [_untrained(name, shared, min_service) for name in controllers]
     return [*_trained(runs, uncertain), *plain], first
 
 
-def differences(env: VectorEnv, other: VectorEnv) -> Iterator[str]:
+def differences(env: MultiAgentVectorEnv, other: MultiAgentVectorEnv) -> Iterator[str]:
     """Yield what makes an episode of ``env`` another than one of ``other``; observations and rewards do not count."""
     ours, theirs = env.network, other.network
     if ours.name != theirs.name:
@@ -140,7 +140,7 @@ def _policy(run: RunDirectory) -> Controller:
     return Trained(run)
 
 
-def _untrained(name: str, env: Callable[[int], VectorEnv], min_service: ArrayLike | None) -> Contender:
+def _untrained(name: str, env: Callable[[int], MultiAgentVectorEnv], min_service: ArrayLike | None) -> Contender:
     demanded = min_service if name in ("mpc", "optimum") else None
     controller = partial(named_controller, name, min_service=demanded)
     controller()  # an unknown name fails before anything is computed

@@ -11,7 +11,7 @@ from typing import Any
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.definitions.writing import fingerprint
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import SHARE, over_episodes
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
@@ -35,7 +35,7 @@ def time_window(network: Network, rollout_: Rollout) -> Floats:
     return CIRO_FACTOR * network.objective.criticality * rollout_.episode_circularity
 
 
-def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
+def summary(env: MultiAgentVectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
     """Return the figures of each controller beside those of ``neutral``, ready for JSON.
 
     Each figure is a mean over episodes with its 95 % confidence interval; gains are paired, episode by episode, with
@@ -58,7 +58,7 @@ def summary(env: VectorEnv, rollouts: Mapping[str, Rollout]) -> dict[str, Any]:
     return {"unit": env.network.mass_unit, "episodes": env.num_envs, "controllers": figures}
 
 
-def _by_agent(env: VectorEnv, samples: Floats) -> dict[str, Any]:
+def _by_agent(env: MultiAgentVectorEnv, samples: Floats) -> dict[str, Any]:
     return {agent: over_episodes(row).as_dict() for agent, row in zip(env.agents, samples, strict=True)}
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.controllers.rollout import beginning, first_seed, rollout
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
@@ -70,7 +70,7 @@ def sampled(
     """
     if samples < 2:
         raise CirlError(f"samples must be at least 2, got {samples}")
-    env = VectorEnv(network, num_envs=samples, uncertain=True)
+    env = MultiAgentVectorEnv(network, num_envs=samples, uncertain=True)
     begun, horizon = beginning(env), network.episode.horizon
     stock = np.empty((samples, horizon, len(network.stores)))
     flow = np.empty((samples, horizon, len(network.arcs)))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
@@ -204,9 +204,9 @@ def _unpriced(recipe: Recipe | None) -> Recipe | None:
     return recipe.model_copy(update={"run": recipe.run.model_copy(update=fixed)})
 
 
-def _env(network: Network, recipe: Recipe) -> VectorEnv:
+def _env(network: Network, recipe: Recipe) -> MultiAgentVectorEnv:
     options = {name: value for name, value in recipe.environment.items() if name != "scenario"}
-    return VectorEnv(network, num_envs=1, **options)
+    return MultiAgentVectorEnv(network, num_envs=1, **options)
 
 
 def _check_fit(network: Network, recipe: Recipe) -> None:

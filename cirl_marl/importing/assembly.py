@@ -13,11 +13,11 @@ import numpy as np
 from cirl_marl.controllers.basic import Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Residual
 from cirl_marl.importing.definition import ImportedFiles, identifiers, written
-from cirl_marl.importing.tables import FlowTable, read_flows, read_stocks
+from cirl_marl.importing.flow_table import FlowTable, read_flows, read_stocks
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import published, write_table
@@ -199,7 +199,7 @@ def _largest_error(path: Path, table: FlowTable, made: ImportedFiles, progress: 
     ids = identifiers(table.regions) if table.regions != ("",) else {"": ""}
     for done, (region, id_) in enumerate(ids.items()):
         network = load_network(f"{path}:{id_}" if id_ else path)
-        env = VectorEnv(network, num_envs=1)
+        env = MultiAgentVectorEnv(network, num_envs=1)
         begun = beginning(env)
         run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
         expected = np.array(

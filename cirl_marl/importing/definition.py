@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.importing.balances import Processes, ProcessKind
-from cirl_marl.importing.tables import Connection, FlowTable
+from cirl_marl.importing.flow_table import Connection, FlowTable
 from cirl_marl.network import Floats
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Role

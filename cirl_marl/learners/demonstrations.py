@@ -28,7 +28,7 @@ from cirl_marl.controllers.scripted import Scripted
 from cirl_marl.environments.goal import GoalEnv
 from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.environments.state import State
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError
 from cirl_marl.optimum.named import named_controller
 
@@ -156,7 +156,7 @@ class Demonstrator:
     Several learners may follow it: it acts once for each state.
     """
 
-    def __init__(self, name: str, env: VectorEnv, seed: int) -> None:
+    def __init__(self, name: str, env: MultiAgentVectorEnv, seed: int) -> None:
         """Make the controller ``name``; a random one draws from ``seed`` and the number of the episode."""
         self.name = name
         self.env = env
@@ -213,7 +213,7 @@ def in_copies(name: str, envs: Sequence[gymnasium.Env[Any, Any]], seeds: Sequenc
     return lambda: np.concatenate([row(each) for each in followed], dtype=np.float32, casting="same_kind")
 
 
-def _batch_of(env: gymnasium.Env[Any, Any]) -> VectorEnv:
+def _batch_of(env: gymnasium.Env[Any, Any]) -> MultiAgentVectorEnv:
     own = env.unwrapped
     single = own.flat if isinstance(own, GoalEnv) else own
     if not isinstance(single, SingleAgentEnv):

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reading import write_network
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
@@ -150,7 +150,7 @@ def prepared(
     given = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
     settings = found.environment | given
     copies = found.run.envs if envs is None else _whole("envs", envs, 1)
-    env = VectorEnv(network, num_envs=copies, agents=agents, **settings)
+    env = MultiAgentVectorEnv(network, num_envs=copies, agents=agents, **settings)
     if not env.agents:
         raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
     found.check_agents(env.agents)

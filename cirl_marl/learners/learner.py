@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RecipeError, RunError
 from cirl_marl.learners.algorithms import algorithm_class, build, has_replay_buffer
 from cirl_marl.learners.boundary import Boundary
@@ -300,7 +300,7 @@ def chosen(
     return model.predict(observation, memory, starts, deterministic=deterministic, **masks)
 
 
-def learnt(folder: Path, group: Group, env: VectorEnv) -> Learner:
+def learnt(folder: Path, group: Group, env: MultiAgentVectorEnv) -> Learner:
     """Return a learner that acts by what a checkpoint holds of ``group``, and is not made to learn."""
     parameters = {key: value for key, value in group.spec.parameters.items() if key in ACTING}
     if has_replay_buffer(group.spec.algorithm):

@@ -17,7 +17,7 @@ from greenlet import GreenletExit, getcurrent, greenlet
 from numpy.typing import NDArray
 
 from cirl_marl.environments.state import Snapshot, State
-from cirl_marl.environments.vector import Infos, VectorEnv
+from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import ControlError, LearnerError
 from cirl_marl.learners.boundary import Boundary
 from cirl_marl.learners.seat import JointEnv, JointStep, Seat
@@ -109,10 +109,10 @@ class World:
 class NetworkWorld(World):
     """The world of a network, which can be saved and go on."""
 
-    env: VectorEnv
+    env: MultiAgentVectorEnv
 
     def __init__(
-        self, env: VectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None, *, done: int = 0
+        self, env: MultiAgentVectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None, *, done: int = 0
     ) -> None:
         """Seat learners in ``env``, as ``World`` does.
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.views import View, unseen_state
 
 
@@ -44,7 +44,7 @@ class Policies(Controller):
         """What each remembers, as its algorithm has it; None of those that remember nothing, or have not acted yet."""
         return self._memory
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Forget the last episode."""
         self._memory = dict.fromkeys(self._policies)
         self._starts = np.ones(env.num_envs, dtype=bool)

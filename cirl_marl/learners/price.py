@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.records.files import write_json
 
@@ -32,7 +32,7 @@ class ServicePrice:
     drift through it at any other price, and only the damping, which is at once, stops them.
     """
 
-    def __init__(self, env: VectorEnv, demanded: float, rate: float, damping: float) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, demanded: float, rate: float, damping: float) -> None:
         """Begin with the weight that ``env`` has."""
         self._env, self._demanded, self._rate, self._damping = env, demanded, rate, damping
         weight = max(env.circularity_weight, 1.0 / (1.0 + STEEPEST))

@@ -24,7 +24,7 @@ from cirl_marl.definitions.catalogue import recipe_path
 from cirl_marl.definitions.mistakes import mistakes_of
 from cirl_marl.definitions.quantities import Number
 from cirl_marl.definitions.reading import read_toml
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
 from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of
 from cirl_marl.network import Network
@@ -219,7 +219,7 @@ class Group:
     agents: tuple[str, ...]
     spec: LearnerSettings
 
-    def view(self, env: VectorEnv) -> View:
+    def view(self, env: MultiAgentVectorEnv) -> View:
         """Return how the learner sees ``env``."""
         return view_of(env, self.agents, self.spec.scheme, with_state=self.spec.policy == CENTRAL_CRITIC)
 

@@ -38,7 +38,7 @@ from pydantic import Field, StrictInt, ValidationError, field_validator
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.mistakes import mistakes_of
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError, unknown
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
 from cirl_marl.network import Network
@@ -70,9 +70,9 @@ class RunConfig(Settings):
     """What a run was asked to do, fully resolved.
 
     ``steps`` are environment steps, summed over the copies, of which there are ``envs``. Every random stream derives
-    from ``seed``; ``options`` are those of ``VectorEnv``. Of a definition with regions, ``region`` is the one that was
-    trained on; ``definition_sha256`` is the hash of the definition, ``data_sha256`` are those of the data files by the
-    names that it gives them.
+    from ``seed``; ``options`` are those of ``MultiAgentVectorEnv``. Of a definition with regions, ``region`` is the one
+    that was trained on; ``definition_sha256`` is the hash of the definition, ``data_sha256`` are those of the data
+    files by the names that it gives them.
     ``origins`` say for each learner that had a start where that came from; going on with the run does not need it.
     """
 
@@ -273,14 +273,14 @@ class RunDirectory:
         """The file of the network; a ``RunError`` if it is missing."""
         return self._file("network/network.toml" if self.config.data_sha256 else "network.toml")
 
-    def make_env(self, num_envs: int, *, uncertain: bool | None = None) -> VectorEnv:
+    def make_env(self, num_envs: int, *, uncertain: bool | None = None) -> MultiAgentVectorEnv:
         """Return the environment that the run trained in, with ``num_envs`` copies.
 
         ``uncertain`` says whether uncertain numbers are drawn; None: if they were in the training.
         """
         config = self.config
         options = config.options if uncertain is None else {**config.options, "uncertain": uncertain}
-        return VectorEnv(self.network(), num_envs=num_envs, agents=config.agents, **options)
+        return MultiAgentVectorEnv(self.network(), num_envs=num_envs, agents=config.agents, **options)
 
     def begin_checkpoint(self) -> Path:
         """Return an empty folder for a checkpoint, which counts when ``end_checkpoint`` is called."""

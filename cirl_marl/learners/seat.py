@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn
 
 from cirl_marl.controllers.basic import Arrays
-from cirl_marl.environments.vector import Infos, VectorEnv
+from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.learners.views import ObservedRows, View
 from cirl_marl.network import Floats
@@ -19,7 +19,7 @@ from cirl_marl.network.elements import Compartment
 
 
 class JointEnv(Protocol):
-    """Several copies of an environment of many agents, all stepped at once; ``VectorEnv`` is one.
+    """Several copies of an environment of many agents, all stepped at once; ``MultiAgentVectorEnv`` is one.
 
     What it takes and gives is by agent, with a leading axis of ``num_envs`` entries. An episode that has ended is
     followed by the next at once; what was seen last is ``final_observation`` in the infos.
@@ -102,7 +102,7 @@ class CopyView:
 
     render_mode: str | None = None
 
-    def __init__(self, env: VectorEnv, index: int, agent: str | None = None) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, index: int, agent: str | None = None) -> None:
         """View copy ``index`` of ``env`` as ``agent``, or as all agents of a joint learner."""
         self.env, self.index, self.agent = env, index, agent
 

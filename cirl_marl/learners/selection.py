@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.policies import Policies
 
 SEEDS = 2**40
@@ -54,7 +54,7 @@ class Score:
 class Selection:
     """The episodes that choose: the same ones each time, each in a copy of the environment of its own."""
 
-    def __init__(self, env: VectorEnv) -> None:
+    def __init__(self, env: MultiAgentVectorEnv) -> None:
         """``env`` has a copy for each episode, and is used by nobody else."""
         self._env = env
 

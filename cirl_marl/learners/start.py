@@ -16,7 +16,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, unknown
 from cirl_marl.learners.demonstrations import keep_parameters
 from cirl_marl.learners.learner import Learner, learnt
@@ -31,7 +31,7 @@ SHOWN = 3
 Bounds = tuple[float, float]
 
 
-def begin_from(start: Start, learner: Learner, env: VectorEnv, seed: int) -> Origin:
+def begin_from(start: Start, learner: Learner, env: MultiAgentVectorEnv, seed: int) -> Origin:
     """Give a fresh ``learner`` in ``env`` the policy that ``start`` names; return where it comes from.
 
     In the name of the run ``{seed}`` stands for ``seed``, so that one recipe serves several seeds.
@@ -46,7 +46,7 @@ def begin_from(start: Start, learner: Learner, env: VectorEnv, seed: int) -> Ori
         raise RecipeError(f"{learner.seat.title}: start: {error}") from error
 
 
-def _begin_from(run: RunDirectory, name: str, learner: Learner, env: VectorEnv) -> Origin:
+def _begin_from(run: RunDirectory, name: str, learner: Learner, env: MultiAgentVectorEnv) -> Origin:
     groups = {group.name: group for group in run.groups()}
     if name not in groups:
         raise RecipeError(f"{run.path}: {unknown('agent', name, groups)}")
@@ -104,7 +104,7 @@ def _written(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
-def _entries(env: VectorEnv, agents: Sequence[str], spec: LearnerSettings) -> dict[str, Bounds]:
+def _entries(env: MultiAgentVectorEnv, agents: Sequence[str], spec: LearnerSettings) -> dict[str, Bounds]:
     """Return what a learner of ``agents`` sees, in order, with its bounds."""
     found: dict[str, Bounds] = {}
     for agent in agents:

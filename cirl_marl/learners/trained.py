@@ -6,7 +6,7 @@ from pathlib import Path
 
 from stable_baselines3.common.vec_env import VecNormalize
 
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.learners.learner import learnt
 from cirl_marl.learners.policies import Policies, Policy
@@ -32,7 +32,7 @@ class Trained(Policies):
             policies[group.name] = Policy(learner.model, normaliser, learner.seat.view)
         super().__init__(policies)
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
         if set(env.agents) != set(self._seen):
             raise RunError(f"{self.run.path}: trained {sorted(self._seen)}, not {sorted(env.agents)}")

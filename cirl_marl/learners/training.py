@@ -21,7 +21,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.environments.rewards import WEIGHED
-from cirl_marl.environments.vector import Infos, VectorEnv
+from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
@@ -73,7 +73,11 @@ class Training:
     """A run in progress: what it was asked to do, the joint environment, its learners by name, and where it is kept."""
 
     def __init__(
-        self, config: RunConfig, env: VectorEnv, checkpoint: Path | None = None, checkpoint_every: float | None = None
+        self,
+        config: RunConfig,
+        env: MultiAgentVectorEnv,
+        checkpoint: Path | None = None,
+        checkpoint_every: float | None = None,
     ) -> None:
         """Seat the learners and make their algorithms, or load those of a ``checkpoint`` from which a run goes on.
 
@@ -118,7 +122,7 @@ class Training:
         asked = config.recipe.run
         self._evaluation: Selection | None = None
         if asked.evaluations:
-            own = VectorEnv(env.network, num_envs=asked.episodes, agents=env.agents, **config.options)
+            own = MultiAgentVectorEnv(env.network, num_envs=asked.episodes, agents=env.agents, **config.options)
             self._evaluation = Selection(own)
         self._evaluated = -1
         self._saving: Path | None = None

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from cirl_marl.controllers.basic import Arrays
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
 
 ObservedRows = NDArray[np.floating] | dict[str, NDArray[np.floating]]
@@ -49,10 +49,10 @@ class View(ABC):
     action_space: spaces.Space[Any]
     state_entries = 0
 
-    def with_state(self, env: VectorEnv) -> View:
+    def with_state(self, env: MultiAgentVectorEnv) -> View:
         """Show the whole state beside the rows from now on: ``{"observation": …, "state": …}``; return the view.
 
-        The state is that of ``VectorEnv.state()``, in physical units and double precision.
+        The state is that of ``MultiAgentVectorEnv.state()``, in physical units and double precision.
         """
         self.state_entries = len(env.state_names) + 1
         state = spaces.Box(-np.inf, np.inf, (self.state_entries,), dtype=np.float64)
@@ -117,7 +117,7 @@ class SharedPolicy(View):
     and ``agent_indicator_v0``, but for the indicator, which is 1 where SuperSuit writes the largest bound of the space.
     """
 
-    def __init__(self, env: VectorEnv, agents: Sequence[str]) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, agents: Sequence[str]) -> None:
         """View ``env`` as each of ``agents`` in turn."""
         self.agents = self.row_agents = tuple(agents)
         boxes = [env.observation_spaces[agent] for agent in self.agents]
@@ -161,7 +161,7 @@ class SharedPolicy(View):
 class AllAtOnce(View):
     """N agents as one: observations and actions one after the other, the reward their mean."""
 
-    def __init__(self, env: VectorEnv, agents: Sequence[str]) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, agents: Sequence[str]) -> None:
         """View ``env`` as all of ``agents``."""
         self.agents, self.row_agents = tuple(agents), ()
         boxes = [env.observation_spaces[agent] for agent in self.agents]
@@ -190,7 +190,7 @@ class AllAtOnce(View):
         return mean
 
 
-def view_of(env: VectorEnv, agents: Sequence[str], scheme: Scheme, *, with_state: bool = False) -> View:
+def view_of(env: MultiAgentVectorEnv, agents: Sequence[str], scheme: Scheme, *, with_state: bool = False) -> View:
     """Return how a learner of ``agents`` sees ``env``; one that is independent has a single agent."""
     view: View
     if scheme == "independent":
@@ -201,6 +201,6 @@ def view_of(env: VectorEnv, agents: Sequence[str], scheme: Scheme, *, with_state
     return view.with_state(env) if with_state else view
 
 
-def unseen_state(env: VectorEnv) -> Callable[[], Floats]:
+def unseen_state(env: MultiAgentVectorEnv) -> Callable[[], Floats]:
     """Return zeros in the place of the state, for acting: an actor does not look at it."""
     return lambda: np.zeros((env.num_envs, len(env.state_names) + 1))

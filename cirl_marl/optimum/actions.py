@@ -29,7 +29,7 @@ def normalised_actions(
         intervals: of the episode, whose first were planned; None is all of them.
 
     Returns:
-        Actions in [−1, 1], in the order of ``VectorEnv.stack``, shape (steps, entries).
+        Actions in [−1, 1], in the order of ``MultiAgentVectorEnv.stack``, shape (steps, entries).
     """
     network, first = admissible.network, 0 if intervals is None else intervals.start
     during = slice(first, first + len(planned))

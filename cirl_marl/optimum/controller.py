@@ -7,7 +7,7 @@ from collections.abc import Callable
 from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Arrays, Planner
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.optimum.admissible import NoCertificate
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
@@ -36,7 +36,7 @@ class Optimum(Planner):
         self.plans: list[Bound] | list[Incumbent] = []
         self._plan = Plan(())
 
-    def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
+    def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Solve a program for the start of every copy and improve its plan; ``seed`` has no effect.
 
         Where no program bounds the network (``NoCertificate``), look for plans by simulation, from all starts at once.
@@ -56,7 +56,7 @@ class Optimum(Planner):
         """Return the planned actions of the next interval."""
         return self._plan.act(observations)
 
-    def _bounded(self, env: VectorEnv, progress: Callable[[float], None]) -> list[Bound]:
+    def _bounded(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Bound]:
         plans: list[Bound] = []
         known: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
         for copy, start in enumerate(env.physical.stock[env.rows.nodes].T):
@@ -77,7 +77,7 @@ class Optimum(Planner):
             known[key] = plans[-1]
         return plans
 
-    def _found(self, env: VectorEnv, progress: Callable[[float], None]) -> list[Incumbent]:
+    def _found(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Incumbent]:
         return search_each(
             env.network,
             starting_states(env),

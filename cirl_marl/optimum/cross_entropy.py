@@ -1,6 +1,6 @@
 """The best plan found where nothing is proved: the cross-entropy method on the simulator itself.
 
-All copies of one ``VectorEnv`` start from the same state; each tries one sequence of actions, that of a known
+All copies of one ``MultiAgentVectorEnv`` start from the same state; each tries one sequence of actions, that of a known
 controller π plus deviations that are constant between knots,
 
     a(t) = clip(π(o(t)) + θ_k, −1, 1),    k = ⌊t·knots/steps⌋,
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.controllers.basic import Constant, Controller, Neutral
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS
 from cirl_marl.controllers.scripted import Scripted
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.optimum.bounds import demanded_levels
@@ -49,7 +49,7 @@ class Incumbent:
     Attributes:
         network: the network, under the scenario and horizon that the plan is for.
         agents: who acts; the others are neutral.
-        initial: stocks and inner states at the start, the first of ``VectorEnv.state_names``, shape (rows,).
+        initial: stocks and inner states at the start, the first of ``MultiAgentVectorEnv.state_names``, shape (rows,).
         actions: normalised actions, shape (steps, entries).
         circularity: λ̄ that the plan achieves in the simulator, mass.
         service: mean service level that it achieves.
@@ -120,7 +120,7 @@ def search(
     Raises:
         CirlError: for input that cannot be used.
     """
-    env = VectorEnv(network, num_envs=1, agents=agents, scenario=scenario, horizon=horizon)
+    env = MultiAgentVectorEnv(network, num_envs=1, agents=agents, scenario=scenario, horizon=horizon)
     given: Mapping[str, ArrayLike] = {}
     if isinstance(initial, Mapping):
         given = initial
@@ -160,7 +160,7 @@ def search_each(
 
     All starts share the draws, so each plan is the one that ``search`` finds from that start alone. Arguments and
     errors are those of ``search``, but for ``network``, under its scenario and horizon, and ``initial``, stocks and
-    inner states, the first of ``VectorEnv.state_names``, shape (starts, rows).
+    inner states, the first of ``MultiAgentVectorEnv.state_names``, shape (starts, rows).
     """
     check_options(service_weight, min_service, DEGREE)
     for name, value, least in (("population", population, 8), ("iterations", iterations, 0), ("knots", knots, 1)):

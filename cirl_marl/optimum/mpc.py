@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from cirl_marl.controllers.basic import Arrays, Planner
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats
 from cirl_marl.optimum.actions import normalised_actions
@@ -137,7 +137,7 @@ class MPC(Planner):
         self._horizon, self._replan = horizon, replan
         self._demanded, self._weight, self._degree = min_service, service_weight, degree
 
-    def plan(self, env: VectorEnv, seed: int, progress: Callable[[float], None]) -> None:
+    def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Make the first plan of every copy; ``seed`` has no effect.
 
         Raises:

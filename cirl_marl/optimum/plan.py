@@ -10,7 +10,7 @@ import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout, rollout
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.bounds import Bound
@@ -33,7 +33,7 @@ class Planned(Protocol):
 
     @property
     def initial(self) -> Floats:
-        """Stocks at the start, and inner states if there are any, the first of ``VectorEnv.state_names``."""
+        """Stocks at the start, and inner states if there are any, the first of ``MultiAgentVectorEnv.state_names``."""
 
     @property
     def actions(self) -> Floats:
@@ -49,7 +49,7 @@ class Plan(Controller):
         self._actions = np.empty((0, 0, 0))
         self._step = 0
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Go to the beginning of the plan.
 
         Raises:
@@ -75,7 +75,7 @@ class Plan(Controller):
         self._step += 1
         return dict(self._env.unstack(actions))
 
-    def _check(self, plan: Planned, env: VectorEnv, start: Floats, copy: int) -> None:
+    def _check(self, plan: Planned, env: MultiAgentVectorEnv, start: Floats, copy: int) -> None:
         ours, theirs = plan.network, env.network
         if (ours.nodes, ours.arcs, ours.episode) != (theirs.nodes, theirs.arcs, theirs.episode):
             raise ControlError(
@@ -98,7 +98,7 @@ def achieved(bound: Bound) -> Rollout:
     network = bound.network
     stores = [replace(n, initial=(x, x)) for n, x in zip(network.stores, bound.stock[0].tolist(), strict=True)]
     pinned = replace(network, nodes=(*stores, *network.nodes[len(stores) :]))
-    env = VectorEnv(pinned, num_envs=1, agents=bound.agents or None)
+    env = MultiAgentVectorEnv(pinned, num_envs=1, agents=bound.agents or None)
     stages = [row for rows in env.rows.stages.values() for row in rows.tolist()]
     start = {env.rows.start_names[row]: float(bound.initial[row]) for row in stages}
     return rollout(env, Plan(replace(bound, network=pinned)), start=start)

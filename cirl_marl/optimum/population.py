@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl.controllers.basic import Controller
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 
@@ -43,14 +43,14 @@ class Population:
         Args:
             network: under its scenario and horizon.
             agents: who acts; None is the network's own choice.
-            starts: stocks and inner states, the first of ``VectorEnv.state_names``, shape (starts, rows).
+            starts: stocks and inner states, the first of ``MultiAgentVectorEnv.state_names``, shape (starts, rows).
             size: copies from each start.
 
         Raises:
             CirlError: for starts that no episode can begin with, or if nobody acts.
         """
         self._shape = (len(starts), size)
-        self._env = env = VectorEnv(network, num_envs=len(starts) * size, agents=agents)
+        self._env = env = MultiAgentVectorEnv(network, num_envs=len(starts) * size, agents=agents)
         if not env.agents:
             raise CirlError(f"network '{network.name}': nobody acts, so there is nothing to search for")
         self.agents = env.agents
@@ -109,13 +109,13 @@ class Population:
         )
 
 
-def starting_states(env: VectorEnv) -> Floats:
+def starting_states(env: MultiAgentVectorEnv) -> Floats:
     """Return the stocks and inner states in which the copies of ``env`` are, shape (copies, rows)."""
     state = env.physical
     return env.rows.start_of(state.stock, state.inner).T
 
 
-def named(env: VectorEnv, starts: Floats) -> dict[str, Floats]:
+def named(env: MultiAgentVectorEnv, starts: Floats) -> dict[str, Floats]:
     """Return stocks and inner states, shape (copies, rows), by their names, shape (copies,) each.
 
     Raises:

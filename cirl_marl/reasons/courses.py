@@ -13,7 +13,7 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import beginning, first_seed, rollout
 from cirl_marl.controllers.schedule import control_names
 from cirl_marl.environments.actuators import Actuators
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
@@ -131,7 +131,7 @@ class _Given(Controller):
         """Take physical values, shape (entries, steps)."""
         self._values, self._step = values, 0
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         self._env, self._step = env, 0
         self._actuators = Actuators(env.dynamics, env.agents, 1)
 
@@ -148,7 +148,7 @@ class _Given(Controller):
 def _of_controls(
     network: Network, path: Path, header: list[str], rows: list[list[str]], seed: int | None
 ) -> PlannedEpisode:
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     steps = network.episode.horizon
     if len(rows) != steps:
         raise CirlError(f"{path}: has {len(rows)} intervals, an episode of '{network.name}' has {steps}")
@@ -167,7 +167,7 @@ def _of_controls(
     return PlannedEpisode(str(path), initial, run.stock, run.flow)
 
 
-def _stocks(env: VectorEnv) -> Floats:
+def _stocks(env: MultiAgentVectorEnv) -> Floats:
     """Return the stocks of the only copy, shape (stocks,), as the simulator has them."""
     found: Floats = env.physical.stock[env.rows.nodes][:, 0].copy()
     return found

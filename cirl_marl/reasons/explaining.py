@@ -10,7 +10,7 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.evaluation.comparison import part_of, starting_stocks
 from cirl_marl.evaluation.yardsticks import demanded
@@ -163,6 +163,8 @@ def _of_run(
     )
 
 
-def _prices(env: VectorEnv, starts: Floats, level: float | Floats, progress: Callable[[float], None]) -> ShadowPrices:
+def _prices(
+    env: MultiAgentVectorEnv, starts: Floats, level: float | Floats, progress: Callable[[float], None]
+) -> ShadowPrices:
     mean = np.asarray(starts.mean(axis=0))
     return shadow_prices(env.network, mean, min_service=level, agents=env.agents, progress=progress)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
 from cirl_marl.network import Floats, Integers
 from cirl_marl.reasons.extras import captum
@@ -83,7 +83,7 @@ def compared(run: Rollout, usual: Rollout) -> Consequence:
 
 
 def inputs(
-    env: VectorEnv,
+    env: MultiAgentVectorEnv,
     policies: Policies,
     again: Policies,
     seen: SeenEpisodes,
@@ -139,13 +139,13 @@ def inputs(
     return tuple(found)
 
 
-def _means(env: VectorEnv, agent: str, names: list[str], seen: SeenEpisodes) -> tuple[Integers, Floats]:
+def _means(env: MultiAgentVectorEnv, agent: str, names: list[str], seen: SeenEpisodes) -> tuple[Integers, Floats]:
     entries = entries_of(env, agent, names)
     return entries, seen.observations[agent].mean(axis=(0, 1))[entries]
 
 
 def _attributed(
-    env: VectorEnv, name: str, policy: Policy, agent: str, seen: SeenEpisodes
+    env: MultiAgentVectorEnv, name: str, policy: Policy, agent: str, seen: SeenEpisodes
 ) -> tuple[Floats, Floats, float]:
     """Return shares, slopes and what is missed, for the signals of ``columns``."""
     import torch

@@ -17,7 +17,7 @@ import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
 from cirl_marl.reasons.extras import trees
 from cirl_marl.reasons.inputs import Consequence, compared
@@ -99,7 +99,7 @@ class Tree(Controller):
         """Take a fitted tree for each agent, and where in the observations its features are."""
         self._grown, self._seen = grown, seen
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Get ready: there is nothing to remember."""
 
     def act(self, observations: Arrays) -> Arrays:
@@ -113,7 +113,7 @@ class Tree(Controller):
 
 
 def rules(
-    env: VectorEnv,
+    env: MultiAgentVectorEnv,
     policies: Policies,
     usual: Rollout,
     seed: int,
@@ -196,7 +196,7 @@ def _explained(tree: Any, agent: str, places: Sequence[tuple[str, int]], watched
 
 
 def _leaves(
-    env: VectorEnv,
+    env: MultiAgentVectorEnv,
     agent: str,
     tree: Any,
     names: Sequence[str],

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.views import View
 from cirl_marl.network import Integers, Network
 from cirl_marl.network.elements import Arc, Law, Node
@@ -20,7 +20,7 @@ class Signal:
     """An entry of observations.
 
     Attributes:
-        name: as ``VectorEnv.observation_names`` has it.
+        name: as ``MultiAgentVectorEnv.observation_names`` has it.
         about: the compartment that it is about; empty for time, services and what models show.
         scale: what it is multiplied by to be in its unit.
         unit: of what it stands for.
@@ -68,7 +68,7 @@ class Columns:
     entries: Integers
 
 
-def columns(env: VectorEnv, view: View, agent: str) -> Columns:
+def columns(env: MultiAgentVectorEnv, view: View, agent: str) -> Columns:
     """Return what stands where in the row in which a policy sees an agent.
 
     Views are asked: they are shown numbers that no indicator and no padding has.
@@ -95,7 +95,7 @@ def columns(env: VectorEnv, view: View, agent: str) -> Columns:
     return Columns(tuple(found), places, tuple(seen.values()), np.asarray(acted[agent][0], dtype=np.intp))
 
 
-def entries_of(env: VectorEnv, agent: str, names: Sequence[str]) -> Integers:
+def entries_of(env: MultiAgentVectorEnv, agent: str, names: Sequence[str]) -> Integers:
     """Return which entries of an agent's observation have these names."""
     shown = env.observation_names[agent]
     return np.array([i for i, name in enumerate(shown) if name in names], dtype=np.intp)

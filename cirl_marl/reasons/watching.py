@@ -10,7 +10,7 @@ import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout, rollout
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.network import Floats, Integers
 
@@ -44,7 +44,7 @@ class Watching(Controller):
     _done: list[Arrays] = field(default_factory=list)
     _memories: list[Mapping[str, Any]] = field(default_factory=list)
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Forget what was seen.
 
         Raises:
@@ -84,7 +84,7 @@ class Holding(Controller):
     controller: Controller
     held: Mapping[str, tuple[Integers, Floats]]
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Start the controller."""
         self.controller.start(env, seed)
 
@@ -104,7 +104,7 @@ class Instead(Controller):
     everyone: Controller
     others: Mapping[str, Controller]
 
-    def start(self, env: VectorEnv, seed: int) -> None:
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Start all of them."""
         self.everyone.start(env, seed)
         for other in {id(each): each for each in self.others.values()}.values():
@@ -118,7 +118,7 @@ class Instead(Controller):
 
 
 def played(
-    env: VectorEnv, controller: Controller, seed: int, progress: Callable[[float], None] = lambda share: None
+    env: MultiAgentVectorEnv, controller: Controller, seed: int, progress: Callable[[float], None] = lambda share: None
 ) -> Rollout:
     """Return the episodes of a controller from the starts of a seed."""
     steps = env.network.episode.horizon

@@ -12,7 +12,7 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout, interval_ends
 from cirl_marl.drawing.digraph import save_before_after
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.comparison import Comparison, part_of
@@ -37,7 +37,7 @@ def evaluate_run(
     seed: int = 0,
     bounds: bool = True,
     progress: Callable[[str, float], None] = lambda what, share: None,
-) -> tuple[dict[str, Any], dict[str, Rollout], VectorEnv]:
+) -> tuple[dict[str, Any], dict[str, Rollout], MultiAgentVectorEnv]:
     """Compare the trained policies with neutral and random control on fresh episodes.
 
     The other arguments are those of ``compare``; bounds take longer than the episodes.
@@ -57,7 +57,7 @@ def evaluate_run(
 
 def evaluate_story(
     run: RunDirectory, *, episodes: int, seed: int, progress: Callable[[str, float], None]
-) -> tuple[tuple[dict[str, Any], dict[str, Rollout], VectorEnv], Story]:
+) -> tuple[tuple[dict[str, Any], dict[str, Rollout], MultiAgentVectorEnv], Story]:
     """Return what ``evaluate_run`` does, and the page: business as usual, the policies, and the plan of the bound.
 
     Reasons are on it if they were found of the checkpoint that acts; else it says how to find them.
@@ -75,7 +75,7 @@ def evaluate_story(
 
 def figures_of(
     run: RunDirectory, comparison: Comparison, *, bounds: bool
-) -> tuple[dict[str, Any], dict[str, Rollout], VectorEnv]:
+) -> tuple[dict[str, Any], dict[str, Rollout], MultiAgentVectorEnv]:
     """Return, and write, what ``evaluate_run`` does of a comparison of the run with ``CONTROLLERS``."""
     episodes = comparison.episodes
     entries = dict(zip(("trained", "neutral", "random"), comparison.entries, strict=True))
@@ -128,7 +128,7 @@ def _is_evaluated(run: RunDirectory, figures: Mapping[str, Any]) -> bool:
     return all(found.get(name) == figures[name] for name in ("checkpoint", "episodes", "first_seed"))
 
 
-def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: VectorEnv) -> list[Path]:
+def draw_run(run: RunDirectory, rollouts: Mapping[str, Rollout], env: MultiAgentVectorEnv) -> list[Path]:
     """Draw the network before and after, λ over time trained against neutral and random, and the learning curves.
 
     There are no learning curves if no episode ended while training.

@@ -13,7 +13,7 @@ from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.style import spoken
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.alternatives import Alternative
 from cirl_marl.evaluation.comparison import FIGURES, Comparison
 from cirl_marl.evaluation.sampling import SampledEpisodes
@@ -150,7 +150,7 @@ def of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> Story:
 
 
 def with_plan(
-    story: Story, found: Comparison, env: VectorEnv, progress: Callable[[float], None] = lambda share: None
+    story: Story, found: Comparison, env: MultiAgentVectorEnv, progress: Callable[[float], None] = lambda share: None
 ) -> Story:
     """Return the page with the best plan for the first episode.
 
@@ -190,7 +190,7 @@ def _weighed(weight: float | None, seed: int | None) -> str:
 
 def _first_start(found: Comparison) -> Floats:
     """Return the stocks with which the first episode begins, shape (stores,), mass."""
-    env = VectorEnv(found.network, num_envs=1, agents=found.agents)
+    env = MultiAgentVectorEnv(found.network, num_envs=1, agents=found.agents)
     env.reset(seed=found.first_seed)
     start: Floats = env.rows.stocks(env.physical.stock)[:, 0].copy()
     return start

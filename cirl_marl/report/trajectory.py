@@ -9,7 +9,7 @@ import numpy as np
 
 from cirl_marl.controllers.pyramids import Pyramid, pyramids
 from cirl_marl.controllers.rollout import Beginning, Rollout, interval_ends
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.records.files import write_atomically, write_table
@@ -17,7 +17,9 @@ from cirl_marl.report.ages import save_pyramids
 from cirl_marl.report.curves import save_trajectory
 
 
-def write_trajectory(folder: Path, name: str, env: VectorEnv, begun: Beginning, run: Rollout, title: str) -> list[Path]:
+def write_trajectory(
+    folder: Path, name: str, env: MultiAgentVectorEnv, begun: Beginning, run: Rollout, title: str
+) -> list[Path]:
     """Write ``name.csv`` and ``name.png`` of what ``run`` did in ``env`` from where it began; return their paths.
 
     The first holds what ``trajectory_table`` returns. The picture shows λ as a mean, as it does the flows. Of a network
@@ -66,7 +68,7 @@ def ages_table(network: Network, found: Sequence[Pyramid]) -> tuple[list[str], l
     return header, rows
 
 
-def trajectory_table(env: VectorEnv, begun: Beginning, run: Rollout) -> tuple[list[str], list[list[object]]]:
+def trajectory_table(env: MultiAgentVectorEnv, begun: Beginning, run: Rollout) -> tuple[list[str], list[list[object]]]:
     """Return header and rows of what ``run`` did in ``env`` from where it began.
 
     There is a row for the start and one for the end of each interval: year or date at the end, if the network has a
@@ -89,7 +91,7 @@ def trajectory_table(env: VectorEnv, begun: Beginning, run: Rollout) -> tuple[li
     return _header(env), [[*at, *values] for at, values in zip(clock, measured, strict=True)]
 
 
-def _header(env: VectorEnv) -> list[str]:
+def _header(env: MultiAgentVectorEnv) -> list[str]:
     network, physics = env.network, env.dynamics.inner
     mass, time = network.mass_unit, network.time_unit
     header = [f"time ({time})", *(f"{each} at the end" for each in labels(network, 0.0)[0])]

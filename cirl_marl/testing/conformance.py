@@ -23,7 +23,7 @@ from pettingzoo import ParallelEnv
 from cirl_marl.testing.nested import ConformanceError, check_member, check_memory, require, same_or_raise
 
 if TYPE_CHECKING:
-    from cirl_marl.environments.vector import VectorEnv
+    from cirl_marl.environments.vector import MultiAgentVectorEnv
 
 __all__ = ["ConformanceError", "check_parallel_env", "check_vector_env"]
 
@@ -71,8 +71,8 @@ def check_parallel_env(make: Callable[[], AnyEnv], *, steps: int = 200, seed: in
     second.close()
 
 
-def check_vector_env(make: Callable[[], VectorEnv], *, steps: int = 200, seed: int = 0) -> None:
-    """Check every copy of a ``VectorEnv``, over restarts; arguments and errors are as in ``check_parallel_env``."""
+def check_vector_env(make: Callable[[], MultiAgentVectorEnv], *, steps: int = 200, seed: int = 0) -> None:
+    """Check every copy of a ``MultiAgentVectorEnv``, and restarts; arguments are those of ``check_parallel_env``."""
     first, second = make(), make()
     generator = np.random.default_rng(seed)
     observations = first.reset(seed)
@@ -209,13 +209,13 @@ def _check_restart(watched: _Watched, seed: int, recorded: list[tuple[Any, ...]]
         _compare(recorded[step], again, "one environment run twice with the same seed and actions", step)
 
 
-def _check_batch(env: VectorEnv, observations: Mapping[str, Any], step: int) -> None:
+def _check_batch(env: MultiAgentVectorEnv, observations: Mapping[str, Any], step: int) -> None:
     require(list(observations) == list(env.agents), f"step {step}: observations have keys {list(observations)}")
     for agent, seen in observations.items():
         _check_rows(env, agent, seen, f"agent {agent!r}, step {step}: observation")
 
 
-def _check_rows(env: VectorEnv, agent: str, seen: Any, where: str) -> None:
+def _check_rows(env: MultiAgentVectorEnv, agent: str, seen: Any, where: str) -> None:
     require(len(seen) == env.num_envs, f"{where}: {len(seen)} rows for {env.num_envs} copies")
     for i, row in enumerate(seen):
         check_member(env.observation_spaces[agent], row, f"{where} of copy {i}")

@@ -11,7 +11,7 @@ from cirl_marl.controllers.basic import Constant, Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.controllers.shortages import shortages, unsupplied
 from cirl_marl.dynamics.laws import LAWS
-from cirl_marl.environments.vector import VectorEnv
+from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import ControlKind, Law, Role
@@ -31,7 +31,7 @@ SHORT = 20
 """Control intervals over which the ends of the controls are tried."""
 
 
-def remarks(network: Network) -> Iterator[str]:
+def lint_warnings(network: Network) -> Iterator[str]:
     """Yield what whoever wrote ``network`` may not have meant: what is idle, starved, too late or too coarse."""
     for look in (
         _apart,
@@ -131,7 +131,7 @@ def _coarse(network: Network) -> Iterator[str]:
     size = np.maximum(np.abs(shown[1]).max(axis=0), 1e-9)
     apart = np.abs(shown[0] - shown[1]).max(axis=0) / size
     if apart[worst := int(apart.argmax())] > COARSE:
-        name = VectorEnv(network, num_envs=1).state_names[worst]
+        name = MultiAgentVectorEnv(network, num_envs=1).state_names[worst]
         other = f"neutral control gives another {name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
         yield f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, {other}"
 
@@ -150,7 +150,7 @@ def _lives(network: Network) -> Iterator[str]:
 
 def _states(network: Network, action: float | None, intervals: int) -> Floats:
     """Return the states that come of one action of all agents, None being neutral, shape (intervals, states)."""
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed=0)
     controls = env.dynamics.neutral.copy()
     if action is not None:
@@ -187,7 +187,7 @@ def _starved(network: Network) -> Iterator[str]:
     fed = {arc.recipient for arc in network.arcs}
     sources = {id_ for arc, donor in scheduled.items() if donor not in fed for id_ in (arc, donor)}
     highest = Constant({agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)})
-    env, said = VectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS)), set[str]()
+    env, said = MultiAgentVectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS)), set[str]()
     begun = beginning(env)
     for control, controller, looked_at in (("neutral", Neutral(), set(scheduled)), ("the highest", highest, sources)):
         try:
@@ -207,7 +207,7 @@ def _unsupplied(network: Network) -> Iterator[str]:
     """Yield services that fall short of what is demanded though arcs make up for them."""
     if not any(arc.makes_up_for for arc in network.arcs):
         return
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     begun = beginning(env)
     for said in unsupplied(rollout(env, Neutral(), seed=begun.seed, start=begun.given), network):
         yield f"under neutral control {said}; widen the bounds of its control, or ask for less"
