@@ -18,7 +18,7 @@ from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import Rollout, beginning, rollout
 from cirl_marl.evaluation import Comparison, compare
-from cirl_marl.evaluation.sampling import sampled, sensitivities
+from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, achieved, bound, gap, improved
@@ -114,7 +114,7 @@ def lives() -> Iterator[str]:
 
 def spread(network: Network) -> Iterator[str]:
     """Yield how λ̄ as usual spreads, and which number causes it."""
-    found = sampled(network, samples=SAMPLES)
+    found = sample_episodes(network, samples=SAMPLES)
     mean = found.circularity.mean(axis=1) / 1e3
     low, high = np.quantile(mean, (0.025, 0.975)).tolist()
     (cause, *_) = sensitivities(found)

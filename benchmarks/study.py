@@ -26,7 +26,7 @@ from cirl_marl.controllers.rollout import first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown
-from cirl_marl.evaluation import Comparison, Row, compare, yardstick
+from cirl_marl.evaluation import Comparison, Row, compare, solve_baseline
 from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes, over_seeds
 from cirl_marl.jobs import Standing, Tell, raise_first, run_jobs
@@ -225,9 +225,9 @@ def _table(comparison: Comparison) -> Iterator[str]:
     yield f"{comparison.episodes} episodes each, the same for all."
     yield ""
     yield f"![λ̄ against service](pictures/study_{comparison.network.name}.png)"
-    if comparison.yardstick.reason:
+    if comparison.baseline.reason:
         yield ""
-        yield f"No bound: {comparison.yardstick.reason}."
+        yield f"No bound: {comparison.baseline.reason}."
 
 
 def _cells(row: Row, neutral: Floats, network: str) -> Iterator[str]:
@@ -281,7 +281,7 @@ def _lqr_table(episodes: int) -> Iterator[str]:
             "mpc": MPC(service_weight=SERVICE_FIRST),
         }
         runs = {label: rollout(env, each, seed=first_seed(0)) for label, each in acting.items()}
-        measure = yardstick(env.network, env.agents, starts, [run.episode_levels for run in runs.values()])
+        measure = solve_baseline(env.network, env.agents, starts, [run.episode_levels for run in runs.values()])
         for label, run in runs.items():
             proved = measure.at(starts, run.episode_levels)
             assert proved is not None

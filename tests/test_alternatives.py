@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, cli
 from cirl_marl.controllers.rollout import Rollout, beginning, rollout
-from cirl_marl.evaluation.alternatives import Alternative, ComparedQuantity, alternatives, compared_quantities
+from cirl_marl.evaluation.simulations import ComparedQuantity, Simulation, rank_quantities, simulate_alternatives
 from cirl_marl.optimum.named import named_controller
 from cirl_marl.report import alternatives as report
 from cirl_marl.report import trajectory
@@ -125,7 +125,7 @@ def named(quantities: list[ComparedQuantity]) -> dict[str, ComparedQuantity]:
 def test_each_alternative_is_what_it_is_alone(definition: Path, seed: int | None) -> None:
     """Whoever acted before in the same environment; scenario by scenario, each from the same seed."""
     scenarios, controls = (None, "crisis", "ban"), ("random", "neutral")
-    found = alternatives(definition, scenarios=scenarios, controls=controls, seed=seed)
+    found = simulate_alternatives(definition, scenarios=scenarios, controls=controls, seed=seed)
     names = [f"{scenario or 'default'}, {control}" for scenario in scenarios for control in controls]
     assert [each.name for each in found] == names
     pairs = [(scenario, control) for scenario in scenarios for control in controls]
@@ -141,16 +141,19 @@ def test_each_alternative_is_what_it_is_alone(definition: Path, seed: int | None
 
 def test_names_say_what_there_are_several_of(definition: Path) -> None:
     """What all have in common need not be said."""
-    assert [each.name for each in alternatives(definition)] == [""]
-    assert [each.name for each in alternatives(definition, controls=["random", "neutral"])] == ["random", "neutral"]
-    found = alternatives(definition, scenarios=["crisis", None], controls=["random"], steps=2)
+    assert [each.name for each in simulate_alternatives(definition)] == [""]
+    assert [each.name for each in simulate_alternatives(definition, controls=["random", "neutral"])] == [
+        "random",
+        "neutral",
+    ]
+    found = simulate_alternatives(definition, scenarios=["crisis", None], controls=["random"], steps=2)
     assert [(each.name, len(each.rollout.stock)) for each in found] == [("crisis", 2), ("default", 2)]
 
 
 def test_quantities_are_those_of_single_simulations(definition: Path) -> None:
     """Of λ̄, services, arcs and nodes; what a scenario lacks has no value, and neither has a difference to it."""
     scenarios = ("crisis", "default", "ban")
-    quantities = named(compared_quantities(alternatives(definition, scenarios=scenarios, controls=["random"])))
+    quantities = named(rank_quantities(simulate_alternatives(definition, scenarios=scenarios, controls=["random"])))
     expected = [figures(definition, scenario, "random", None) for scenario in scenarios]
     assert set(quantities) == set(expected[0])
     assert len(quantities) == 7 and len(expected[2]) == 5
@@ -166,7 +169,7 @@ def test_quantities_are_those_of_single_simulations(definition: Path) -> None:
 
 def test_what_differs_most_comes_first(definition: Path) -> None:
     """By the largest relative difference of any alternative; what appears or goes before what changes."""
-    found = compared_quantities(alternatives(definition, scenarios=["ban", "crisis", None]))
+    found = rank_quantities(simulate_alternatives(definition, scenarios=["ban", "crisis", None]))
     ranks = [each.rank for each in found]
     assert ranks == sorted(ranks, reverse=True)
     assert {each.name for each in found[:3]} == {
@@ -176,9 +179,9 @@ def test_what_differs_most_comes_first(definition: Path) -> None:
     }
     changes = [np.nanmax(np.abs(each.relative_differences)) for each in found[3:]]
     np.testing.assert_allclose([each.rank for each in found[3:]], changes)
-    same = compared_quantities(alternatives(definition, scenarios=[None, "same"]))
+    same = rank_quantities(simulate_alternatives(definition, scenarios=[None, "same"]))
     assert [each.rank for each in same] == [0.0] * 7
-    without = compared_quantities(alternatives(definition, scenarios=["ban"], controls=["random", "neutral"]))
+    without = rank_quantities(simulate_alternatives(definition, scenarios=["ban"], controls=["random", "neutral"]))
     assert {each.kind for each in without} == {"circularity", "flow", "stock"}
 
 
@@ -203,7 +206,7 @@ def test_ranks(values: tuple[float, ...], rank: float) -> None:
 
 def test_round_off_is_of_the_same_kind(definition: Path) -> None:
     """A service level is not lost in the tonnes of a reserve."""
-    quantities = named(compared_quantities(alternatives(definition, scenarios=[None, "crisis"])))
+    quantities = named(rank_quantities(simulate_alternatives(definition, scenarios=[None, "crisis"])))
     level, stock = quantities["mean level of service bottles_in_use"], quantities["final stock of landfill"]
     assert level.round_off == pytest.approx(1e-12 * level.values[0])
     assert stock.round_off == pytest.approx(1e-12 * quantities["final stock of quarry"].values[0])
@@ -211,15 +214,15 @@ def test_round_off_is_of_the_same_kind(definition: Path) -> None:
 
 def test_intervals_may_differ_if_episodes_last_alike(definition: Path) -> None:
     """Without anyone acting the same masses move in them."""
-    found = alternatives(definition, scenarios=[None, "fine"])
+    found = simulate_alternatives(definition, scenarios=[None, "fine"])
     assert [len(each.rollout.flow) for each in found] == [6, 12]
-    flows = [each for each in compared_quantities(found) if each.kind == "flow"]
+    flows = [each for each in rank_quantities(found) if each.kind == "flow"]
     assert [each.values[1] for each in flows] == pytest.approx([each.values[0] for each in flows], rel=1e-9)
 
 
 def test_only_controllers_that_take_values_hold_them(definition: Path) -> None:
     """The others act as they do."""
-    found = alternatives(definition, controls=["neutral", "constant"], held={"quarry": -1.0})
+    found = simulate_alternatives(definition, controls=["neutral", "constant"], held={"quarry": -1.0})
     flows = [each.rollout.flow[:, each.network.arc_index["glassworks"]] for each in found]
     assert (flows[0] > 4).all() and (flows[1] == 0).all()
 
@@ -227,7 +230,9 @@ def test_only_controllers_that_take_values_hold_them(definition: Path) -> None:
 def test_progress_is_that_of_all(definition: Path) -> None:
     """It never goes back, and ends when the last episode does."""
     shares: list[float] = []
-    alternatives(definition, scenarios=[None, "crisis"], controls=["neutral", "random"], progress=shares.append)
+    simulate_alternatives(
+        definition, scenarios=[None, "crisis"], controls=["neutral", "random"], progress=shares.append
+    )
     assert shares == pytest.approx([i / 24 for i in range(1, 25)])
 
 
@@ -243,7 +248,7 @@ def test_progress_is_that_of_all(definition: Path) -> None:
 def test_alternatives_that_make_no_sense(options: dict[str, list[str]], message: str, definition: Path) -> None:
     """They are refused in Python too."""
     with pytest.raises(CirlError, match=message):
-        alternatives(definition, **options)  # type: ignore[arg-type]
+        simulate_alternatives(definition, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -277,7 +282,7 @@ def test_bad_input_is_refused_before_anything_is_simulated(
     arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The message names both values, or the nearest right one; nothing is written."""
-    monkeypatch.setattr("cirl_marl.evaluation.alternatives.rollout", None)
+    monkeypatch.setattr("cirl_marl.evaluation.simulations.rollout", None)
     assert cirl(monkeypatch, "bottles.toml", *arguments) == 2
     assert message in capsys.readouterr().err
     assert [path.name for path in Path().iterdir()] == ["bottles.toml"]
@@ -414,23 +419,23 @@ def test_titles(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[Alternative]], Figure]:
+def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[Simulation]], Figure]:
     """Return what draws alternatives without writing a file."""
     figures: list[Figure] = []
     monkeypatch.setattr(report, "save", lambda figure, path: figures.append(figure))
 
-    def draw(found: list[Alternative]) -> Figure:
-        report.save_alternatives("x.png", found, compared_quantities(found), title="heading")
+    def draw(found: list[Simulation]) -> Figure:
+        report.save_alternatives("x.png", found, rank_quantities(found), title="heading")
         return figures[-1]
 
     return draw
 
 
 def test_picture_lays_trajectories_over_each_other(
-    definition: Path, drawn: Callable[[list[Alternative]], Figure]
+    definition: Path, drawn: Callable[[list[Simulation]], Figure]
 ) -> None:
     """Means in the middle of their intervals, stocks from the start on; who lacks something has no line there."""
-    found = alternatives(definition, scenarios=[None, "crisis", "ban"])
+    found = simulate_alternatives(definition, scenarios=[None, "crisis", "ban"])
     figure = drawn(found)
     assert figure.get_suptitle() == "heading"
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["default", "crisis", "ban"]
@@ -463,38 +468,38 @@ def test_picture_lays_trajectories_over_each_other(
     assert crisis.get_color() == panels["Mean circularity"].lines[1].get_color()
 
 
-def test_picture_shows_what_differs_most(definition: Path, drawn: Callable[[list[Alternative]], Figure]) -> None:
+def test_picture_shows_what_differs_most(definition: Path, drawn: Callable[[list[Simulation]], Figure]) -> None:
     """At most eight panels, in the order of the table; what is the same in all is left out, λ and services are not."""
-    found = alternatives("copper_net", controls=["random", "neutral"], steps=2)
+    found = simulate_alternatives("copper_net", controls=["random", "neutral"], steps=2)
     panels = [axes.get_title(loc="left") for axes in drawn(found).axes]
-    most = [each.of.replace("_", " ") for each in compared_quantities(found) if each.kind in ("flow", "stock")]
+    most = [each.of.replace("_", " ") for each in rank_quantities(found) if each.kind in ("flow", "stock")]
     assert len(panels) == 8
     assert [panel.split(": ")[1] for panel in panels[2:]] == most[:6]
     assert len(most) > 6
-    figure = drawn(alternatives(definition, scenarios=[None, "same"]))
+    figure = drawn(simulate_alternatives(definition, scenarios=[None, "same"]))
     shown = [axes.get_title(loc="left") for axes in figure.axes if axes.axison]
     assert shown == ["Mean circularity", "Service: bottles in use"]
 
 
-def test_single_intervals_and_years(definition: Path, drawn: Callable[[list[Alternative]], Figure]) -> None:
+def test_single_intervals_and_years(definition: Path, drawn: Callable[[list[Simulation]], Figure]) -> None:
     """A lone mean is a dot; a network that begins on the calendar is drawn in years."""
-    figure = drawn(alternatives(definition, controls=["random", "neutral"], steps=1))
+    figure = drawn(simulate_alternatives(definition, controls=["random", "neutral"], steps=1))
     assert {line.get_marker() for line in figure.axes[0].lines} == {"o"}
-    figure = drawn(alternatives(definition, scenarios=["dated"], controls=["random", "neutral"]))
+    figure = drawn(simulate_alternatives(definition, scenarios=["dated"], controls=["random", "neutral"]))
     assert figure.axes[0].get_xlabel() == "year"
     low, high = figure.axes[0].get_xlim()
     assert low == pytest.approx(2020 + 58 / 365.25) and high == pytest.approx(low + 3 / 365.25)
     assert np.asarray(figure.axes[0].lines[0].get_xdata())[0] == pytest.approx(low + 0.25 / 365.25)
 
 
-def test_picture_of_many(definition: Path, drawn: Callable[[list[Alternative]], Figure]) -> None:
+def test_picture_of_many(definition: Path, drawn: Callable[[list[Simulation]], Figure]) -> None:
     """Nine alternatives look different, and of four services the three that differ most are shown, each as it was."""
     definition.write_text(definition.read_text() + MORE)
     scenarios, controls = (None, "crisis", "long"), ("neutral", "random", "constant")
-    found = alternatives(definition, scenarios=scenarios, controls=controls, steps=3)
+    found = simulate_alternatives(definition, scenarios=scenarios, controls=controls, steps=3)
     figure = drawn(found)
     assert len({(line.get_color(), line.get_linestyle()) for line in figure.axes[0].lines}) == 9
-    services = [each.of for each in compared_quantities(found) if each.kind == "service"]
+    services = [each.of for each in rank_quantities(found) if each.kind == "service"]
     assert len(services) == 4
     for axes, service in zip(figure.axes[1:4], services, strict=False):
         assert axes.get_title(loc="left") == f"Service: {service.replace('_', ' ')}"

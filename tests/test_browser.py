@@ -16,7 +16,7 @@ import pytest
 from pages import COMPUTED, HOSTILE, bottles_at, shown, world
 
 from cirl_marl import load_network
-from cirl_marl.evaluation.alternatives import Alternative, alternatives
+from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
 from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.report.browser import write_page
 from cirl_marl.report.scenes import PLAN, PlanePoint, Story, of_alternatives
@@ -103,9 +103,9 @@ def opened(chromium: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
         assert said == []
 
 
-def two(folder: Path, **options: Any) -> list[Alternative]:
+def two(folder: Path, **options: Any) -> list[Simulation]:
     """Return two courses of the small network of the guide."""
-    return alternatives(bottles_at(folder, **options), controls=["neutral", "random"])
+    return simulate_alternatives(bottles_at(folder, **options), controls=["neutral", "random"])
 
 
 def test_the_slider_moves_flows_to_the_numbers_of_the_csv(tmp_path: Path, opened: Any) -> None:
@@ -216,7 +216,7 @@ def test_phone_dark_and_motion(tmp_path: Path, opened: Any) -> None:
 
 def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
     """A world opens on its countries and one unfolds and folds again; a plan is what λ is held against; points."""
-    story = of_alternatives(alternatives(world(), controls=["neutral", "random"]))
+    story = of_alternatives(simulate_alternatives(world(), controls=["neutral", "random"]))
     points = (PlanePoint("plans", 0.9, -2.0, "first"), PlanePoint("plans", 0.95, -3.0))
     usual, plan = story.scenes
     front = np.array([[0.9, -1.0], [1.0, -1.5]])
@@ -255,7 +255,9 @@ def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
 def test_a_country_is_light_and_fast(tmp_path: Path, opened: Any) -> None:
     """The steel of Japan takes less than 2 MB and 2 s to the first picture."""
     network = load_network("steel_japan")
-    path = write_page(tmp_path / "steel.html", of_alternatives(alternatives(network, controls=["neutral", "random"])))
+    path = write_page(
+        tmp_path / "steel.html", of_alternatives(simulate_alternatives(network, controls=["neutral", "random"]))
+    )
     assert path.stat().st_size < 2e6
     tab = opened(path)
     assert tab.page.locator(".ribbon").count() == len(network.arcs)
@@ -267,6 +269,8 @@ def test_a_country_is_light_and_fast(tmp_path: Path, opened: Any) -> None:
 def test_a_world_is_light_enough(tmp_path: Path, opened: Any) -> None:
     """Five hundred nodes take less than 5 MB."""
     network = world(countries=31, horizon=26)
-    path = write_page(tmp_path / "w.html", of_alternatives(alternatives(network, controls=["neutral", "random"])))
+    path = write_page(
+        tmp_path / "w.html", of_alternatives(simulate_alternatives(network, controls=["neutral", "random"]))
+    )
     assert len(network.nodes) == 498 and path.stat().st_size < 5e6
     assert opened(path).page.locator(".box").count() == 33

@@ -21,8 +21,8 @@ from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.contenders import differences
 from cirl_marl.evaluation.figures import provenance
+from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.evaluation.statistics import interquartile_mean
-from cirl_marl.evaluation.sweep import pareto
 from cirl_marl.learners import Progress, Recipe, RunDirectory, Training, load_recipe, resume, train
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
@@ -79,7 +79,7 @@ def test_gap_is_to_the_best_episode_that_serves_as_well(bottles: Network) -> Non
         np.testing.assert_allclose(entry.gap, (entry.bound - entry.circularity) / np.abs(entry.bound))
         gaps[entry.name] = float(entry.gap.mean())
     assert max(gaps["mpc"], gaps["optimum"]) < 0.1 < gaps["random"] < gaps["neutral"]
-    front = found.yardstick.front
+    front = found.baseline.front
     assert (np.diff(front[:, 0]) > 0).all()
     assert (np.diff(front[:, 1]) <= 1e-9).all()
 
@@ -89,7 +89,7 @@ def test_network_without_certificate() -> None:
     short = load_network("net_zero").with_options(episode={"horizon": 8})
     found = compare([], ["random"], network=short, episodes=2)
     assert found.entries[0].gap is None
-    assert "no bound is proved" in found.yardstick.reason
+    assert "no bound is proved" in found.baseline.reason
 
 
 def reported(run: Callable[[Callable[[str, float], None]], object]) -> list[tuple[str, float]]:
@@ -121,7 +121,7 @@ def test_evaluation_and_sweep_tell_how_far_they_are(bottles: Network, runs: list
     """Bounds of an evaluation and plans of a sweep are several steps each."""
     told = reported(lambda progress: evaluate_run(RunDirectory(runs[1]), episodes=2, progress=progress))
     assert len({share for what, share in told if what == "bounds"}) >= 3 * 2 + 3
-    told = reported(lambda progress: pareto(bottles, directory=tmp_path, points=3, progress=progress))
+    told = reported(lambda progress: pareto_front(bottles, directory=tmp_path, points=3, progress=progress))
     assert len(set(told)) > 3 * 2
 
 

@@ -28,8 +28,8 @@ from cirl_marl.cli.episodes import simulate
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import write_network
-from cirl_marl.evaluation import compare, yardstick
-from cirl_marl.evaluation.sweep import pareto
+from cirl_marl.evaluation import compare, solve_baseline
+from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.optimum import Plan, achieved, bound, envelope, improved, search
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.controller import Optimum
@@ -161,22 +161,22 @@ def test_episodes_are_held_against_what_each_service_got() -> None:
     assert plan.gap is not None and plan.bound is not None
     assert (plan.gap >= 0).all() and (plan.gap < 0.02).all()
     starts = np.tile(starting_stocks(town(), None), (2, 1))
-    np.testing.assert_array_equal(plan.bound, found.yardstick.at(starts, plan.rollout.episode_levels))
+    np.testing.assert_array_equal(plan.bound, found.baseline.at(starts, plan.rollout.episode_levels))
     np.testing.assert_allclose(plan.rollout.least_service, 0.4, atol=1e-3)
     np.testing.assert_allclose(plan.service, 0.7, atol=1e-3)
     # what was said of the same mean level in every service lies below what the plan achieved
-    fair = yardstick(town(), (), starts, [np.full((2, 2), 0.7)])
+    fair = solve_baseline(town(), (), starts, [np.full((2, 2), 0.7)])
     proved = fair.at(starts, np.full((2, 2), 0.7))
     assert proved is not None and (proved < plan.circularity).all()
     # points of the picture lie at the least level, so that none is above the front
-    assert found.yardstick.front[0, 0] == pytest.approx(0.4, abs=1e-3)
+    assert found.baseline.front[0, 0] == pytest.approx(0.4, abs=1e-3)
 
 
 @pytest.mark.medium
 def test_sweep_ends_where_all_services_can_be_had(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Where services compete, no more is demanded of each than both can have, and each plan gives it to both."""
     scarce = town(reserve=8.0, cars=0.0, homes=4.0)
-    found = pareto(scarce, directory=tmp_path_factory.mktemp("sweep"), points=3)
+    found = pareto_front(scarce, directory=tmp_path_factory.mktemp("sweep"), points=3)
     bounds, plans = found.of("bound"), found.of("plan")
     assert bounds[-1].service == pytest.approx(highest_service(scarce), abs=2e-4)
     for most, plan in zip(bounds, plans, strict=True):

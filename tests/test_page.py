@@ -23,8 +23,8 @@ from cirl_marl.drawing.grouping import groups, sketches
 from cirl_marl.drawing.weave import NARROW, woven
 from cirl_marl.errors import DefinitionError
 from cirl_marl.evaluation import compare
-from cirl_marl.evaluation.alternatives import alternatives
-from cirl_marl.evaluation.sampling import sampled
+from cirl_marl.evaluation.sampling import sample_episodes
+from cirl_marl.evaluation.simulations import simulate_alternatives
 from cirl_marl.report import browser
 from cirl_marl.report.browser import SCRIPTS, page, write_page
 from cirl_marl.report.document import document
@@ -139,7 +139,7 @@ def test_sources_follow_scenario_and_file(tmp_path: Path) -> None:
 
 def test_the_page_shows_what_was_simulated(tmp_path: Path) -> None:
     """Stocks, flows, λ, service and controls are those of the CSV file, to six digits; start and units included."""
-    (found,) = alternatives(bottles_at(tmp_path))
+    (found,) = simulate_alternatives(bottles_at(tmp_path))
     told = document(of_alternatives([found]))
     header, rows = trajectory_table(found.env, found.begun, found.rollout)
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
@@ -171,7 +171,7 @@ def test_the_page_of_a_comparison(tmp_path: Path) -> None:
     moved = entry.rollout.flow[0] @ np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
     np.testing.assert_allclose(usual.start + moved, entry.rollout.stock[0], rtol=1e-9, err_msg="the first start")
     assert random.figures["gap"] == found.rows[0].figure("gap") and len(story.front)
-    env = next(each.env for each in alternatives(found.network))
+    env = next(each.env for each in simulate_alternatives(found.network))
     best = with_plan(of_comparison(found, without=["random"]), found, env)
     assert [scene.name for scene in best.scenes] == [USUAL, PLAN]
     assert found.entries[0].bound is not None
@@ -189,7 +189,7 @@ def test_the_page_of_samples(tmp_path: Path) -> None:
     path = tmp_path / "bottles.toml"
     bottles_at(tmp_path)
     path.write_text(path.read_text().replace("rate = { value = 0.05,", 'rate = { value = 0.05, deviation = "9 %",'))
-    found = sampled(load_network(path), samples=5)
+    found = sample_episodes(load_network(path), samples=5)
     (scene,) = document(of_samples(found, "neutral"))["scenes"]
     assert {values[0] for values in scene["levels"]} == {None}
     np.testing.assert_allclose(scene["lambda"]["high"], np.quantile(found.circularity, 0.975, axis=0), rtol=1e-5)
@@ -199,7 +199,7 @@ def test_the_page_of_samples(tmp_path: Path) -> None:
 def test_no_text_can_run(tmp_path: Path) -> None:
     """Hostile titles and sources stand in the data as they are, nowhere as markup; hashes allow the script alone."""
     network = bottles_at(tmp_path, hostile=True)
-    text = page(of_alternatives(alternatives(network)))
+    text = page(of_alternatives(simulate_alternatives(network)))
     told = shown(text)
     assert told["title"] == HOSTILE == told["networks"][0]["arcs"][0]["label"]
     assert HOSTILE in {source for *_, source in told["networks"][0]["arcs"][0]["told"]}
@@ -234,12 +234,12 @@ def test_the_script_has_no_way_out() -> None:
 def test_a_page_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What cannot be written, or shown, leaves the page that was there."""
     network = bottles_at(tmp_path, days=2)
-    story = of_alternatives(alternatives(network))
+    story = of_alternatives(simulate_alternatives(network))
     path = write_page(tmp_path / "new" / "page.html", story)
     before = path.read_text(encoding="utf-8")
     with pytest.raises(CirlError, match="network 'bottles': there is nothing to show, neither episodes nor points"):
         write_page(path, Story("nothing", network))
-    (other,) = of_alternatives(alternatives(network, steps=3)).scenes
+    (other,) = of_alternatives(simulate_alternatives(network, steps=3)).scenes
     with pytest.raises(CirlError, match=r"2 intervals of 1 day, '.*' 3 of 1: a page shows them by one clock"):
         write_page(path, replace(story, scenes=(*story.scenes, other)))
 

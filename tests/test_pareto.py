@@ -11,7 +11,7 @@ import pytest
 
 from cirl_marl.definitions.catalogue import folder, load_network
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.evaluation.sweep import Sweep, pareto
+from cirl_marl.evaluation.pareto import ParetoFront, pareto_front
 from cirl_marl.learners import load_recipe
 from cirl_marl.network import Network
 from cirl_marl.optimum import NoCertificate
@@ -20,14 +20,14 @@ from cirl_marl.report.sweep import FILES, write_sweep
 pytestmark = pytest.mark.medium
 
 
-def swept(network: Network, directory: Path, **options: object) -> Sweep:
+def swept(network: Network, directory: Path, **options: object) -> ParetoFront:
     """Sweep with three weights and a short training."""
-    return pareto(network, "independent_a2c", directory=directory, points=3, steps=320, episodes=2, **options)  # type: ignore[arg-type]
+    return pareto_front(network, "independent_a2c", directory=directory, points=3, steps=320, episodes=2, **options)  # type: ignore[arg-type]
 
 
 def test_bounds_are_above_plans(bottles: Network, tmp_path: Path) -> None:
     """More service costs circularity; each plan delivers what was demanded and stays below its bound."""
-    found = pareto(bottles, directory=tmp_path, points=4)
+    found = pareto_front(bottles, directory=tmp_path, points=4)
     bounds, plans = found.of("bound"), found.of("plan")
     assert len(bounds) == len(plans) >= 3
     assert (np.diff([each.service for each in bounds]) > 0).all()
@@ -53,7 +53,7 @@ def test_trainings_are_kept(bottles: Network, tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["kind"] for row in rows].count("trained") == 3
     assert {row["circularity weight"] for row in rows} == {"", "0.0", "0.5", "1.0"}
-    longer = pareto(bottles, "independent_a2c", directory=tmp_path / "other", points=2, steps=640, episodes=2)
+    longer = pareto_front(bottles, "independent_a2c", directory=tmp_path / "other", points=2, steps=640, episodes=2)
     (tmp_path / "runs").rename(tmp_path / "old")
     (tmp_path / "other" / "runs").rename(tmp_path / "runs")
     assert len(longer.runs) == 2
@@ -67,7 +67,7 @@ def test_swept_weights_stay_as_they_are(bottles: Network, tmp_path: Path) -> Non
     moving = {"min_service": 1.0, "price_rate": 1.0, "evaluations": 8, "episodes": 2}
     given = given.model_copy(update={"run": given.run.model_copy(update=moving)})
     options = {"directory": tmp_path, "points": 2, "steps": 5120, "episodes": 2}
-    for weight, run in zip((0.0, 1.0), pareto(bottles, given, **options).runs, strict=True):  # type: ignore[arg-type]
+    for weight, run in zip((0.0, 1.0), pareto_front(bottles, given, **options).runs, strict=True):  # type: ignore[arg-type]
         with (run.path / "evaluations.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
         assert len(rows) > 4
@@ -95,8 +95,8 @@ def test_network_without_certificate(tmp_path: Path) -> None:
     """Only the learners have a front, with the reason; without learners there is nothing to show."""
     short = load_network("net_zero").with_options(episode={"horizon": 8})
     with pytest.raises(NoCertificate, match="no bound is proved"):
-        pareto(short, directory=tmp_path)
-    found = pareto(short, "independent_a2c", directory=tmp_path, points=2, steps=320, episodes=2)
+        pareto_front(short, directory=tmp_path)
+    found = pareto_front(short, "independent_a2c", directory=tmp_path, points=2, steps=320, episodes=2)
     assert found.of("bound") == found.of("plan") == []
     assert len(found.of("trained")) == 2
     assert "no bound is proved" in found.reason
@@ -108,7 +108,7 @@ def test_weight_without_effect_is_refused(bottles: Network, tmp_path: Path) -> N
     path = tmp_path / "team.toml"
     path.write_text(recipe + '\n[environment]\nreward = "circularity"\n')
     with pytest.raises(CirlError, match="the weight of circularity has no part"):
-        pareto(bottles, path, directory=tmp_path / "out")
+        pareto_front(bottles, path, directory=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -117,6 +117,6 @@ def test_recipe_of_another_scenario_is_refused(bottles: Network, tmp_path: Path)
     recipe = load_recipe("independent_a2c")
     other = recipe.model_copy(update={"environment": recipe.environment | {"scenario": "crisis"}})
     with pytest.raises(CirlError, match="is for scenario 'crisis', the sweep for 'default'"):
-        pareto(bottles, other, directory=tmp_path, points=2)
-    found = pareto(bottles, other, directory=tmp_path, scenario="crisis", points=2, steps=320, episodes=2)
+        pareto_front(bottles, other, directory=tmp_path, points=2)
+    found = pareto_front(bottles, other, directory=tmp_path, scenario="crisis", points=2, steps=320, episodes=2)
     assert {run.config.scenario for run in found.runs} == {"crisis"}

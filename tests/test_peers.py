@@ -24,7 +24,7 @@ from cirl_marl.controllers import Constant
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluation.yardsticks import Yardstick
+from cirl_marl.evaluation.baselines import Baseline
 from cirl_marl.learners import load_recipe
 from cirl_marl.learners.launch import prepared
 
@@ -170,7 +170,7 @@ def test_a_gap_counts_at_the_service_that_is_demanded() -> None:
 def test_gaps_are_those_of_the_episodes() -> None:
     """Each of the first episodes is held against its own bound, and the service that lacks most is what counts."""
 
-    class Twice(Yardstick):
+    class Twice(Baseline):
         def at(self, starts: np.ndarray, levels: np.ndarray) -> np.ndarray:
             return -10.0 * levels[:, 0]
 

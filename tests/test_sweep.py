@@ -22,8 +22,8 @@ from test_jobs import is_alive, wait_until
 from cirl_marl import cli, load_network
 from cirl_marl.errors import CirlError, DefinitionError, RunError
 from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.evaluation.statistics import over_episodes
-from cirl_marl.evaluation.sweep import pareto
 from cirl_marl.jobs import Standing
 from cirl_marl.learners import train
 from cirl_marl.network import Network
@@ -133,7 +133,7 @@ def test_a_place_that_cannot_be_is_refused_before_anything_is_written(
         assert command(monkeypatch, "sweep", str(asked), *arguments) == 2
         assert said in capsys.readouterr().err
     with pytest.raises(CirlError, match="unknown place 'slrm'"):
-        pareto("bottles.toml", "quick.toml", directory=Path("runs"), on="slrm")
+        pareto_front("bottles.toml", "quick.toml", directory=Path("runs"), on="slrm")
     assert not Path("runs").exists()
 
 

@@ -40,7 +40,7 @@ from cirl_marl.definitions.reading import write_network
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.environments.state import Outcome
 from cirl_marl.evaluation import compare
-from cirl_marl.evaluation.sampling import sampled, sensitivities
+from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.learners import train
 from cirl_marl.network.uncertainty import DISTRIBUTIONS, Spread, drawn
 from cirl_marl.optimum import bound
@@ -123,14 +123,14 @@ def test_samples_are_single_simulations() -> None:
     """Of what was drawn; more samples add to those before."""
     uncertain = {"arcs.dig.flow": Spread(deviation=0.1), "arcs.leak.rate": Spread(deviation=0.2)}
     network = line(uncertain)
-    found, more = sampled(network, samples=3, seed=4), sampled(network, samples=5, seed=4)
+    found, more = sample_episodes(network, samples=3, seed=4), sample_episodes(network, samples=5, seed=4)
     np.testing.assert_array_equal(more.circularity[:3], found.circularity)
     for i, (dug, leaked) in enumerate(found.factors.tolist()):
         run = rollout(MultiAgentVectorEnv(line({}, flow=10.0 * dug, leak=0.1 * leaked), num_envs=1), Neutral())
         np.testing.assert_allclose(found.stock[i], run.stock, rtol=1e-12)
         np.testing.assert_allclose(found.flow[i], run.flow, rtol=1e-12)
         np.testing.assert_allclose(found.circularity[i], run.circularity_mean[0], rtol=1e-12)
-    assert not np.array_equal(sampled(network, samples=3, seed=5).factors, found.factors)
+    assert not np.array_equal(sample_episodes(network, samples=3, seed=5).factors, found.factors)
 
 
 def test_causes_are_the_shares_of_the_variance() -> None:
@@ -146,7 +146,7 @@ def test_causes_are_the_shares_of_the_variance() -> None:
     network = replace(
         network, nodes=(*network.nodes, other), arcs=(*network.arcs, apart), uncertain=uncertain
     ).with_options(episode={"horizon": 1})
-    found = sampled(network, samples=300)
+    found = sample_episodes(network, samples=300)
     (causes,) = sensitivities(found)
     parts = []
     for k in range(2):
@@ -176,7 +176,9 @@ def test_files_state_it(tmp_path: Path) -> None:
     for where, spread in network.uncertain.items():
         other = again.uncertain[where]
         assert (other.low, other.deviation) == pytest.approx((spread.low, spread.deviation))
-    np.testing.assert_allclose(sampled(again, samples=2).circularity, sampled(network, samples=2).circularity)
+    np.testing.assert_allclose(
+        sample_episodes(again, samples=2).circularity, sample_episodes(network, samples=2).circularity
+    )
 
 
 @pytest.mark.parametrize(
@@ -406,7 +408,7 @@ def test_an_episode_is_held_against_what_it_drew(tmp_path: Path) -> None:
             assert least - 1e-6 <= entry.bound[i] <= most
             assert entry.bound[i] >= entry.circularity[i]
     certain = compare((), ("neutral",), network=network, episodes=3)
-    assert certain.yardstick.envelope is not None
+    assert certain.baseline.envelope is not None
     assert (certain.entries[0].circularity != found.entries[0].circularity).all()
     run = train(network, "independent_ars", steps=128, envs=2, uncertain=True, directory=tmp_path / "run").run
     assert run is not None and run.make_env(1).uncertain
@@ -458,4 +460,4 @@ def test_the_command_writes_bands_and_causes(tmp_path: Path) -> None:
         assert refused.exit_code != 0 and said in str(refused.exception)
     assert not (tmp_path / "other").exists()
     with pytest.raises(CirlError, match="too few to tell"):
-        sensitivities(sampled(load_network(EXAMPLE).with_options(episode={"horizon": 2}), samples=3))
+        sensitivities(sample_episodes(load_network(EXAMPLE).with_options(episode={"horizon": 2}), samples=3))

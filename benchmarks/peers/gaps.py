@@ -11,9 +11,9 @@ from benchmarks.peers.settings import NETWORK, SERVICE
 from benchmarks.peers.watch import Judged
 from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.controllers.rollout import first_seed
-from cirl_marl.evaluation import yardstick
+from cirl_marl.evaluation import solve_baseline
+from cirl_marl.evaluation.baselines import Baseline
 from cirl_marl.evaluation.comparison import starting_stocks
-from cirl_marl.evaluation.yardsticks import Yardstick
 from cirl_marl.network import Floats
 from cirl_marl.optimum import gap
 
@@ -50,7 +50,7 @@ class Reference:
     """Bounds of the first episodes on which all are judged."""
 
     starts: Floats
-    measure: Yardstick
+    measure: Baseline
 
     @classmethod
     def solved(cls, levels: Sequence[float] = LEVELS, episodes: int = BOUNDED) -> Reference:
@@ -58,7 +58,7 @@ class Reference:
         env = MultiAgentVectorEnv(NETWORK, num_envs=episodes)
         starts = starting_stocks(env, first_seed(0))
         services = [np.full((episodes, len(env.network.services)), level) for level in levels]
-        return cls(starts, yardstick(env.network, env.agents, starts, services))
+        return cls(starts, solve_baseline(env.network, env.agents, starts, services))
 
     def standing(self, judged: Judged) -> Standing:
         """Hold a policy against the bounds, episode by episode."""

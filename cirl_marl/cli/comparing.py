@@ -103,7 +103,7 @@ def pareto(
     The bound is swept over the service demanded, the learners over the weight of circularity in their reward, 0 to 1.
     Finished trainings are kept: the same command goes on where it was stopped.
     """
-    from cirl_marl.evaluation.sweep import pareto as swept
+    from cirl_marl.evaluation.pareto import pareto_front as swept
     from cirl_marl.report.sweep import write_sweep
 
     page = common.page_for(html)

@@ -31,8 +31,8 @@ from cirl_marl.controllers.shortages import shortages, unsupplied
 from cirl_marl.definitions.catalogue import file_and_region, load_network, networks
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluation.alternatives import Alternative, alternatives, compared_quantities
 from cirl_marl.evaluation.figures import time_window
+from cirl_marl.evaluation.simulations import Simulation, rank_quantities, simulate_alternatives
 from cirl_marl.network import Network
 from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
 
@@ -78,7 +78,7 @@ def simulate(
         return
     held, folder = _held(controls, set_ or []), folder_for(out or Path(), "--out")
     with bar("simulating") as progress:
-        found = alternatives(
+        found = simulate_alternatives(
             network,
             scenarios=scenario or [None],
             controls=controls,
@@ -110,7 +110,7 @@ def _sample(
     page: Path | None,
 ) -> None:
     """Simulate draws of the uncertain numbers, and write and say what came of them."""
-    from cirl_marl.evaluation.sampling import FEWEST, sampled, sensitivities
+    from cirl_marl.evaluation.sampling import FEWEST, sample_episodes, sensitivities
     from cirl_marl.report.samples import sensitivity_table, write_samples
 
     if len(scenarios) > 1 or len(controls) > 1:
@@ -119,7 +119,7 @@ def _sample(
     if steps is not None:
         network = network.with_options(episode={"horizon": steps})
     with bar("sampling") as progress:
-        found = sampled(network, samples=samples, control=controls[0], seed=seed, progress=progress)
+        found = sample_episodes(network, samples=samples, control=controls[0], seed=seed, progress=progress)
     causes = sensitivities(found) if samples >= FEWEST else []
     title = f"{network.title or network.name}, {controls[0]} control, {samples} samples"
     written = write_samples(folder, stem(network, controls[0]), found, causes, title=title)
@@ -141,7 +141,7 @@ def _sample(
     say(f"wrote {', '.join(map(str, written))}")
 
 
-def _write_one(folder: Path, files: Mapping[str, Alternative]) -> None:
+def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
     from cirl_marl.report.trajectory import write_trajectory
 
     ((name, only),) = files.items()
@@ -151,12 +151,12 @@ def _write_one(folder: Path, files: Mapping[str, Alternative]) -> None:
     say(f"wrote {', '.join(map(str, written))}")
 
 
-def _write_several(folder: Path, files: Mapping[str, Alternative]) -> None:
+def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
     """Write and say what became of alternatives, and what differs between them."""
     from cirl_marl.report.alternatives import ROWS, differences_table, write_alternatives
 
     found = list(files.values())
-    network, quantities = found[0].network, compared_quantities(found)
+    network, quantities = found[0].network, rank_quantities(found)
     controls = list(dict.fromkeys(each.control for each in found))
     title = f"{network.name}, {controls[0]} control" if len(controls) == 1 else network.name
     written = write_alternatives(folder, f"{network.name}_differences", files, quantities, title=title)

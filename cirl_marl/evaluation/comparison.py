@@ -14,10 +14,10 @@ from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
+from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_baseline
 from cirl_marl.evaluation.contenders import contenders
 from cirl_marl.evaluation.figures import gain
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds
-from cirl_marl.evaluation.yardsticks import Yardstick, bounds_of_draws, yardstick
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import NoCertificate, gap
@@ -97,14 +97,14 @@ class Row:
 class Comparison:
     """What every policy and controller did in the same episodes; episode i starts from seed ``first_seed + i``.
 
-    The network is under its scenario and horizon, and ``yardstick`` has the bounds that the entries are held against.
+    The network is under its scenario and horizon, and ``baseline`` has the bounds that the entries are held against.
     """
 
     network: Network
     agents: tuple[str, ...]
     first_seed: int
     entries: tuple[Entry, ...]
-    yardstick: Yardstick
+    baseline: Baseline
 
     @property
     def episodes(self) -> int:
@@ -205,14 +205,14 @@ def _measured(
     names: Sequence[str],
     rollouts: Sequence[Rollout],
     progress: Callable[[float], None],
-) -> tuple[Yardstick, list[Floats | None]]:
-    """Return the yardstick of all rows, and the bounds of the episodes of each rollout."""
+) -> tuple[Baseline, list[Floats | None]]:
+    """Return the baseline of all rows, and the bounds of the episodes of each rollout."""
     services: dict[str, list[Floats]] = {}
     for name, run in zip(names, rollouts, strict=True):
         services.setdefault(name, []).append(run.episode_levels)
     delivered = [np.mean(each, axis=0) for each in services.values()]
     try:
-        measure = yardstick(
+        measure = solve_baseline(
             env.network, env.agents, starts, delivered, progress=lambda share: progress(SOLVING * share)
         )
         proved: list[Floats | None] = []
@@ -231,18 +231,18 @@ def _measured_draws(
     factors: Floats,
     rollouts: Sequence[Rollout],
     progress: Callable[[float], None],
-) -> tuple[Yardstick, list[Floats | None]]:
+) -> tuple[Baseline, list[Floats | None]]:
     """Return the bounds of the episodes of each rollout, every episode with the numbers that it drew."""
     levels = [run.episode_levels for run in rollouts]
     try:
         proved = bounds_of_draws(env.network, env.agents, starts, factors, levels, progress=progress)
     except NoCertificate as missing:
         return _unproved(len(rollouts), str(missing))
-    return Yardstick(None, np.empty((0, 2))), [*proved]
+    return Baseline(None, np.empty((0, 2))), [*proved]
 
 
-def _unproved(entries: int, reason: str) -> tuple[Yardstick, list[Floats | None]]:
-    return Yardstick(None, np.empty((0, 2)), reason), [None] * entries
+def _unproved(entries: int, reason: str) -> tuple[Baseline, list[Floats | None]]:
+    return Baseline(None, np.empty((0, 2)), reason), [None] * entries
 
 
 def part_of(progress: ProgressReport, what: str, done: float, share: float) -> Callable[[float], None]:

@@ -45,7 +45,7 @@ class Sensitivity:
     margins: Annotated[Floats, "half-widths of their 95 % intervals, shape (numbers,)"]
 
 
-def sampled(
+def sample_episodes(
     network: Network,
     *,
     samples: int,

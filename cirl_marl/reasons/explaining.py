@@ -12,8 +12,8 @@ from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown
+from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import part_of, starting_stocks
-from cirl_marl.evaluation.yardsticks import demanded
 from cirl_marl.learners.run import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import NoCertificate
@@ -138,7 +138,7 @@ def _of_run(
     ruled: TeamRules | None = None
     no_prices, done = "", share
     if "prices" in asked:
-        level = demanded(usual.episode_levels.mean(axis=0)) if min_service is None else min_service
+        level = levels_to_demand(usual.episode_levels.mean(axis=0)) if min_service is None else min_service
         try:
             prices = _prices(env, starts, level, part_of(progress, "shadow prices", done, share))
         except NoCertificate as missing:

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import DASHES, SERIES, dated, dressed, save, spoken, time_axis
-from cirl_marl.evaluation.alternatives import Alternative, ComparedQuantity
+from cirl_marl.evaluation.simulations import ComparedQuantity, Simulation
 from cirl_marl.evaluation.statistics import defined
 from cirl_marl.network import Floats, Network
 from cirl_marl.records.files import published, write_table
@@ -26,7 +26,7 @@ SERVICE_PANELS = 3
 COLUMNS = 2
 
 
-def differences_table(found: Sequence[Alternative], quantities: Sequence[ComparedQuantity]) -> Table:
+def differences_table(found: Sequence[Simulation], quantities: Sequence[ComparedQuantity]) -> Table:
     """One row for each quantity, of 12 at most: its value in every alternative, and the difference to the first."""
     table = Table(title=f"differences to {found[0].name} stand below the values")
     table.add_column("quantity")
@@ -49,7 +49,7 @@ def _cells(quantity: ComparedQuantity) -> Iterator[str]:
 
 
 def write_alternatives(
-    folder: Path, name: str, files: Mapping[str, Alternative], quantities: Sequence[ComparedQuantity], *, title: str
+    folder: Path, name: str, files: Mapping[str, Simulation], quantities: Sequence[ComparedQuantity], *, title: str
 ) -> list[Path]:
     """Write the files of alternatives, all of them or none, and return their paths.
 
@@ -57,7 +57,7 @@ def write_alternatives(
         folder: where to write; it is made if it is not there.
         name: stem of ``name.csv``, with every quantity, and of the picture ``name.png``.
         files: the alternatives by the stem of a CSV file each, which holds what ``trajectory_table`` returns.
-        quantities: what ``compared_quantities`` found in them.
+        quantities: what ``rank_quantities`` found in them.
         title: heading of the picture.
     """
     found = list(files.values())
@@ -79,12 +79,12 @@ def _row(quantity: ComparedQuantity) -> list[object]:
 
 
 def save_alternatives(
-    path: str | Path, found: Sequence[Alternative], quantities: Sequence[ComparedQuantity], *, title: str = ""
+    path: str | Path, found: Sequence[Simulation], quantities: Sequence[ComparedQuantity], *, title: str = ""
 ) -> Path:
     """Save the trajectories of alternatives, laid over each other, as a PNG and return its path.
 
     There are at most 8 panels: mean λ, the levels of the 3 services that differ most, and the flows and stocks that
-    differ most by ``quantities``, which are what ``compared_quantities`` found.
+    differ most by ``quantities``, which are what ``rank_quantities`` found.
     """
     panels = _chosen(quantities)
     rows = math.ceil(len(panels) / COLUMNS)
@@ -119,7 +119,7 @@ def _chosen(quantities: Sequence[ComparedQuantity]) -> list[ComparedQuantity]:
     return [*circularity, *services, *rest][:PANELS]
 
 
-def _trajectory(alternative: Alternative, quantity: ComparedQuantity) -> tuple[Floats, Floats]:
+def _trajectory(alternative: Simulation, quantity: ComparedQuantity) -> tuple[Floats, Floats]:
     """Return times and values, shape (points,) each: means in the middle of an interval, stocks at start and ends."""
     network, run = alternative.network, alternative.rollout
     ends = interval_ends(network)

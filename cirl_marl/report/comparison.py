@@ -46,12 +46,12 @@ def comparison_notes(comparison: Comparison) -> list[str]:
     if any(row.few for row in comparison.rows):
         notes.append(f"few: fewer than {ENOUGH_SEEDS} training seeds; the interval says little, one seed has none")
     if comparison.entries[0].bound is not None:
-        drawn = "" if comparison.yardstick.envelope is not None else ", whatever anybody knew of what was drawn,"
+        drawn = "" if comparison.baseline.envelope is not None else ", whatever anybody knew of what was drawn,"
         notes.append(
             f"bound: no episode from the same start with at least the same level of each service{drawn} has a higher λ̄"
         )
-    elif comparison.yardstick.reason:
-        notes.append(f"gap to bound: {comparison.yardstick.reason}")
+    elif comparison.baseline.reason:
+        notes.append(f"gap to bound: {comparison.baseline.reason}")
         if any(row.name == "optimum" for row in comparison.rows):
             notes.append("optimum: the best plan found by search, no certificate")
     return notes
@@ -77,7 +77,7 @@ def save_comparison(path: str | Path, comparison: Comparison) -> Path:
         for row in comparison.rows
     ]
     title = f"{comparison.network.title or comparison.network.name}: {comparison.episodes} episodes"
-    return save_fronts(path, comparison.network, series, comparison.yardstick.front, title=title)
+    return save_fronts(path, comparison.network, series, comparison.baseline.front, title=title)
 
 
 def write_comparison(comparison: Comparison, folder: Path, **options: Any) -> list[Path]:
@@ -106,8 +106,8 @@ def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
         "agents": list(comparison.agents),
         "episodes": comparison.episodes,
         "first_seed": comparison.first_seed,
-        "no_bound": comparison.yardstick.reason or None,
-        "front": [{"service": level, "bound": bound} for level, bound in comparison.yardstick.front.tolist()],
+        "no_bound": comparison.baseline.reason or None,
+        "front": [{"service": level, "bound": bound} for level, bound in comparison.baseline.front.tolist()],
         "rows": [
             {
                 "name": row.name,

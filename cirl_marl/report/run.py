@@ -88,8 +88,8 @@ def figures_of(
                 "bound": over_episodes(entry.bound).as_dict(),
                 "gap": over_episodes(entry.gap, (0.0, np.inf)).as_dict(),
             }
-    if comparison.yardstick.reason:
-        figures["no_bound"] = comparison.yardstick.reason
+    if comparison.baseline.reason:
+        figures["no_bound"] = comparison.baseline.reason
     config = run.config
     figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": comparison.first_seed}
     figures["checkpoint"] = entries["trained"].checkpoint

@@ -14,12 +14,12 @@ from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.style import spoken
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.evaluation.alternatives import Alternative
+from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import FIGURES, Comparison
+from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.sampling import SampledEpisodes
+from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
-from cirl_marl.evaluation.sweep import Sweep
-from cirl_marl.evaluation.yardsticks import demanded
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.optimum.controller import Optimum
@@ -88,7 +88,7 @@ class Story:
     reasons: Annotated[tuple[tuple[str, tuple[str, ...]], ...], "headings with sentences that say why"] = ()
 
 
-def of_alternatives(found: Sequence[Alternative]) -> Story:
+def of_alternatives(found: Sequence[Simulation]) -> Story:
     """Return the page of ``cirl simulate``."""
     scenes = [
         _scene(each.name or spoken(each.control), each.network, each.env.agents, each.start, each.rollout)
@@ -143,10 +143,8 @@ def of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> Story:
             service, circularity = float(entry.rollout.least_service.mean()), float(entry.circularity.mean())
             points.append(PlanePoint(shown, service, circularity, "" if entry.seed is None else f"seed {entry.seed}"))
     notes = [f"Flows, stocks and actions are those of the first of {found.episodes} episodes."]
-    notes += [f"No bound: {found.yardstick.reason}."] if found.yardstick.reason else []
-    return Story(
-        _title(found.network), found.network, tuple(scenes), tuple(points), found.yardstick.front, tuple(notes)
-    )
+    notes += [f"No bound: {found.baseline.reason}."] if found.baseline.reason else []
+    return Story(_title(found.network), found.network, tuple(scenes), tuple(points), found.baseline.front, tuple(notes))
 
 
 def with_plan(
@@ -160,7 +158,7 @@ def with_plan(
     Raises:
         CirlError: if a solver fails, or nobody acts.
     """
-    level = None if env.uncertain else demanded(found.entries[0].rollout.episode_levels[0])
+    level = None if env.uncertain else levels_to_demand(found.entries[0].rollout.episode_levels[0])
     controller = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
     watched = Watched(controller, progress)
     run = rollout(env, watched, seed=found.first_seed, progress=watched.acted)
@@ -172,7 +170,7 @@ def with_plan(
     return replace(story, scenes=(*story.scenes, scene), points=(*story.points, point), notes=tuple(notes))
 
 
-def of_sweep(found: Sweep) -> Story:
+def of_sweep(found: ParetoFront) -> Story:
     """Return the page of ``cirl pareto``: points alone, as nothing else of its episodes is kept."""
     names = {"plan": "plans", "trained": "trained", "neutral": USUAL}
     points = [

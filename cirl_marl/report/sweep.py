@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.evaluation.figures import provenance
+from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.statistics import interquartile_mean
-from cirl_marl.evaluation.sweep import Sweep
 from cirl_marl.records.files import published, write_json, write_table
 from cirl_marl.report.curves import PointSeries, save_fronts
 
 FILES = ("pareto.csv", "pareto.json", "pareto.png")
 
 
-def write_sweep(sweep: Sweep, folder: Path, **options: Any) -> list[Path]:
+def write_sweep(sweep: ParetoFront, folder: Path, **options: Any) -> list[Path]:
     """Write table, provenance and picture, all of them or none, and return their paths."""
     mass = sweep.network.mass_unit
     header = ["kind", "least service level", f"circularity ({mass})", "circularity weight", "training seed"]
@@ -31,7 +31,7 @@ def write_sweep(sweep: Sweep, folder: Path, **options: Any) -> list[Path]:
     return [folder / name for name in FILES]
 
 
-def _series(sweep: Sweep) -> Iterator[PointSeries]:
+def _series(sweep: ParetoFront) -> Iterator[PointSeries]:
     """Yield what is drawn: of several seeds the interquartile mean at each weight."""
     weights = sorted({each.weight for each in sweep.of("trained") if each.weight is not None})
     alike = {

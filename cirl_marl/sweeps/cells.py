@@ -177,7 +177,7 @@ class CellJob:
             "circularity": over_episodes(entry.circularity).as_dict(),
             "service": over_episodes(entry.service, SHARE).as_dict(),
             "gap": gap,
-            "no_bound": compared.yardstick.reason,
+            "no_bound": compared.baseline.reason,
             "unit": compared.network.mass_unit,
             "checkpoint": entry.checkpoint,
             "evaluation": asked,

@@ -27,7 +27,7 @@ FRONT = 41
 
 
 @dataclass(frozen=True, slots=True)
-class Yardstick:
+class Baseline:
     """Proven bounds on λ̄ by start and service.
 
     Attributes:
@@ -48,14 +48,14 @@ class Yardstick:
         return None if self.envelope is None else self.envelope.at(starts, np.clip(levels, 0.0, 1.0))
 
 
-def yardstick(
+def solve_baseline(
     network: Network,
     agents: Sequence[str],
     starts: Floats,
     services: Sequence[Floats],
     *,
     progress: Callable[[float], None] = lambda share: None,
-) -> Yardstick:
+) -> Baseline:
     """Solve the programs for ``services``, the mean levels, shape (episodes, services), that each row delivered.
 
     ``starts`` are of shape (episodes, nodes), mass; ``progress`` is called with the share that is done.
@@ -72,7 +72,7 @@ def yardstick(
             progress((row + solved / SOLVES) / len(services))
 
         tell(0)
-        asked = demanded(service)
+        asked = levels_to_demand(service)
         level = tuple(np.rint(asked.mean(axis=0) / STEP).astype(int).tolist())
         if level not in members:
             found = envelope(
@@ -83,7 +83,7 @@ def yardstick(
     everyone = Envelope(tuple(each for level in sorted(members) for each in members[level]))
     least = [min(level, default=1.0 / STEP) for level in members]
     levels = STEP * np.linspace(min(least), max(least), FRONT)
-    return Yardstick(everyone, np.stack([levels, everyone.at(starts.mean(axis=0), levels[:, None])], axis=1))
+    return Baseline(everyone, np.stack([levels, everyone.at(starts.mean(axis=0), levels[:, None])], axis=1))
 
 
 def bounds_of_draws(
@@ -117,12 +117,12 @@ def bounds_of_draws(
     for i, (start, row) in enumerate(zip(starts, factors.tolist(), strict=True)):
         certain, near = drawn(network, row), None
         for k, levels in enumerate(services):
-            near = bound(certain, start, min_service=demanded(levels[i]), agents=agents or None, near=near)
+            near = bound(certain, start, min_service=levels_to_demand(levels[i]), agents=agents or None, near=near)
             found[k, i] = near.objective
             progress((i + (k + 1) / len(services)) / len(starts))
     return [*found]
 
 
-def demanded(levels: Floats) -> Floats:
+def levels_to_demand(levels: Floats) -> Floats:
     """Return the levels that programs demand of episodes that delivered ``levels``."""
     return np.asarray(np.maximum(np.floor((levels - MARGIN) / STEP) * STEP, 0.0))

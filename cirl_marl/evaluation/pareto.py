@@ -13,9 +13,9 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.baselines import FRONT
 from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.evaluation.contenders import differences
-from cirl_marl.evaluation.yardsticks import FRONT
 from cirl_marl.jobs import Standing, Tell, check_place, raise_first, run_jobs
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.learners.completion import completed
@@ -45,7 +45,7 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
-class Sweep:
+class ParetoFront:
     """All points of a network.
 
     Attributes:
@@ -66,7 +66,7 @@ class Sweep:
         return [point for point in self.points if point.kind == kind]
 
 
-def pareto(
+def pareto_front(
     network: str | Path | Network,
     recipe: str | Path | Recipe | None = None,
     *,
@@ -79,8 +79,8 @@ def pareto(
     on: str = "here",
     workers: int | None = None,
     progress: ProgressReport = lambda what, share: None,
-) -> Sweep:
-    """Sweep the weight between circularity and service.
+) -> ParetoFront:
+    """ParetoFront the weight between circularity and service.
 
     The bound and its plans start in the middle of all initial ranges. They demand the same mean level of every service,
     from the least that the highest circularity leaves one to the most that all can have at once. Learners are trained
@@ -129,7 +129,7 @@ def pareto(
             raise
         reason, share = str(missing), 0.0
     if chosen is None:
-        return Sweep(found, None, possible, front=front)
+        return ParetoFront(found, None, possible, front=front)
 
     def watch(standings: Sequence[Standing]) -> None:
         busy = [each.name for each in standings if each.state == "running"]
@@ -138,7 +138,7 @@ def pareto(
 
     raise_first(run_jobs(asked, directory / "runs" / "jobs", on=on, workers=workers, watch=watch))
     runs = [each.directory for each in asked]
-    return Sweep(found, chosen, (*possible, *_learnt(runs, episodes)), tuple(runs), reason, front)
+    return ParetoFront(found, chosen, (*possible, *_learnt(runs, episodes)), tuple(runs), reason, front)
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,7 @@ NAMES: Mapping[QuantityKind, str] = {
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class Alternative:
+class Simulation:
     """One episode of a network under one scenario and one controller."""
 
     name: Annotated[str, "scenario, controller or both, whichever there are several of; empty if it is alone"]
@@ -90,7 +90,7 @@ class ComparedQuantity:
         return largest / max(abs(float(there[0])), self.round_off) if largest > self.round_off else 0.0
 
 
-def alternatives(
+def simulate_alternatives(
     network: str | Path | Network,
     *,
     scenarios: Sequence[str | None] = (None,),
@@ -99,7 +99,7 @@ def alternatives(
     steps: int | None = None,
     seed: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
-) -> list[Alternative]:
+) -> list[Simulation]:
     """Simulate every scenario under every controller, each from the same seed.
 
     Each begins at ``beginning(env, seed)``. Scenarios with the same nodes and initial ranges thus begin with the same
@@ -141,7 +141,7 @@ def alternatives(
 
 
 def _refuse(envs: Sequence[MultiAgentVectorEnv], controls: Sequence[str], held: Mapping[str, float] | None) -> None:
-    """Raise what ``alternatives`` raises of scenarios and controllers that exist."""
+    """Raise what ``simulate_alternatives`` raises of scenarios and controllers that exist."""
     for kind, names in (("scenario", [env.network.scenario_name for env in envs]), ("control", controls)):
         if not names:
             raise CirlError(f"no {kind} is given")
@@ -156,12 +156,12 @@ def _refuse(envs: Sequence[MultiAgentVectorEnv], controls: Sequence[str], held: 
             raise CirlError(f"network '{env.network.name}': scenarios {both} cannot be compared: {'; '.join(found)}")
 
 
-def _simulated(name: str, control: str, env: MultiAgentVectorEnv, watched: Watched, seed: int | None) -> Alternative:
+def _simulated(name: str, control: str, env: MultiAgentVectorEnv, watched: Watched, seed: int | None) -> Simulation:
     begun = beginning(env, seed)
     begun.reset(env)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     run = rollout(env, watched, seed=begun.seed, start=begun.given, progress=watched.acted)
-    return Alternative(name, control, env, begun, start, run)
+    return Simulation(name, control, env, begun, start, run)
 
 
 def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -> None:
@@ -189,8 +189,8 @@ def _obstacles(one: Network, other: Network) -> Iterator[str]:
         yield f"horizon {mine} and {its}{advice}"
 
 
-def compared_quantities(found: Sequence[Alternative]) -> list[ComparedQuantity]:
-    """Return the figures of alternatives that ``alternatives`` simulated together, those first that differ most.
+def rank_quantities(found: Sequence[Simulation]) -> list[ComparedQuantity]:
+    """Return the figures of episodes of ``simulate_alternatives``, those first that differ most.
 
     They are λ̄, the mean level of each service, the mass that each arc moved in the episode, and the stock of each node
     at the end.
@@ -208,7 +208,7 @@ def compared_quantities(found: Sequence[Alternative]) -> list[ComparedQuantity]:
     return sorted(quantities, key=lambda quantity: -quantity.rank)
 
 
-def _figures(alternative: Alternative) -> dict[QuantityKind, dict[str, float]]:
+def _figures(alternative: Simulation) -> dict[QuantityKind, dict[str, float]]:
     """Return the figures of an episode by kind and id."""
     network, run = alternative.network, alternative.rollout
     duration = network.episode.horizon * network.episode.control_interval
