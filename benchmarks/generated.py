@@ -17,10 +17,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
+from cirl_marl.learners.agent_env import AgentVecEnv, StepResult
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
 from cirl_marl.learners.recipe import Recipe
-from cirl_marl.learners.seat import Handed, Seat
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Arc, Control, ControlKind, Episode, Law, Node, Role
@@ -210,7 +210,7 @@ class FreeEnv(MultiAgentVectorEnv):
         )
 
 
-def lone_seat(env: FreeEnv, agent: str) -> Seat:
+def lone_seat(env: FreeEnv, agent: str) -> AgentVecEnv:
     """Return a seat that nobody else waits for: a ``VecEnv`` with the outcomes that ``env`` has for ``agent``."""
     step = 0
 
@@ -219,11 +219,11 @@ def lone_seat(env: FreeEnv, agent: str) -> Seat:
         step += 1
         seen, nothing = env.observation(agent, step), np.zeros(env.num_envs)
         paid = env.reward(agent, step).astype(np.float32)
-        seat.handed = Handed(seen, paid, env.ended(step), seen, nothing, nothing.astype(int))
+        seat.handed = StepResult(seen, paid, env.ended(step), seen, nothing, nothing.astype(int))
 
-    seat = Seat(env, agent, OneAgent(env, agent), wait)
+    seat = AgentVecEnv(env, agent, OneAgent(env, agent), wait)
     ready = np.zeros(env.num_envs, dtype=np.float32), np.ones(env.num_envs, dtype=bool)
-    seat.handed = Handed(env.observation(agent, 0), *ready)
+    seat.handed = StepResult(env.observation(agent, 0), *ready)
     return seat
 
 
@@ -254,7 +254,7 @@ def learn_alone(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weight
     return seconds, _weights(learners)
 
 
-def _built(seat: Seat, recipe: Recipe, env: FreeEnv) -> Learner:
+def _built(seat: AgentVecEnv, recipe: Recipe, env: FreeEnv) -> Learner:
     return Learner(seat, recipe.learner_of(seat.name, env.network), 0).build()
 
 

@@ -19,7 +19,7 @@ from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import Rollout, beginning, rollout
 from cirl_marl.evaluation import Comparison, compare
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, achieved, bound, gap, improved
 from cirl_marl.report.decisions import savings

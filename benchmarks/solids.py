@@ -22,8 +22,8 @@ from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.controllers.scripted import Scripted
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import over_episodes, over_seeds
-from cirl_marl.learners.learner import Learner, learnt
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.learner import Learner, load_acting_learner
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats
 
 EPISODES = 16
@@ -113,7 +113,7 @@ def _learnt(run: Path) -> Act:
     """Return what the learners of a run do, each for its own agent."""
     directory = RunDirectory(run)
     env = directory.make_env(1)
-    policies = {group.name: _policy(learnt(directory.chosen, group, env)) for group in directory.groups()}
+    policies = {group.name: _policy(load_acting_learner(directory.chosen, group, env)) for group in directory.groups()}
     return lambda _env, _t, seen, _script: {agent: act(seen[agent]) for agent, act in policies.items()}
 
 

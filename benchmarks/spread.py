@@ -25,7 +25,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 import cirl_marl
 from cirl_marl.learners.teams.copies import Copies
-from cirl_marl.learners.training import one_torch_thread
+from cirl_marl.learners.trainer import one_torch_thread
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", UserWarning)

@@ -31,7 +31,7 @@ from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes, over_seeds
 from cirl_marl.jobs import Standing, Tell, raise_first, run_jobs
 from cirl_marl.learners import RunDirectory, train_seeds
-from cirl_marl.learners.launch import prepared
+from cirl_marl.learners.interface import prepare
 from cirl_marl.network import Floats
 from cirl_marl.optimum import gap
 from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
@@ -96,7 +96,7 @@ class Job:
         """Return whether complete runs are there, by the recipe and in the network of now."""
         if not all(_note(run).is_file() for run in self.runs):
             return False
-        now = prepared(self.network, self.recipe, seed=self.seeds[0], **dict(self.options))
+        now = prepare(self.network, self.recipe, seed=self.seeds[0], **dict(self.options))
         kept = {"seed", "definition_sha256", "data_sha256", "region"}  # the network is compared itself
         wanted = now.config.model_dump(exclude=kept)
         return all(

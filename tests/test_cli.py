@@ -538,7 +538,7 @@ def test_demo_stopped_says_what_is_kept(monkeypatch: pytest.MonkeyPatch, capsys:
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cirl_marl.learners.completion.completed", stop)
+    monkeypatch.setattr("cirl_marl.learners.interface.complete_run", stop)
     assert run(monkeypatch, "demo") == 130
     assert "stopped; nothing was learnt yet" in capsys.readouterr().out
 

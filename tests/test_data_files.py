@@ -17,7 +17,7 @@ from cirl_marl.definitions import columns
 from cirl_marl.definitions.reading import Definition
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.learners import Recipe, train
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 
 JAPAN = 'where = { country = "Japan" }'
 IN_JAPAN = "ores.csv, column 'kt', where country = 'Japan'"

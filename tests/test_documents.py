@@ -224,7 +224,7 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "steps=4_000_000" in code
     recipe = load_recipe("independent_ars")
     short = recipe.model_copy(update={"run": recipe.run.model_copy(update={"evaluations": 1, "episodes": 8})})
-    monkeypatch.setattr("cirl_marl.learners.launch.load_recipe", lambda name: short)
+    monkeypatch.setattr("cirl_marl.learners.interface.load_recipe", lambda name: short)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     exec(compile(code.replace("4_000_000", "20_480"), "README.md", "exec"), names)

@@ -102,7 +102,7 @@ def test_import_is_light() -> None:
     light = [name for name in modules(CHECKOUT) if room_of(name) not in TRAINING and ".robots." not in name]
     light += [
         f"{PACKAGE}.learners",
-        f"{PACKAGE}.learners.run",
+        f"{PACKAGE}.learners.run_directory",
         f"{PACKAGE}.learners.recipe",
         f"{PACKAGE}.paper.selection",
     ]

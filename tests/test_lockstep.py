@@ -12,9 +12,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from cirl_marl import LearnerError, MultiAgentVectorEnv
-from cirl_marl.learners.lockstep import Interrupted, Lockstep, NetworkWorld, Participant
-from cirl_marl.learners.seat import Seat
-from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.agent_env import AgentVecEnv
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingInterrupted
 
 HORIZON = 5
 COPIES = 3
@@ -26,7 +25,7 @@ def make_world(agents: list[str] | None = None) -> NetworkWorld:
     return NetworkWorld(env, seeds=[11, 12, 13])
 
 
-def scripted(seat: Seat, steps: int, seen: list[VecEnvStepReturn], value: float = 0.0) -> Callable[[], None]:
+def scripted(seat: AgentVecEnv, steps: int, seen: list[VecEnvStepReturn], value: float = 0.0) -> Callable[[], None]:
     """Return a learner that takes a fixed action for some steps and notes what comes back."""
 
     def run() -> None:
@@ -37,7 +36,7 @@ def scripted(seat: Seat, steps: int, seen: list[VecEnvStepReturn], value: float 
     return run
 
 
-def hold(seat: Seat) -> Callable[[], None]:
+def hold(seat: AgentVecEnv) -> Callable[[], None]:
     """Return an actor that holds action 0 for ever."""
 
     def run() -> None:
@@ -168,14 +167,14 @@ def test_failing_learner_is_named() -> None:
 
 
 def test_everything_can_be_stopped() -> None:
-    """``Interrupted`` ends all learners cleanly."""
+    """``TrainingInterrupted`` ends all learners cleanly."""
     world = make_world(["mine", "use"])
 
     def stop() -> None:
         if world.joint_steps == 4:
-            raise Interrupted
+            raise TrainingInterrupted
 
-    with pytest.raises(Interrupted):
+    with pytest.raises(TrainingInterrupted):
         run_scripted(world, {"mine": 100, "use": 100}, after=stop)
     assert world.joint_steps == 4
 

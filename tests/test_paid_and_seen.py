@@ -11,8 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Service
-from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
-from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams
 
 VALVE = Control(kind=ControlKind.RATE, low=0.0, neutral=1.0, high=2.0)
 SHIPPED = Network(

@@ -26,7 +26,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.baselines import Baseline
 from cirl_marl.learners import load_recipe
-from cirl_marl.learners.launch import prepared
+from cirl_marl.learners.interface import prepare
 
 CODE = Path(run.__file__).parent
 
@@ -43,7 +43,7 @@ def test_peers_get_the_settings_that_our_learners_have() -> None:
     assert dict(recipe.environment) == ENVIRONMENT
     assert (recipe.run.envs, recipe.run.steps, recipe.learner.bootstrap) == (SETTINGS.envs, SETTINGS.schedule, False)
     assert recipe.run.min_service == SERVICE
-    model = next(iter(prepared(NETWORK, recipe, envs=8).learners.values())).model
+    model = next(iter(prepare(NETWORK, recipe, envs=8).learners.values())).model
     assert isinstance(model, PPO)
     assert model.n_steps == SETTINGS.steps == load_network(NETWORK).episode.horizon
     assert (model.batch_size, model.n_epochs) == (SETTINGS.minibatch, SETTINGS.epochs)

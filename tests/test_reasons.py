@@ -21,10 +21,9 @@ from cirl_marl import CirlError, MultiAgentVectorEnv, Network, RunError, load_ne
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.learners import train
-from cirl_marl.learners.gradients import Acting
-from cirl_marl.learners.policies import Policies, Policy
+from cirl_marl.learners.interface import Trained
+from cirl_marl.learners.policies import DifferentiablePolicy, Policies, Policy
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Recipe, Run
-from cirl_marl.learners.trained import Trained
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.reasons import extras
 from cirl_marl.reasons.explaining import explain
@@ -58,7 +57,7 @@ class Known(Policies):
     def act(self, observations: Arrays) -> Arrays:
         """Return the clipped actions."""
         return {
-            agent: np.clip(Acting(policy)(torch.as_tensor(observations[agent])).numpy(), -1.0, 1.0)
+            agent: np.clip(DifferentiablePolicy(policy)(torch.as_tensor(observations[agent])).numpy(), -1.0, 1.0)
             for agent, policy in self.policies.items()
         }
 
@@ -184,7 +183,7 @@ def test_every_kind_of_policy_is_differentiated(tmp_path: Path, kind: str) -> No
     seen = watching.seen
     for agent in env.agents:
         name, policy = next(each for each in policies.policies.items() if agent in each[1].view.agents)
-        acting, where, view = Acting(policy), columns(env, policy.view, agent), policy.view
+        acting, where, view = DifferentiablePolicy(policy), columns(env, policy.view, agent), policy.view
         flat = {each: seen.observations[each].reshape(18, -1) for each in view.agents}
         place = view.row_agents.index(agent) if view.row_agents else 0
         rows = torch.as_tensor(view.rows(flat)[18 * place : 18 * (place + 1)].astype(np.float32))

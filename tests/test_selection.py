@@ -16,10 +16,9 @@ from cirl_marl import MultiAgentVectorEnv, RecipeError, RunError
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation import compare
 from cirl_marl.learners import RunDirectory, resume, train
-from cirl_marl.learners.price import STEEPEST, ServicePrice
+from cirl_marl.learners.interface import Trained
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
-from cirl_marl.learners.selection import SEEDS, Score, Selection
-from cirl_marl.learners.trained import Trained
+from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Score, ServiceMultiplier, ValidationEpisodes
 from cirl_marl.report.run import choice
 
 HORIZON, STEPS = 6, 96
@@ -60,7 +59,7 @@ def test_the_best_checkpoint_acts(tmp_path: Path, demanded: float | None) -> Non
     assert run.chosen.name == status["checkpoint"] == f"{6 * (best + 1):09d}-best"
     assert max(i for i in range(8) if rows[i]["best"]) == best
     env = MultiAgentVectorEnv("copper_net", num_envs=3, horizon=HORIZON, reward="team")
-    again = rollout(env, Trained(run), seed=SEEDS)
+    again = rollout(env, Trained(run), seed=FIRST_SEED)
     assert float(again.episode_circularity.mean()) == pytest.approx(rows[best]["circularity"], rel=1e-9)
     assert float(again.returns.sum(axis=0).mean()) == pytest.approx(rows[best]["paid"], rel=1e-9)
     levels = again.episode_levels
@@ -134,7 +133,7 @@ def test_a_status_of_something_else_is_refused(tmp_path: Path, best: object) -> 
 def test_the_price_moves_by_what_lacks(assured: float, step: float, damping: float) -> None:
     """In closed form, at once in what is paid, and never without end."""
     env = MultiAgentVectorEnv("copper_net", num_envs=2, reward="team", circularity="mean", circularity_weight=0.8)
-    price = ServicePrice(env, 0.99, 0.2, damping)
+    price = ServiceMultiplier(env, 0.99, 0.2, damping)
     price.heed(0.0)
     price.heed(assured)
     weight = env.circularity_weight
@@ -148,7 +147,8 @@ def test_the_price_moves_by_what_lacks(assured: float, step: float, damping: flo
     np.testing.assert_allclose(outcome.reward[0], paid, rtol=1e-9)
     for _ in range(2000):
         price.heed(assured)
-    end = {0.2: STEEPEST, 0.1: STEEPEST, 0.0: 0.25 * np.exp(0.2)}.get(step, 0.25)  # it falls to what it was at first
+    ends = {0.2: LARGEST_MULTIPLIER, 0.1: LARGEST_MULTIPLIER, 0.0: 0.25 * np.exp(0.2)}
+    end = ends.get(step, 0.25)  # it falls to what it was at first
     weight = env.circularity_weight
     assert (1 - weight) / weight == pytest.approx(end)
 
@@ -187,7 +187,7 @@ def test_an_evaluation_has_episodes_of_its_own() -> None:
     env = MultiAgentVectorEnv("copper_net", num_envs=2, horizon=HORIZON)
     from cirl_marl.learners.policies import Policies
 
-    evaluation = Selection(env)
+    evaluation = ValidationEpisodes(env)
 
     class Still(Policies):
         def act(self, observations: Any) -> Any:

@@ -16,9 +16,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl import CirlError, DefinitionError, LearnerError, RecipeError
 from cirl_marl.learners import Recipe, RunDirectory, Training, load_recipe, resume, train
-from cirl_marl.learners.launch import prepared
-from cirl_marl.learners.learner import Learner, learnt
-from cirl_marl.learners.trained import Trained
+from cirl_marl.learners.interface import Trained, prepare
+from cirl_marl.learners.learner import Learner, load_acting_learner
 
 AGENTS = ["mine", "use"]
 OPTIONS: dict[str, Any] = {"agents": AGENTS, "horizon": 4}
@@ -87,8 +86,8 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Training, Path]:
 def test_policy_before_the_first_update_is_that_of_the_run(algorithm: str, tmp_path: Path) -> None:
     """With critics, entropy coefficient and statistics of observations; optimiser, steps and rewards begin anew."""
     source = train("copper_net", recipe(algorithm), directory=tmp_path / "first", **OPTIONS)
-    found = prepared("copper_net", recipe(algorithm, **from_run(tmp_path / "first")), seed=7, **OPTIONS)
-    fresh = prepared("copper_net", recipe(algorithm), seed=7, **OPTIONS)
+    found = prepare("copper_net", recipe(algorithm, **from_run(tmp_path / "first")), seed=7, **OPTIONS)
+    fresh = prepare("copper_net", recipe(algorithm), seed=7, **OPTIONS)
     for name in AGENTS:
         old, new = source.learners[name], found.learners[name]
         assert same(weights(new), weights(old)) and not same(weights(new), weights(fresh.learners[name]))
@@ -122,7 +121,7 @@ def test_shared_policy_has_a_start_too(tmp_path: Path) -> None:
     shared = recipe(scheme="shared")
     source = train("copper_net", shared, directory=tmp_path / "first", **OPTIONS)
     asked = recipe(scheme="shared", **from_run(tmp_path / "first"))
-    (found,) = prepared("copper_net", asked, **OPTIONS).learners.values()
+    (found,) = prepare("copper_net", asked, **OPTIONS).learners.values()
     assert same(weights(found), weights(source.learners["shared-learner"]))
 
 
@@ -131,12 +130,12 @@ def test_start_is_the_best_checkpoint(tmp_path: Path) -> None:
     asked = recipe()
     chosen = asked.model_copy(update={"run": asked.run.model_copy(update={"evaluations": 6, "episodes": 2})})
     train("copper_net", chosen, directory=tmp_path / "first", **OPTIONS)
-    found = prepared("copper_net", recipe(**from_run(tmp_path / "first")), **OPTIONS)
+    found = prepare("copper_net", recipe(**from_run(tmp_path / "first")), **OPTIONS)
     folder = RunDirectory(tmp_path / "first").chosen
     assert folder.name.endswith("-best") and found.config.origins["use"].checkpoint == folder.name
     source = RunDirectory(tmp_path / "first")
     group = next(each for each in source.groups() if each.name == "use")
-    expected = learnt(folder, group, source.make_env(1)).model.policy.state_dict()
+    expected = load_acting_learner(folder, group, source.make_env(1)).model.policy.state_dict()
     assert same(weights(found.learners["use"]), expected)
 
 
@@ -288,10 +287,10 @@ def test_one_recipe_serves_several_seeds(first: tuple[Training, Path], tmp_path:
     shutil.copytree(first[1], tmp_path / "first-seed3")
     asked = recipe(**from_run(tmp_path / "first-seed{seed}"))
     assert same(
-        weights(prepared("copper_net", asked, seed=3, **OPTIONS).learners["use"]), weights(first[0].learners["use"])
+        weights(prepare("copper_net", asked, seed=3, **OPTIONS).learners["use"]), weights(first[0].learners["use"])
     )
     with pytest.raises(RecipeError, match=r"unknown run '.*first-seed4'. Did you mean '.*first-seed3'\?"):
-        prepared("copper_net", asked, seed=4, **OPTIONS)
+        prepare("copper_net", asked, seed=4, **OPTIONS)
 
 
 def test_somebody_has_to_learn(first: tuple[Training, Path]) -> None:

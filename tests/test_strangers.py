@@ -23,7 +23,7 @@ from cirl_marl.cli import main
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
-from cirl_marl.learners.trained import Trained
+from cirl_marl.learners.interface import Trained
 from cirl_marl.network.units import factor
 from cirl_marl.report import run as report_run
 
@@ -200,8 +200,8 @@ def test_definitions_import_nothing_unless_they_may(tmp_path: Path, monkeypatch:
 KILLED = """
 import os, signal, sys
 from cirl_marl.learners import Recipe, train, resume
-from cirl_marl.learners import training
-import cirl_marl.records.files as files, cirl_marl.learners.run as run_module
+from cirl_marl.learners import trainer as training
+import cirl_marl.records.files as files, cirl_marl.learners.run_directory as run_module
 from pathlib import Path
 
 directory, at = sys.argv[1], int(sys.argv[2])

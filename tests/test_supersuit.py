@@ -11,8 +11,7 @@ from stable_baselines3 import PPO
 
 import cirl_marl
 from cirl_marl import MultiAgentVectorEnv
-from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant
-from cirl_marl.learners.streams import Streams
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -266,7 +266,7 @@ def test_a_cell_that_fails_is_named_and_the_others_go_on(
             raise MemoryError("no room")
         return real(*arguments, **options)
 
-    monkeypatch.setattr("cirl_marl.learners.launch.train", failing)
+    monkeypatch.setattr("cirl_marl.learners.interface.train", failing)
     assert command(monkeypatch, "sweep", "sweep.toml", "--on", "here", "--json") == 1
     printed = capsys.readouterr()
     rows = json.loads(printed.out)
@@ -274,7 +274,7 @@ def test_a_cell_that_fails_is_named_and_the_others_go_on(
     assert [row["state"] for row in rows] == ["done", "missing", "done", "done"]
     assert f"failed: {missing}: MemoryError: no room" in printed.err
     assert "3 of 4 cells done" in printed.err
-    monkeypatch.setattr("cirl_marl.learners.launch.train", real)
+    monkeypatch.setattr("cirl_marl.learners.interface.train", real)
     assert command(monkeypatch, "sweep", "sweep.toml", "--on", "here") == 0
     shown = capsys.readouterr().out
     assert f"done: {missing}" in shown and "4 of 4 cells done; table: runs/sweep-sweep/sweep.csv" in shown

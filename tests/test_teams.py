@@ -28,7 +28,7 @@ from cirl_marl.learners import load_recipe, train
 from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import Normalisation
 from cirl_marl.learners.teams.team import Team
-from cirl_marl.learners.training import one_torch_thread
+from cirl_marl.learners.trainer import one_torch_thread
 
 SMALL: dict[str, Any] = {"n_steps": 16, "batch_size": 16, "n_epochs": 2}
 PAIR = {"early": range(3), "whole": range(7)}

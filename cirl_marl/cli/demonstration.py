@@ -51,8 +51,8 @@ def demo(
 
 def _train(out: Path, steps: int) -> None:
     """Train the team, or what is left of that."""
-    from cirl_marl.learners.completion import completed
-    from cirl_marl.learners.run import RunDirectory
+    from cirl_marl.learners.interface import complete_run
+    from cirl_marl.learners.run_directory import RunDirectory
 
     if (out / "config.json").is_file():
         run = RunDirectory(out)
@@ -64,7 +64,7 @@ def _train(out: Path, steps: int) -> None:
         if run.status["state"] == "complete":
             say(f"{out} is trained already; remove it to begin anew")
     with training_bar() as report:
-        completed(out, NETWORK, _recipe(), steps=steps, seed=0, report=report)
+        complete_run(out, NETWORK, _recipe(), steps=steps, seed=0, report=report)
 
 
 def _recipe() -> Recipe:

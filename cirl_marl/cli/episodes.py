@@ -240,8 +240,8 @@ def _actor(
         raise CirlError(f"plan {source}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
     if scenario is not None or min_service is not None:
         raise CirlError("--scenario and --min-service go with --control; a run has its own scenario and policies")
-    from cirl_marl.learners.run import RunDirectory
-    from cirl_marl.learners.trained import Trained
+    from cirl_marl.learners.interface import Trained
+    from cirl_marl.learners.run_directory import RunDirectory
 
     run = RunDirectory(source)
     return run.make_env(1), Trained(run)

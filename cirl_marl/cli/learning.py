@@ -124,7 +124,7 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
 
     The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     """
-    from cirl_marl.learners.run import RunDirectory
+    from cirl_marl.learners.run_directory import RunDirectory
     from cirl_marl.report.run import choice, evaluate_run
     from cirl_marl.report.tables import evaluation_table, local_returns_table
 
@@ -251,7 +251,7 @@ def _only_resume(context: typer.Context) -> None:
 
 def what_is_kept(directory: Path) -> str:
     """Say what a training that was stopped has left."""
-    from cirl_marl.learners.run import RunDirectory
+    from cirl_marl.learners.run_directory import RunDirectory
 
     run = RunDirectory(directory)
     if not (directory / "status.json").is_file() or run.status["checkpoint"] is None:
@@ -271,7 +271,7 @@ def _say_shortages(rollouts: Mapping[str, Rollout], network: Network) -> None:
 
 def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | None = None) -> None:
     """Evaluate a run, say what came of it and draw its pictures; with ``page`` also hold it against the best."""
-    from cirl_marl.learners.run import RunDirectory
+    from cirl_marl.learners.run_directory import RunDirectory
     from cirl_marl.report.run import choice, draw_run, evaluate_run, evaluate_story
     from cirl_marl.report.tables import evaluation_table
 

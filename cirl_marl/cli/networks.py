@@ -174,10 +174,10 @@ def _check_recipe(source: str, network: str | None) -> None:
 
 def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
     """Prepare a training, as far as it goes without training, and return the matches by which nobody learns."""
-    from cirl_marl.learners.launch import prepared
+    from cirl_marl.learners.interface import prepare
 
     try:
-        learners = prepared(network, recipe).learners.values()
+        learners = prepare(network, recipe).learners.values()
     except CirlError as error:
         raise CirlError(f"{source} in {network.name}: {error}") from error
     busy = {id(learner.spec) for learner in learners}

@@ -18,7 +18,7 @@ from cirl_marl.evaluation.baselines import Baseline, bounds_of_draws, solve_base
 from cirl_marl.evaluation.contenders import contenders
 from cirl_marl.evaluation.figures import gain
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, SHARE, Aggregate, over_episodes, over_seeds
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import NoCertificate, gap
 
@@ -161,7 +161,7 @@ def compare(
     if network is None and scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; runs have their own")
     found = load_network(network) if isinstance(network, str | Path) else network
-    from cirl_marl.learners.trained import Trained  # it needs torch
+    from cirl_marl.learners.interface import Trained  # it needs torch
 
     asked = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
     everyone = controllers if "neutral" in controllers else ["neutral", *controllers]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.controllers.basic import Controller
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.optimum.named import CONTROLLERS, named_controller
 
@@ -135,7 +135,7 @@ def _trained(runs: Sequence[RunDirectory], uncertain: bool | None) -> Iterator[C
 
 
 def _policy(run: RunDirectory) -> Controller:
-    from cirl_marl.learners.trained import Trained  # it needs torch
+    from cirl_marl.learners.interface import Trained  # it needs torch
 
     return Trained(run)
 

@@ -13,7 +13,7 @@ from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.definitions.writing import fingerprint
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import SHARE, over_episodes
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.staged import CIRO_FACTOR
 from cirl_marl.optimum.bounds import relative

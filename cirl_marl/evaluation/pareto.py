@@ -18,7 +18,6 @@ from cirl_marl.evaluation.comparison import ProgressReport, part_of
 from cirl_marl.evaluation.contenders import differences
 from cirl_marl.jobs import Standing, Tell, check_place, raise_first, run_jobs
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
-from cirl_marl.learners.completion import completed
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
 from cirl_marl.optimum.maximise import highest_service
@@ -172,7 +171,9 @@ class _Asked:
 
     def run(self, tell: Tell) -> None:
         """Train, or go on training."""
-        completed(
+        from cirl_marl.learners.interface import complete_run  # it needs torch
+
+        complete_run(
             self.directory.path,
             self.network,
             self.recipe,

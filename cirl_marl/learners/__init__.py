@@ -7,19 +7,33 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from cirl_marl.learners.recipe import Recipe, load_recipe
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 
 if TYPE_CHECKING:
-    from cirl_marl.learners.exporting import export
-    from cirl_marl.learners.launch import resume, train, train_seeds
-    from cirl_marl.learners.training import Progress, Training
+    from cirl_marl.learners.interface import Trained, complete_run, export, resume, train, train_seeds
+    from cirl_marl.learners.teams.team import Team, independent
+    from cirl_marl.learners.trainer import Progress, Training
 
-__all__ = ["Progress", "Recipe", "RunDirectory", "Training", "export", "load_recipe", "resume", "train", "train_seeds"]
+__all__ = [
+    "Progress",
+    "Recipe",
+    "RunDirectory",
+    "Team",
+    "Trained",
+    "Training",
+    "complete_run",
+    "export",
+    "independent",
+    "load_recipe",
+    "resume",
+    "train",
+    "train_seeds",
+]
 
 _HOME = {
-    **dict.fromkeys(("Progress", "Training"), "training"),
-    **dict.fromkeys(("resume", "train", "train_seeds"), "launch"),
-    "export": "exporting",
+    **dict.fromkeys(("Trained", "complete_run", "export", "resume", "train", "train_seeds"), "interface"),
+    **dict.fromkeys(("Team", "independent"), "teams.team"),
+    **dict.fromkeys(("Progress", "Training"), "trainer"),
 }
 
 

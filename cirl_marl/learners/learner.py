@@ -19,27 +19,28 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RecipeError, RunError
+from cirl_marl.learners.agent_env import AgentVecEnv, StepResult
 from cirl_marl.learners.algorithms import algorithm_class, build, has_replay_buffer
-from cirl_marl.learners.boundary import Boundary
-from cirl_marl.learners.demonstrations import Demonstrator, demonstrate, keep_parameters, steps_counted
-from cirl_marl.learners.lockstep import BudgetSpent, wait
-from cirl_marl.learners.recipe import Group, LearnerSettings
-from cirl_marl.learners.seat import Handed, Seat
-from cirl_marl.learners.states import (
+from cirl_marl.learners.barrier import CheckpointBarrier
+from cirl_marl.learners.checkpoint import (
+    UNREADABLE,
     buffer_state,
+    freeze_statistics,
     model_state,
     normaliser_state,
+    read_tree,
     set_buffer_state,
     set_model_state,
     set_normaliser_state,
     set_variables,
-    settle,
     variables,
+    write_tree,
 )
-from cirl_marl.learners.streams import Streams
-from cirl_marl.learners.trees import UNREADABLE, read_tree, write_tree
+from cirl_marl.learners.demonstrations import Demonstrator, demonstrate, keep_parameters, steps_counted
+from cirl_marl.learners.lockstep import BudgetSpent, Streams, wait
+from cirl_marl.learners.recipe import Group, LearnerSettings
 
-ACTING = ("policy_kwargs", "use_sde", "ent_coef", "gamma")
+ACTING_PARAMETERS = ("policy_kwargs", "use_sde", "ent_coef", "gamma")
 """Parameters on which it depends what acts."""
 
 
@@ -73,7 +74,7 @@ class Learner:
     env: VecEnv
     demonstrator: Demonstrator | None = None
 
-    def __init__(self, seat: Seat, spec: LearnerSettings, seed: int, *, done: int = 0) -> None:
+    def __init__(self, seat: AgentVecEnv, spec: LearnerSettings, seed: int, *, done: int = 0) -> None:
         """Give the learner its streams, others after each number of joint steps ``done`` before.
 
         ``build`` or ``load`` makes the algorithm.
@@ -83,7 +84,7 @@ class Learner:
         self.seat = seat
         seat.bootstrap = spec.bootstrap
         self._seed = derived_seed(seed, seat.name, done)
-        self.boundary = Boundary(seat)
+        self.boundary = CheckpointBarrier(seat)
         self._begun = 0
         self.was_stacked: bool | None = None
         self.shown = False
@@ -93,7 +94,7 @@ class Learner:
     def build(self) -> Learner:
         """Make a fresh algorithm; a ``RecipeError`` names the learner if the algorithm refuses its parameters."""
         spec = self.spec
-        self.env = normalised(self.seat, spec)
+        self.env = wrap_in_normaliser(self.seat, spec)
         parameters = dict(spec.parameters)
         if issubclass(algorithm_class(spec.algorithm), ARS):
             parameters.setdefault("n_eval_episodes", self.seat.num_envs)
@@ -144,11 +145,11 @@ class Learner:
             self.was_stacked = told["stacked"]
             self._begun = told["model"]["values"]["_num_timesteps_at_start"]
             self.model.num_timesteps = self._begun
-            self.boundary.again = [(action, Handed(**handed)) for action, handed in noted]
-            self.boundary.begins_at(read, Handed(**told["handed"]), told["acting"])
+            self.boundary.again = [(action, StepResult(**handed)) for action, handed in noted]
+            self.boundary.begins_at(read, StepResult(**told["handed"]), told["acting"])
             if self.was_stacked:
                 read()
-                self.boundary.begins_at(lambda: None, Handed(**told["handed"]), told["acting"])
+                self.boundary.begins_at(lambda: None, StepResult(**told["handed"]), told["acting"])
         return self
 
     @contextmanager
@@ -164,7 +165,7 @@ class Learner:
         set_model_state(self.model, told["model"])
         if isinstance(self.env, VecNormalize):
             if self.spec.start is not None and self.env.norm_obs:
-                settle(self.env)
+                freeze_statistics(self.env)
             set_normaliser_state(self.env, told["normaliser"])
         buffer = getattr(self.model, "replay_buffer", None)
         if buffer is not None and told["buffer"] is not None:
@@ -254,7 +255,7 @@ class Learner:
             observation = self.seat.reset()
             if isinstance(self.env, VecNormalize):
                 observation = self.env.normalize_obs(observation)  # type: ignore[arg-type]
-            action, state = chosen(self.model, observation, state, done, self.seat)
+            action, state = predict_action(self.model, observation, state, done, self.seat)
             _, _, done, _ = self.seat.step(action)
 
     def save(self, folder: Path) -> None:
@@ -290,7 +291,7 @@ class Learner:
         return self
 
 
-def chosen(
+def predict_action(
     model: BaseAlgorithm, observation: Any, memory: Any, starts: Any, env: VecEnv, *, deterministic: bool = True
 ) -> tuple[Any, Any]:
     """Return what a policy does and remembers; only what is legal if it knows of masks and ``env`` has some."""
@@ -300,19 +301,19 @@ def chosen(
     return model.predict(observation, memory, starts, deterministic=deterministic, **masks)
 
 
-def learnt(folder: Path, group: Group, env: MultiAgentVectorEnv) -> Learner:
+def load_acting_learner(folder: Path, group: Group, env: MultiAgentVectorEnv) -> Learner:
     """Return a learner that acts by what a checkpoint holds of ``group``, and is not made to learn."""
-    parameters = {key: value for key, value in group.spec.parameters.items() if key in ACTING}
+    parameters = {key: value for key, value in group.spec.parameters.items() if key in ACTING_PARAMETERS}
     if has_replay_buffer(group.spec.algorithm):
         parameters["buffer_size"] = 1
     spec = group.spec.model_copy(update={"parameters": parameters})
-    return Learner(Seat(env, group.name, group.view(env), wait), spec, 0).build().take(folder)
+    return Learner(AgentVecEnv(env, group.name, group.view(env), wait), spec, 0).build().take(folder)
 
 
 class AtRollouts(BaseCallback):
     """Tells of the beginning of every rollout of an algorithm that collects them."""
 
-    def __init__(self, boundary: Boundary) -> None:
+    def __init__(self, boundary: CheckpointBarrier) -> None:
         """Tell ``boundary``."""
         super().__init__()
         self._boundary = boundary
@@ -325,10 +326,10 @@ class AtRollouts(BaseCallback):
         return True
 
 
-class _Watched:
+class _ScheduleAtUpdates:
     """A schedule that ARS asks for at the beginning of every update, before it draws; it is saved as it was."""
 
-    def __init__(self, schedule: Schedule, model: ARS, boundary: Boundary) -> None:
+    def __init__(self, schedule: Schedule, model: ARS, boundary: CheckpointBarrier) -> None:
         self._schedule, self._model, self._boundary = schedule, model, boundary
 
     def __call__(self, _remaining: float) -> float:
@@ -344,20 +345,20 @@ def _itself(value: Any) -> Any:
 
 
 @contextmanager
-def at_updates(model: BaseAlgorithm, boundary: Boundary) -> Iterator[None]:
+def at_updates(model: BaseAlgorithm, boundary: CheckpointBarrier) -> Iterator[None]:
     """Tell ``boundary`` of the beginning of every update of ARS, which draws its candidates before its rollouts."""
     if not isinstance(model, ARS):
         yield
         return
     schedule = model.delta_std_schedule
-    model.delta_std_schedule = _Watched(schedule, model, boundary)  # type: ignore[assignment]
+    model.delta_std_schedule = _ScheduleAtUpdates(schedule, model, boundary)  # type: ignore[assignment]
     try:
         yield
     finally:
         model.delta_std_schedule = schedule
 
 
-def normalised(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:
+def wrap_in_normaliser(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:
     """Return ``env`` behind the normaliser that the settings ask for, if they do; of a dict ``keys`` are normalised."""
     normalise = spec.normalise
     if not normalise.any:

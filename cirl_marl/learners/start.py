@@ -18,11 +18,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, unknown
+from cirl_marl.learners.checkpoint import freeze_statistics, set_variables, variables
 from cirl_marl.learners.demonstrations import keep_parameters
-from cirl_marl.learners.learner import Learner, learnt
+from cirl_marl.learners.learner import Learner, load_acting_learner
 from cirl_marl.learners.recipe import LearnerSettings, Start
-from cirl_marl.learners.run import Origin, RunDirectory
-from cirl_marl.learners.states import set_variables, settle, variables
+from cirl_marl.learners.run_directory import Origin, RunDirectory
 from cirl_marl.learners.views import CENTRAL_CRITIC
 
 SHOWN = 3
@@ -54,7 +54,7 @@ def _begin_from(run: RunDirectory, name: str, learner: Learner, env: MultiAgentV
     _refuse(f"{run.path}: '{name}'", [*_other_settings(there.spec, learner.spec)])
     seen = [_entries(*pair, learner.spec) for pair in ((source, there.agents), (env, learner.seat.view.agents))]
     _refuse(f"{run.path}: '{name}'", [*_other_entries(*seen), *_other_actions(there.view(source), learner.seat.view)])
-    theirs = learnt(folder, there, source)
+    theirs = load_acting_learner(folder, there, source)
     _refuse(f"{folder / name}.json:", [*_other_shapes(theirs.model, learner.model)])
     _take_over(theirs, learner)
     files = [folder / f"{name}.{kind}" for kind in ("json", "safetensors")]
@@ -66,7 +66,7 @@ def begin_again(folder: Path, learner: Learner) -> None:
     """Give a fresh ``learner`` what it had from another run, as a checkpoint of its own keeps it."""
     learner.take(folder)
     if isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
-        settle(learner.env)
+        freeze_statistics(learner.env)
 
 
 def _refuse(what: str, mistakes: Sequence[str]) -> None:
@@ -83,7 +83,7 @@ def _take_over(theirs: Learner, learner: Learner) -> None:
     set_variables(mine, {name: known.get(name, own) for name, own in variables(mine).items()})
     if isinstance(theirs.env, VecNormalize) and isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
         learner.env.obs_rms = copy.deepcopy(theirs.env.obs_rms)
-        settle(learner.env)
+        freeze_statistics(learner.env)
 
 
 def _other_settings(there: LearnerSettings, here: LearnerSettings) -> Iterator[str]:

@@ -25,7 +25,7 @@ CENTRAL_CRITIC = "CentralCriticPolicy"
 """Name of the policy whose critic sees the whole state."""
 
 
-class Spaced(Protocol):
+class HasSpaces(Protocol):
     """Whatever has a space for the observation and one for the action of each agent."""
 
     observation_spaces: Any
@@ -86,7 +86,7 @@ class View(ABC):
 class OneAgent(View):
     """The view of a single agent: its own observation, action and reward, as they are."""
 
-    def __init__(self, env: Spaced, agent: str) -> None:
+    def __init__(self, env: HasSpaces, agent: str) -> None:
         """View ``env`` as ``agent``."""
         self.agents, self.row_agents = (agent,), (agent,)
         self.observation_space = env.observation_spaces[agent]

@@ -20,7 +20,7 @@ from cirl_marl.controllers.rollout import EVALUATION_SEEDS, SEED_SPACING
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.jobs import Tell
 from cirl_marl.learners.recipe import Recipe, load_recipe
-from cirl_marl.learners.training import one_torch_thread
+from cirl_marl.learners.trainer import one_torch_thread
 from cirl_marl.paper.published import PaperEnvironment, environment_of
 from cirl_marl.paper.results import WINDOW, Evaluation, PaperRow, Result, Results, thinned
 from cirl_marl.paper.selection import tuned_recipe

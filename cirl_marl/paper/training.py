@@ -23,7 +23,7 @@ from cirl_marl.errors import CirlError, RecipeError, RunError
 from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
-from cirl_marl.learners.learner import derived_seed, normalised
+from cirl_marl.learners.learner import derived_seed, wrap_in_normaliser
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation
 from cirl_marl.paper.published import PaperEnvironment
 from cirl_marl.paper.results import PaperRow
@@ -175,7 +175,7 @@ def _train_copies(
     if environment.has_goals:
         parameters, policy = parameters | {"replay_buffer_class": HerReplayBuffer}, policy.replace("Mlp", "MultiInput")
     # hindsight swaps goals, which keep one scale
-    env = normalised(env, learner, ["observation"] if environment.has_goals else None)
+    env = wrap_in_normaliser(env, learner, ["observation"] if environment.has_goals else None)
     model = build(learner.algorithm, policy, env, parameters, seed=row.seed, device="cpu")
     env.seed(row.seed * copies)  # one seed for each copy from there on, so that no two rows share a start
 

@@ -15,7 +15,7 @@ from cirl_marl.controllers.schedule import control_names
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.bounds import by_stage
 from cirl_marl.reasons.terms import PlannedEpisode
@@ -174,7 +174,7 @@ def _stocks(env: MultiAgentVectorEnv) -> Floats:
 
 
 def _of_run(run: RunDirectory, seed: int, episodes: int) -> list[PlannedEpisode]:
-    from cirl_marl.learners.trained import Trained  # it needs torch
+    from cirl_marl.learners.interface import Trained  # it needs torch
 
     policies, env, found = Trained(run), run.make_env(1, uncertain=False), []
     for episode in range(episodes):

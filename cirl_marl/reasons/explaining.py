@@ -14,7 +14,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import part_of, starting_stocks
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.reasons import extras
@@ -126,7 +126,7 @@ def _of_run(
     for part, extra in (("inputs", extras.captum), ("rules", extras.trees)):
         if part in asked:
             extra()
-    from cirl_marl.learners.trained import Trained  # it needs torch
+    from cirl_marl.learners.interface import Trained  # it needs torch
 
     policies, env, first = Trained(run), run.make_env(episodes, uncertain=False), first_seed(seed)
     starts = starting_stocks(env, first)

@@ -150,9 +150,9 @@ def _attributed(
     """Return shares, slopes and what is missed, for the signals of ``columns``."""
     import torch
 
-    from cirl_marl.learners.gradients import Acting
+    from cirl_marl.learners.policies import DifferentiablePolicy
 
-    acting, view, where = Acting(policy), policy.view, columns(env, policy.view, agent)
+    acting, view, where = DifferentiablePolicy(policy), policy.view, columns(env, policy.view, agent)
     flat: Mapping[str, Floats] = {
         each: seen.observations[each].reshape(-1, seen.observations[each].shape[2]) for each in view.agents
     }

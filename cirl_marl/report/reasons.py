@@ -16,7 +16,7 @@ from cirl_marl.drawing.style import GOOD, SERIES, WARNING, dated, dressed, numbe
 from cirl_marl.errors import RunError
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.statistics import Aggregate
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
 from cirl_marl.reasons.explaining import Explanation
 from cirl_marl.reasons.inputs import Consequence

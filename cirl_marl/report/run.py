@@ -18,7 +18,7 @@ from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.comparison import Comparison, part_of
 from cirl_marl.evaluation.figures import summary
 from cirl_marl.evaluation.statistics import over_episodes
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.records.files import write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
 from cirl_marl.report.reasons import reasons_of

@@ -19,14 +19,13 @@ from cirl_marl.errors import RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.statistics import SHARE, over_episodes
 from cirl_marl.jobs import Tell
-from cirl_marl.learners.completion import completed
 from cirl_marl.learners.recipe import Recipe, load_recipe
-from cirl_marl.learners.run import RunDirectory
+from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.records.files import write_json
 from cirl_marl.sweeps.reading import SweepEvaluation, SweepFile
 
 if TYPE_CHECKING:
-    from cirl_marl.learners.training import Progress
+    from cirl_marl.learners.trainer import Progress
 
 DIGITS = 12
 """Of the hash in the name of a cell."""
@@ -92,7 +91,7 @@ def cells_of(asked: SweepFile) -> list[Cell]:
     Raises:
         CirlError: for a combination that cannot be trained, before anything is written.
     """
-    from cirl_marl.learners.launch import prepared  # it needs torch
+    from cirl_marl.learners.interface import prepare  # it needs torch
 
     found = []
     recipes = [load_recipe(name) for name in asked.recipes]
@@ -107,7 +106,7 @@ def cells_of(asked: SweepFile) -> list[Cell]:
         begins = any(learner.start is not None for _, learner in recipe.learners())
         origins = ""
         if begins or seed == asked.seeds[0]:
-            config = prepared(address, recipe, seed=seed, scenario=network.scenario_name, **options).config
+            config = prepare(address, recipe, seed=seed, scenario=network.scenario_name, **options).config
             read = {name: origin.sha256 for name, origin in config.origins.items()}
             origins = hashlib.sha256(json.dumps(read, sort_keys=True).encode()).hexdigest() if read else ""
         found.append(
@@ -155,11 +154,13 @@ class CellJob:
 
     def run(self, tell: Tell) -> None:
         """Train, or go on training, and evaluate."""
+        from cirl_marl.learners.interface import complete_run  # it needs torch
+
         cell = self.cell
         found = load_network(cell.address, scenario=cell.scenario)
         if fingerprint(found) != cell.definition_sha256:
             raise RunError(f"{cell.address}: was edited while the sweep was running; start the sweep again")
-        run = completed(
+        run = complete_run(
             self.run_directory.path,
             cell.address,
             cell.recipe,

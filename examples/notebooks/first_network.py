@@ -13,7 +13,7 @@ from cirl_marl import Arc, Control, ControlKind, Episode, Network, Node, Objecti
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import interval_ends, rollout
 from cirl_marl.learners import train
-from cirl_marl.learners.trained import Trained
+from cirl_marl.learners.interface import Trained
 from cirl_marl.optimum import achieved, bound, gap, improved
 from cirl_marl.report.curves import save_circularity
 

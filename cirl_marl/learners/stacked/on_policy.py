@@ -2,21 +2,246 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import update_learning_rate
 from torch import Tensor
 
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.stacked.experience import Experience
-from cirl_marl.learners.stacked.perceptrons import pieces
+from cirl_marl.learners.stacked.perceptrons import Weights, pieces
 from cirl_marl.learners.stacked.stack import Stack
-from cirl_marl.learners.stacked.update import LOG_SQRT_2PI, Rules, Update
-from cirl_marl.learners.stacked.weights import Weights
+
+
+@dataclass(slots=True)
+class StackedRollout:
+    """T steps of B rows of N learners; shapes are (N, B, T), with entries last where there are some.
+
+    Attributes:
+        seen: what was seen, normalised.
+        actions: not clipped.
+        rewards: as normalisers scale them.
+        log_probabilities: of the actions.
+        starts: 1 where an episode began.
+        values: what the critic expected.
+        advantages: how much better it went.
+        returns: both together.
+        cut: steps after which time was up though more is expected to come, in which rows, shape (N, B), and what was
+            seen last, shape (N, B, entries).
+    """
+
+    seen: Tensor
+    actions: Tensor
+    rewards: Tensor
+    log_probabilities: Tensor
+    starts: Tensor
+    values: Tensor
+    advantages: Tensor
+    returns: Tensor
+    cut: list[tuple[int, Tensor, Tensor]] = field(default_factory=list)
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int, int], entries: int, actions: int, device: torch.device) -> StackedRollout:
+        """Return one to be filled, of shape (N, B, T)."""
+
+        def zeros(*last: int) -> Tensor:
+            return torch.zeros(*shape, *last, device=device)
+
+        return cls(zeros(entries), zeros(actions), zeros(), zeros(), zeros(), zeros(), zeros(), zeros())
+
+    def estimate(self, last_value: Tensor, last_starts: Tensor, gamma: float, gae_lambda: float) -> None:
+        """Estimate advantages and returns, Schulman et al. 2016, arXiv 1506.02438, eq. 16.
+
+        δ_t = r_t + γ V_{t+1} − V_t,  A_t = δ_t + γ λ A_{t+1},  where V_{t+1} and A_{t+1} are 0 if t ended an episode
+        """
+        advantage, value, goes_on = torch.zeros_like(last_value), last_value, 1.0 - last_starts
+        for t in reversed(range(self.rewards.shape[2])):
+            step = self.rewards[:, :, t] + gamma * value * goes_on - self.values[:, :, t]
+            advantage = step + gamma * gae_lambda * goes_on * advantage
+            self.advantages[:, :, t] = advantage
+            value, goes_on = self.values[:, :, t], 1.0 - self.starts[:, :, t]
+        self.returns = self.advantages + self.values
+
+    def samples(self, learners: slice, order: Tensor) -> Samples:
+        """Return samples of some learners by their indices, shape (learners, samples), of all B·T, row by row."""
+        total = self.rewards.shape[1] * self.rewards.shape[2]
+        first = torch.arange(order.shape[0], device=order.device)[:, None] * total
+        index = (order + first).flatten()
+
+        def picked(values: Tensor) -> Tensor:
+            entries = values.shape[3:]
+            own: Tensor = values[learners].reshape(-1, *entries).index_select(0, index)
+            return own.view(*order.shape, *entries)
+
+        parts = (self.seen, self.actions, self.values, self.log_probabilities, self.advantages, self.returns)
+        return Samples(*map(picked, parts))
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Samples of some learners; shapes are (learners, samples), with a last axis of entries where there is one."""
+
+    seen: Tensor
+    actions: Tensor
+    values: Tensor
+    log_probabilities: Tensor
+    advantages: Tensor
+    returns: Tensor
+
+    def normalised_advantages(self) -> Tensor:
+        """Return the advantages of each learner with mean 0 and standard deviation 1."""
+        mean, std = self.advantages.mean(dim=1, keepdim=True), self.advantages.std(dim=1, keepdim=True)
+        return (self.advantages - mean) / (std + 1e-8)
+
+
+LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """How an algorithm learns from a rollout; ``clip`` is None for A2C, which moves once and by all samples."""
+
+    epochs: int
+    batch: int
+    clip: float | None
+    clip_value: float | None
+    normalises: bool
+    entropy_weight: float
+    value_weight: float
+    largest_norm: float
+    rate: float
+
+    @classmethod
+    def of(cls, model: PPO | A2C, samples: int, remaining: float) -> Rules:
+        """Return those of a model for as many samples, when this share of the run remains."""
+        weights = (model.ent_coef, model.vf_coef, model.max_grad_norm)
+        rate, normalises = model.lr_schedule(remaining), model.normalize_advantage
+        if isinstance(model, A2C):
+            return cls(1, samples, None, None, normalises, *weights, rate)
+        clip, clip_value = (
+            limit(remaining) if callable(limit) else limit for limit in (model.clip_range, model.clip_range_vf)
+        )
+        return cls(model.n_epochs, model.batch_size, clip, clip_value, normalises, *weights, rate)
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyLoss:
+    """A policy's loss, shape (learners,), and its gradient by each log-probability, shape (learners, samples).
+
+    ``clipped`` is the share of samples that were, ``divergence`` the mean of r − 1 − log r for r = π/π_old.
+    """
+
+    value: Tensor
+    gradient: Tensor
+    clipped: Tensor
+    divergence: Tensor
+
+
+def policy_loss(log_probabilities: Tensor, samples: Samples, advantages: Tensor, clip: float | None) -> PolicyLoss:
+    """Return the loss of PPO, or of A2C if nothing is clipped; M is the number of samples.
+
+    PPO: L = −mean(min(A r, A clip(r, 1 − ε, 1 + ε))) with r = π/π_old, so that ∂L/∂log π = −A r/M, 0 where clipped
+    (Schulman et al. 2017, arXiv 1707.06347, eq. 7). A2C: L = −mean(A log π), so that ∂L/∂log π = −A/M.
+    """
+    count = advantages.shape[1]
+    log_ratio = log_probabilities - samples.log_probabilities
+    ratio = log_ratio.exp()
+    divergence = (ratio - 1 - log_ratio).mean(dim=1)
+    if clip is None:
+        value = -(advantages * log_probabilities).mean(dim=1)
+        return PolicyLoss(value, -advantages / count, torch.zeros_like(value), divergence)
+    gain, bounded = advantages * ratio, advantages * ratio.clamp(1 - clip, 1 + clip)
+    return PolicyLoss(
+        value=-torch.minimum(gain, bounded).mean(dim=1),
+        gradient=torch.where(gain <= bounded, -gain / count, 0.0),
+        clipped=((ratio - 1).abs() > clip).float().mean(dim=1),
+        divergence=divergence,
+    )
+
+
+def value_loss(values: Tensor, samples: Samples, clip: float | None) -> tuple[Tensor, Tensor]:
+    """Return mean((V − R)²) and its gradient by V; V moves from its old value by at most ``clip``, if there is one."""
+    moved = values if clip is None else samples.values + (values - samples.values).clamp(-clip, clip)
+    error = moved - samples.returns
+    gradient = 2 * error / error.shape[1]
+    if clip is not None:
+        gradient = torch.where((values - samples.values).abs() <= clip, gradient, 0.0)
+    return error.square().mean(dim=1), gradient
+
+
+class Update:
+    """One update of all learners by their rollouts; ``acts`` is 1 where a learner has an entry of its action."""
+
+    def __init__(self, weights: Weights, rules: Rules, rollout: StackedRollout, acts: Tensor, local: int) -> None:
+        """``local`` is the number of columns of what is seen at which actors look."""
+        self._weights, self._rules, self._rollout = weights, rules, rollout
+        self._acts, self._local = acts, local
+        self._sums, self._count = np.zeros((len(acts), len(FIGURES))), 0
+
+    def run(self, shuffles: list[np.random.RandomState]) -> None:
+        """Pass over the samples in minibatches, which each learner draws from its own stream."""
+        weights, rules = self._weights, self._rules
+        learners, device = len(shuffles), weights.matrix.device
+        total = self._rollout.rewards[0].numel()
+        update_learning_rate(weights.optimiser, rules.rate)
+        for _ in range(rules.epochs):
+            order = torch.as_tensor(np.stack([own.permutation(total) for own in shuffles]), device=device)
+            for first in range(0, total, rules.batch):
+                part = order[:, first : first + rules.batch]
+                for some in pieces(learners, part.shape[1] * weights.actor.width, device):
+                    self._differentiate(self._rollout.samples(some, part[some]), some)
+                weights.clip(rules.largest_norm)
+                weights.optimiser.step()
+                self._count += 1
+
+    def _differentiate(self, samples: Samples, some: slice) -> None:
+        """Write the gradients of the loss of some learners: L = L_π − c_H H + c_V L_V.
+
+        With z = (a − μ)/σ, ∂log π/∂μ = z/σ and ∂log π/∂log σ = z² − 1 for each entry of the action.
+        """
+        weights, rules, acts = self._weights, self._rules, self._acts[some]
+        log_std = weights.log_std[some][:, None]
+        std = log_std.exp()
+        units = weights.actor.forward(samples.seen[..., : self._local], some)
+        z = (samples.actions - units[-1]) / std
+        log_probabilities = ((-0.5 * z.square() - log_std - LOG_SQRT_2PI) * acts).sum(dim=-1)
+        normalises = rules.normalises and samples.advantages.shape[1] > 1
+        advantages = samples.normalised_advantages() if normalises else samples.advantages
+        policy = policy_loss(log_probabilities, samples, advantages, rules.clip)
+        each = policy.gradient[..., None] * acts
+        weights.log_std_gradient[some] = ((z.square() - 1) * each).sum(dim=1) - rules.entropy_weight * acts[:, 0]
+        weights.actor.backward(units, z / std * each, some)
+        units = weights.critic.forward(samples.seen, some)
+        loss, gradient = value_loss(units[-1][..., 0], samples, rules.clip_value)
+        weights.critic.backward(units, (rules.value_weight * gradient)[..., None], some)
+        own = torch.stack([policy.value, policy.clipped, policy.divergence, loss], dim=1)
+        self._sums[some] += own.cpu().numpy()
+
+    def figures(self) -> Iterator[dict[str, float]]:
+        """Yield the figures of each learner that Stable-Baselines3 writes of an update."""
+        rollout, log_std = self._rollout, self._weights.log_std
+        unexplained = (rollout.returns - rollout.values).flatten(1).var(dim=1) / rollout.returns.flatten(1).var(dim=1)
+        entropy = ((log_std + LOG_SQRT_2PI + 0.5) * self._acts[:, 0]).sum(dim=1)
+        std = (log_std.exp() * self._acts[:, 0]).sum(dim=1) / self._acts[:, 0].sum(dim=1)
+        for i, sums in enumerate(self._sums / max(1, self._count)):
+            own = dict(zip(FIGURES, sums.tolist(), strict=True))
+            yield own | {
+                "entropy_loss": -float(entropy[i]),
+                "explained_variance": 1.0 - float(unexplained[i]),
+                "std": float(std[i]),
+                "learning_rate": self._rules.rate,
+            }
+
+
+FIGURES = ("policy_gradient_loss", "clip_fraction", "approx_kl", "value_loss")
+"""Means over minibatches."""
+
 
 AT_ONCE = 1024
 """Samples of a learner that critics value at once."""
@@ -43,7 +268,7 @@ class RolloutStack(Stack):
         # Minibatches come from each learner's NumPy stream itself.
         self._shuffles = [np.random.RandomState(learner.streams.bit_generator) for learner in members]
         shape = (len(members), self._rows, self._steps)
-        self._rollout = Experience.empty(shape, self._inputs.entries, self._acts.shape[2], self._device)
+        self._rollout = StackedRollout.empty(shape, self._inputs.entries, self._acts.shape[2], self._device)
         self._episodes: list[deque[float]] = [deque(maxlen=EPISODES) for _ in members]
 
     def learn(self, steps: int, wait: Callable[[], None]) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor, nn
+
+from cirl_marl.network import Integers
 
 CELLS = 262_144
 """Hidden units times samples that are worked on at once on a CPU: few enough for its cache, many for each call."""
@@ -116,3 +120,157 @@ def linear_layers(network: nn.Module) -> tuple[list[nn.Linear], type[nn.Module] 
     if len(linear) != len(between) or len(kinds) > 1 or not all(type(module) is nn.Linear for module in linear):
         raise TypeError(f"not linear layers with an activation after each: {network}")
     return linear, kinds.pop() if kinds else None
+
+
+class Field:
+    """Where a padded tensor stands in the rows of a matrix.
+
+    Attributes:
+        first: its first column.
+    """
+
+    def __init__(self, columns: slice, shape: tuple[int, ...]) -> None:
+        """Stand in these columns, which hold a tensor of this shape."""
+        self._columns, self._shape, self.first = columns, shape, columns.start
+
+    def of(self, matrix: Tensor) -> Tensor:
+        """Return it as a view of a matrix, shape (rows, …)."""
+        return matrix.detach()[:, self._columns].view(-1, *self._shape)
+
+
+class ParameterLayout:
+    """A matrix with a row for each of N policies.
+
+    Policies with fewer entries of observation or action than the largest are padded by parameters that are zero and
+    stay zero: what they multiply is zero, and so are their gradients.
+
+    Attributes:
+        columns: of the matrix.
+    """
+
+    def __init__(self, learners: int) -> None:
+        """Begin with no columns."""
+        self.columns = 0
+        self._places: list[dict[Tensor, Integers]] = [{} for _ in range(learners)]
+
+    def field(self, parameters: Sequence[Tensor], *indices: Sequence[Integers]) -> Field:
+        """Give a parameter of every learner columns; of a padded tensor it fills these rows, columns and so on."""
+        shape = tuple(1 + max(int(own.max()) for own in along) for along in indices)
+        for places, parameter, *own in zip(self._places, parameters, *indices, strict=True):
+            places[parameter] = self.columns + np.ravel_multi_index(np.ix_(*own), shape).ravel()
+        first, self.columns = self.columns, self.columns + math.prod(shape)
+        return Field(slice(first, self.columns), shape)
+
+    def layers(self, networks: Sequence[Sequence[Any]], inputs: Sequence[Integers]) -> list[tuple[Field, Field | None]]:
+        """Give the linear layers of a network of every learner columns; it looks at these entries of the inputs."""
+        found: list[tuple[Field, Field | None]] = []
+        for layers in zip(*networks, strict=True):
+            outputs = [np.arange(layer.out_features) for layer in layers]
+            weight = self.field([layer.weight for layer in layers], outputs, inputs)
+            biases = [layer.bias for layer in layers]
+            found.append((weight, None if biases[0] is None else self.field(biases, outputs)))
+            inputs = outputs
+        return found
+
+    def places(self, learner: int) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield each parameter of a learner with its columns."""
+        for parameter, columns in self._places[learner].items():
+            yield parameter, torch.as_tensor(columns)
+
+
+def layers_of(fields: Sequence[tuple[Field, Field | None]], matrix: Tensor) -> list[Layer]:
+    """Return layers as views of a matrix."""
+    return [Layer(weight.of(matrix), None if bias is None else bias.of(matrix)) for weight, bias in fields]
+
+
+class Weights:
+    """Standard deviations, actors and critics of N policies.
+
+    The optimiser works element by element, so that one for the whole matrix does what N of them do.
+
+    Attributes:
+        matrix: parameters of all learners, shape (learners, parameters).
+        gradient: of the same shape.
+        log_std: logarithm of the standard deviation of each action, shape (learners, actions); a view of the matrix.
+        log_std_gradient: its part of the gradient.
+        actor: from what an agent sees to the mean of its action.
+        critic: from what a critic sees to the value of the state.
+        optimiser: of the kind and with the settings that the policies have.
+    """
+
+    def __init__(
+        self,
+        policies: Sequence[ActorCriticPolicy],
+        seen: Sequence[Integers],
+        criticised: Sequence[Integers],
+        device: torch.device,
+    ) -> None:
+        """Take over the parameters and what the optimisers remember.
+
+        ``seen`` and ``criticised`` are, by learner, the columns of the padded inputs at which its actor and its critic
+        look.
+        """
+        self._policies, self._layout = policies, (layout := ParameterLayout(len(policies)))
+        log_std = layout.field([p.log_std for p in policies], [np.arange(len(p.log_std)) for p in policies])
+        extractors = [policy.mlp_extractor for policy in policies]
+        heads = [(policy.action_net, policy.value_net) for policy in policies]
+        linear = [(linear_layers(each.policy_net)[0], linear_layers(each.value_net)[0]) for each in extractors]
+        actor = layout.layers([[*own, head] for (own, _), (head, _) in zip(linear, heads, strict=True)], seen)
+        critic = layout.layers([[*own, head] for (_, own), (_, head) in zip(linear, heads, strict=True)], criticised)
+        self.matrix = nn.Parameter(torch.zeros(len(policies), layout.columns, device=device), requires_grad=False)
+        self.gradient = torch.zeros_like(self.matrix)
+        self.matrix.grad = self.gradient
+        first = policies[0]
+        kind: Any = first.optimizer_class
+        rate = first.optimizer.param_groups[0]["lr"]
+        self.optimiser: torch.optim.Optimizer = kind([self.matrix], lr=rate, **first.optimizer_kwargs)
+        self.log_std, self.log_std_gradient = log_std.of(self.matrix), log_std.of(self.gradient)
+        activation = ACTIVATIONS[linear_layers(extractors[0].policy_net)[1] or nn.Tanh]
+        self.actor, self.critic = (
+            Perceptrons(layers_of(fields, self.matrix), activation, layers_of(fields, self.gradient))
+            for fields in (actor, critic)
+        )
+        self._take()
+
+    def clip(self, norm: float) -> None:
+        """Scale the gradient of each learner down to at most ``norm``, as torch's ``clip_grad_norm_`` does."""
+        own = torch.linalg.vector_norm(self.gradient, dim=1, keepdim=True)
+        self.gradient.mul_((norm / (own + 1e-6)).clamp(max=1.0))
+
+    def give(self) -> None:
+        """Give each policy its parameters, and its optimiser what it remembers."""
+        remembered = self.optimiser.state.get(self.matrix, {})
+        rate = self.optimiser.param_groups[0]["lr"]
+        for learner, policy in enumerate(self._policies):
+            policy.optimizer.param_groups[0]["lr"] = rate
+            for parameter, columns in self._layout.places(learner):
+                with torch.no_grad():
+                    parameter.copy_(self.matrix[learner, columns].view(parameter.shape))
+                policy.optimizer.state[parameter] = {
+                    name: value[learner, columns].view(parameter.shape).to(parameter.device)
+                    if _is_like(value, self.matrix)
+                    else _copied(value)
+                    for name, value in remembered.items()
+                }
+
+    def _take(self) -> None:
+        state: dict[str, Any] = {}
+        for learner, policy in enumerate(self._policies):
+            for parameter, columns in self._layout.places(learner):
+                self.matrix[learner, columns] = parameter.detach().flatten().to(self.matrix.device)
+                for name, value in policy.optimizer.state.get(parameter, {}).items():
+                    if not _is_like(value, parameter):
+                        state[name] = _copied(value)  # a number of steps: the same for all, who learn together
+                        continue
+                    own = state.setdefault(name, torch.zeros_like(self.matrix))
+                    own[learner, columns] = value.flatten().to(own.device)
+        if state:
+            self.optimiser.state[self.matrix] = state
+
+
+def _is_like(value: object, parameter: Tensor) -> bool:
+    return isinstance(value, Tensor) and value.shape == parameter.shape
+
+
+def _copied(value: Any) -> Any:
+    return value.clone() if isinstance(value, Tensor) else value

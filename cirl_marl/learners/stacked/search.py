@@ -10,8 +10,14 @@ from sb3_contrib.ars.policies import ARSPolicy
 from torch import Tensor, nn
 
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.stacked.layout import ParameterLayout, layers_of
-from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, Activation, Perceptrons, linear_layers
+from cirl_marl.learners.stacked.perceptrons import (
+    ACTIVATIONS,
+    Activation,
+    ParameterLayout,
+    Perceptrons,
+    layers_of,
+    linear_layers,
+)
 from cirl_marl.learners.stacked.stack import Stack
 
 

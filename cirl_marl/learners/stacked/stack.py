@@ -3,13 +3,152 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
+import numpy as np
 import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import Tensor
 
 from cirl_marl.learners.learner import Learner
-from cirl_marl.learners.stacked.inputs import Inputs
+from cirl_marl.network import Integers
+
+
+class StackedInputs:
+    """Observations, actions and rewards of N learners with B rows each.
+
+    Observations come first, padded with zeros; where critics see the state, it follows, as in the policies' own order.
+
+    Attributes:
+        spaces: of the actions of each learner.
+        local: entries of the longest observation.
+        entries: with the state.
+        seen: columns at which the actor of each learner looks.
+        criticised: columns at which its critic looks.
+    """
+
+    def __init__(self, members: Sequence[Learner], device: torch.device) -> None:
+        """Lay out the inputs and take over what normalisers know."""
+        self._members, self._device = members, device
+        views = [learner.seat.view for learner in members]
+        self.spaces = [_box(view.action_space) for view in views]
+        rows, states = members[0].seat.num_envs, views[0].state_entries
+        own = [spaces.flatdim(view.observation_space) - states for view in views]
+        self.local, self.entries = max(own), max(own) + states
+        self.seen: list[Integers] = [np.arange(entries) for entries in own]
+        state = np.arange(self.local, self.entries)
+        self.criticised: list[Integers] = [np.concatenate([seen, state]) for seen in self.seen]
+        # in the precision in which the learners see them, which is that of their moments
+        self._parts: dict[str, NDArray[np.floating]] = {
+            "observation": np.zeros((len(members), rows, self.local), dtype=np.float32)
+        }
+        if states:
+            self._parts["state"] = np.zeros((len(members), rows, states))
+        self._returns = np.zeros((len(members), rows))
+        # of all learners at once, shape (N, entries): they have seen the same number of samples
+        self._moments = {key: RunningMeanStd(shape=(len(members), part.shape[2])) for key, part in self._parts.items()}
+        self._paid_moments = RunningMeanStd(shape=(len(members), 1))
+        spec = members[0].spec
+        self._follows = spec.normalise.observation and spec.start is None  # statistics stay as they are after a start
+        for i, columns, ours, kept in self._kept():
+            ours.mean[i, columns], ours.var[i, columns], ours.count = kept.mean, kept.var, kept.count
+        for returns, learner in zip(self._returns, members, strict=True):
+            if isinstance(learner.env, VecNormalize):
+                returns[:] = learner.env.returns
+
+    def begin(self) -> Tensor:
+        """Return what is seen, as at a reset: it counts in the moments, and discounted returns begin anew."""
+        self._returns[:] = 0.0
+        return self.observed(learning=True)
+
+    def observed(self, *, learning: bool) -> Tensor:
+        """Return what the learners see now, shape (N, B, entries); while learning, it counts in the moments."""
+        for i, learner in enumerate(self._members):
+            self._enter(i, learner.seat.reset())
+        if learning and self._follows:
+            for key, part in self._parts.items():
+                _update(self._moments[key], part)
+        return self._normalised()
+
+    def last_seen(self, ended: NDArray[np.bool_]) -> Tensor:
+        """Return what was seen last in the rows that ``ended``, shape (N, B, entries); in others, anything."""
+        for i, learner in enumerate(self._members):
+            if ended[i].any():
+                self._enter(i, learner.seat.handed.final)
+        return self._normalised()
+
+    def paid(self) -> tuple[Tensor, NDArray[np.bool_]]:
+        """Return the rewards as normalisers scale them, and which rows ended, shape (N, B) each."""
+        rewards, ended = (np.stack(parts) for parts in zip(*(x.seat.paid() for x in self._members), strict=True))
+        env = self._members[0].env
+        if isinstance(env, VecNormalize):
+            self._returns = self._returns * env.gamma + rewards
+            _update(self._paid_moments, self._returns[..., None])
+            self._returns[ended] = 0.0
+            if env.norm_reward:
+                rewards = rewards / np.sqrt(self._paid_moments.var + env.epsilon)
+                rewards = np.clip(rewards, -env.clip_reward, env.clip_reward)
+        return torch.as_tensor(rewards, dtype=torch.float32, device=self._device), ended
+
+    def hand_in(self, actions: Tensor) -> None:
+        """Hand in actions, shape (N, B, entries), clipped to their bounds."""
+        for own, learner, space in zip(actions.cpu().numpy(), self._members, self.spaces, strict=True):
+            learner.seat.step_async(np.clip(own[:, : space.shape[0]], space.low, space.high))
+
+    def give(self) -> None:
+        """Give normalisers what they would know by themselves."""
+        for i, columns, ours, kept in self._kept():
+            shape = np.shape(kept.mean)
+            kept.mean, kept.var = (np.array(own[i, columns]).reshape(shape) for own in (ours.mean, ours.var))
+            kept.count = ours.count
+        for own, learner in zip(self._returns, self._members, strict=True):
+            if isinstance(learner.env, VecNormalize):
+                learner.env.returns = own.copy()
+
+    def _kept(self) -> Iterator[tuple[int, slice, RunningMeanStd, RunningMeanStd]]:
+        """Yield each learner's own moments beside ours, with its row and columns."""
+        for i, learner in enumerate(self._members):
+            env = learner.env
+            if not isinstance(env, VecNormalize):
+                continue
+            yield i, slice(1), self._paid_moments, env.ret_rms
+            if env.norm_obs:
+                kept = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
+                for key, moments in kept.items():
+                    yield i, slice(len(self.seen[i]) if key == "observation" else None), self._moments[key], moments
+
+    def _enter(self, i: int, observation: Any) -> None:
+        """Enter what a learner sees into the padded parts."""
+        for key, part in self._parts.items():
+            own = observation[key] if isinstance(observation, dict) else observation
+            part[i, :, : own.shape[1]] = own
+
+    def _normalised(self) -> Tensor:
+        """Return what was entered, side by side."""
+        env = self._members[0].env
+        parts: list[NDArray[np.floating]] = []
+        for key, part in self._parts.items():
+            own = self._moments[key]
+            if isinstance(env, VecNormalize) and env.norm_obs:
+                scaled = (part - own.mean[:, None]) / np.sqrt(own.var + env.epsilon)[:, None]
+                parts.append(np.clip(scaled, -env.clip_obs, env.clip_obs))
+            else:
+                parts.append(part)
+        return torch.as_tensor(np.concatenate(parts, axis=2), dtype=torch.float32, device=self._device)
+
+
+def _update(moments: RunningMeanStd, samples: NDArray[np.floating]) -> None:
+    """Add samples, shape (N, samples, entries); their own moments are of their own precision."""
+    moments.update_from_moments(samples.mean(axis=1), samples.var(axis=1), samples.shape[1])
+
+
+def _box(space: spaces.Space[Any]) -> spaces.Box:
+    assert isinstance(space, spaces.Box)
+    return space
 
 
 class Stack(ABC):
@@ -23,7 +162,7 @@ class Stack(ABC):
         """Take over what all learners have."""
         self.members = list(members)
         self._device = torch.device(device)
-        self._inputs = Inputs(members, self._device)
+        self._inputs = StackedInputs(members, self._device)
         # Noise comes from a copy of each learner's torch stream.
         self._noise = [torch.Generator().set_state(learner.streams.torch_state) for learner in members]
         self._moves, self._given = 0, 0

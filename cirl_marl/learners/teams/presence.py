@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.errors import LearnerError
-from cirl_marl.learners.seat import JointStep, Seat
+from cirl_marl.learners.agent_env import AgentVecEnv, JointStep
 from cirl_marl.learners.teams.copies import AgentInCopy, Copies
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.network import Floats
@@ -32,7 +32,7 @@ WHOLE = (ReplayBuffer, DictReplayBuffer)
 """Replay buffers in which every row of a step is a transition by itself."""
 
 
-class TeamSeat(Seat):
+class TeamVecEnv(AgentVecEnv):
     """The seat of one agent of any environment, who may be absent in some copies or in all.
 
     Attributes:
@@ -89,7 +89,7 @@ class TeamSeat(Seat):
 class _Rollout(RolloutBuffer):
     """Rollouts of which only rows in which the agent acted are learnt."""
 
-    seat: TeamSeat
+    seat: TeamVecEnv
     acted: NDArray[np.bool_]
 
     def reset(self) -> None:
@@ -114,7 +114,7 @@ class _Rollout(RolloutBuffer):
 class _Replay(ReplayBuffer):
     """A replay buffer into which no row goes in which the agent did not act."""
 
-    seat: TeamSeat
+    seat: TeamVecEnv
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
         counted = self.seat.counted
@@ -132,14 +132,14 @@ def _chosen(seen: Any, rows: NDArray[np.integer]) -> Any:
 class _Moments(RunningMeanStd):
     """Moments of the rows that somebody acts in."""
 
-    seat: TeamSeat
+    seat: TeamVecEnv
     which: str
 
     def update(self, arr: NDArray[Any]) -> None:
         super().update(arr[getattr(self.seat, self.which)])
 
 
-def leave_out_absent(model: BaseAlgorithm, env: Any, seat: TeamSeat) -> None:
+def leave_out_absent(model: BaseAlgorithm, env: Any, seat: TeamVecEnv) -> None:
     """Let a learner learn only from rows of its ``seat`` in which the agent is present.
 
     Raises:
@@ -164,7 +164,7 @@ def leave_out_absent(model: BaseAlgorithm, env: Any, seat: TeamSeat) -> None:
             moments.which = which  # type: ignore[attr-defined]
 
 
-def _become(thing: Any, kind: type, seat: TeamSeat) -> None:
+def _become(thing: Any, kind: type, seat: TeamVecEnv) -> None:
     """Make an object one of ``kind`` as well, with what it has in it."""
     thing.__class__ = type(f"Present{type(thing).__name__}", (kind, type(thing)), {})
     thing.seat = seat

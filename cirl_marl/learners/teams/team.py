@@ -23,14 +23,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.algorithms import RESERVED, every_algorithm
-from cirl_marl.learners.learner import Learner, chosen, derived_seed
-from cirl_marl.learners.lockstep import Lockstep, Participant, World, wait
+from cirl_marl.learners.checkpoint import read_tree, write_tree
+from cirl_marl.learners.learner import Learner, derived_seed, predict_action
+from cirl_marl.learners.lockstep import Lockstep, Participant, Streams, World, global_streams_claimed, wait
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation
-from cirl_marl.learners.streams import Streams, global_streams_claimed
 from cirl_marl.learners.teams.copies import Copies, MakeEnv
-from cirl_marl.learners.teams.presence import TeamSeat, leave_out_absent
-from cirl_marl.learners.training import one_torch_thread
-from cirl_marl.learners.trees import read_tree, write_tree
+from cirl_marl.learners.teams.presence import TeamVecEnv, leave_out_absent
+from cirl_marl.learners.trainer import one_torch_thread
 
 Algorithm = Callable[..., BaseAlgorithm]
 """A class of Stable-Baselines3 or sb3-contrib, or one with parameters: ``functools.partial(PPO, n_steps=128)``."""
@@ -98,7 +97,7 @@ class Team:
         self._make_env, self._settings, self.seed = make_env, dict(settings), seed
         self._copies, self._log = copies, tensorboard_log
         self.agents = copies.agents
-        seats = {agent: TeamSeat(copies, agent, wait) for agent in copies.agents}
+        seats = {agent: TeamVecEnv(copies, agent, wait) for agent in copies.agents}
         seeds = [derived_seed(seed, "copies", i) for i in range(copies.num_envs)]
         self.world = World(copies, seeds, seats)
         self.learners: dict[str, Learner] = {}
@@ -151,7 +150,7 @@ class Team:
 
     def _participant(self, agent: str, steps: int, joint: int, callbacks: Mapping[str, BaseCallback]) -> Participant:
         learner, seat = self.learners[agent], self.world.seats[agent]
-        assert isinstance(seat, TeamSeat)
+        assert isinstance(seat, TeamVecEnv)
         missed = seat.missed_steps
         if self._log is not None:
             learner.model.set_logger(configure(str(Path(self._log) / agent), ["tensorboard"]))
@@ -183,7 +182,7 @@ class Team:
 
     def _played(self, copies: Copies, episodes: int, seed: int, deterministic: bool) -> dict[str, NDArray[np.floating]]:
         count = copies.num_envs
-        seats = {agent: TeamSeat(copies, agent, wait) for agent in self.agents}
+        seats = {agent: TeamVecEnv(copies, agent, wait) for agent in self.agents}
         seen = copies.reset(seed=[derived_seed(seed, "evaluation", i) for i in range(count)])
         starts = {agent: np.ones(count, dtype=bool) for agent in self.agents}
         memory: dict[str, Any] = dict.fromkeys(self.agents)
@@ -196,7 +195,7 @@ class Team:
                     rows: Any = seen[agent]
                     if isinstance(learner.env, VecNormalize):
                         rows = learner.env.normalize_obs(rows)
-                    actions[agent], memory[agent] = chosen(
+                    actions[agent], memory[agent] = predict_action(
                         learner.model, rows, memory[agent], starts[agent], seats[agent], deterministic=deterministic
                     )
             before = copies.present

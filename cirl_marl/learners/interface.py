@@ -12,17 +12,22 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
+from cirl_marl.learners.agent_env import AgentVecEnv
 from cirl_marl.learners.algorithms import has_replay_buffer
+from cirl_marl.learners.learner import Learner, load_acting_learner
+from cirl_marl.learners.lockstep import global_streams_claimed, wait
+from cirl_marl.learners.policies import Policies, Policy
 from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
-from cirl_marl.learners.run import RunConfig, RunDirectory
-from cirl_marl.learners.streams import global_streams_claimed
-from cirl_marl.learners.training import Progress, Training, run_together
+from cirl_marl.learners.run_directory import RunConfig, RunDirectory
+from cirl_marl.learners.trainer import Progress, Training, run_together
 from cirl_marl.network import Network
+from cirl_marl.records.files import published
 
 
 def train(
@@ -112,7 +117,7 @@ def _train(
 ) -> list[Training]:
     with ExitStack() as claims:
         claims.enter_context(global_streams_claimed())
-        trainings = [prepared(network, recipe, seed=seed, **options) for seed in seeds]
+        trainings = [prepare(network, recipe, seed=seed, **options) for seed in seeds]
         for training in trainings:
             training.check_callbacks(callbacks or {})
             training.stackable(callbacks or {})
@@ -124,7 +129,7 @@ def _train(
     return trainings
 
 
-def prepared(
+def prepare(
     network: str | Path | Network,
     recipe: str | Path | Recipe,
     *,
@@ -283,3 +288,85 @@ def _whole(name: str, value: object, least: int) -> int:
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
         raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
     return int(value)
+
+
+def complete_run(
+    directory: Path,
+    network: str | Path | Network,
+    recipe: Recipe,
+    *,
+    report: Callable[[Progress], None] | None = None,
+    checkpoint_every: float | None = None,
+    **options: Any,
+) -> RunDirectory:
+    """Return the complete run of a directory: trained from the beginning, from its last checkpoint, or not at all.
+
+    A run that is there is taken for the right one. The arguments are those of ``train``, and the bits do not depend on
+    where it was interrupted.
+    """
+    run = RunDirectory(directory)
+    how: dict[str, Any] = {"report": report, "checkpoint_every": checkpoint_every}
+    if not (directory / "config.json").is_file():
+        train(network, recipe, directory=directory, **how, **options)
+    elif run.status["state"] != "complete":
+        resume(directory, **how)
+    return run
+
+
+def export(run: str | Path | RunDirectory, folder: str | Path) -> list[Path]:
+    """Write the policies that a run has chosen as ``LEARNER.zip``, and normalisers as ``LEARNER.normaliser.pkl``.
+
+    ``stable_baselines3.PPO.load`` and ``VecNormalize.load`` read them, and run whatever code such files contain: load
+    only what you wrote yourself. Optimisers and replay buffers are not in them.
+
+    Raises:
+        RunError: if the run is incomplete, or ``folder`` exists and is no folder.
+    """
+    found = run if isinstance(run, RunDirectory) else RunDirectory(run)
+    if (target := Path(folder)).exists() and not target.is_dir():
+        raise RunError(f"{target}: is no folder")
+    env, written = found.make_env(found.config.envs), list[Path]()
+    with published(target) as partial:
+        for group in found.groups():
+            learner = Learner(
+                AgentVecEnv(env, group.name, group.view(env), wait), group.spec, found.config.seed
+            ).build()
+            learner.take(found.chosen).model.save(partial / f"{group.name}.zip")
+            written.append(target / f"{group.name}.zip")
+            if isinstance(learner.env, VecNormalize):
+                learner.env.save(str(partial / f"{group.name}.normaliser.pkl"))
+                written.append(target / f"{group.name}.normaliser.pkl")
+    return written
+
+
+class Trained(Policies):
+    """Acts by the policies of the checkpoint that a run has chosen.
+
+    ``checkpoint`` is the folder from which they were loaded; a run that is being trained has others later.
+    """
+
+    def __init__(self, run: str | Path | RunDirectory) -> None:
+        """Load every policy; a ``RunError`` if the run is incomplete or a file of it cannot be read."""
+        self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
+        self.checkpoint = folder = self.run.chosen
+        env = self.run.make_env(1)
+        self._seen = env.layout.names
+        policies: dict[str, Policy] = {}
+        for group in self.run.groups():
+            learner = load_acting_learner(folder, group, env)
+            normaliser = learner.env if isinstance(learner.env, VecNormalize) else None
+            policies[group.name] = Policy(learner.model, normaliser, learner.seat.view)
+        super().__init__(policies)
+
+    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
+        """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
+        if set(env.agents) != set(self._seen):
+            raise RunError(f"{self.run.path}: trained {sorted(self._seen)}, not {sorted(env.agents)}")
+        for agent, seen in self._seen.items():
+            if (shown := env.layout.names[agent]) != seen:
+                other = next((name for name in shown if name not in seen), f"{len(shown)} entries, not {len(seen)}")
+                raise RunError(
+                    f"{self.run.path}: '{agent}' learnt from other observations than this environment's ({other}); "
+                    "make the environment with the options of the run, as its make_env() does"
+                )
+        super().start(env, seed)

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.errors import RunError
-from cirl_marl.learners.seat import Handed, Seat
+from cirl_marl.learners.agent_env import AgentVecEnv, StepResult
 
-Played = tuple[NDArray[np.float32], Handed]
+LoggedStep = tuple[NDArray[np.float32], StepResult]
 """An action, and what was handed to the learner after it."""
 
 
-class Boundary:
+class CheckpointBarrier:
     """The boundaries of one learner.
 
     Attributes:
@@ -32,21 +32,21 @@ class Boundary:
         again: what is to be handed to it again.
     """
 
-    def __init__(self, seat: Seat) -> None:
+    def __init__(self, seat: AgentVecEnv) -> None:
         """Of the learner of ``seat``; ``keeps`` says how it is saved."""
         self._seat = seat
         self._write: Callable[[Path, dict[str, Any]], None] | None = None
         self._read: Callable[[], None] | None = None
         self._acting: Mapping[str, Any] | None = None
         self.folder: Path | None = None
-        self.noted: list[Played] | None = None
-        self.again: list[Played] = []
+        self.noted: list[LoggedStep] | None = None
+        self.again: list[LoggedStep] = []
 
     def keeps(self, write: Callable[[Path, dict[str, Any]], None]) -> None:
         """Have the state written by ``write``, which takes the folder and what else belongs to the state."""
         self._write = write
 
-    def begins_at(self, read: Callable[[], None], handed: Handed, acting: Mapping[str, Any] | None) -> None:
+    def begins_at(self, read: Callable[[], None], handed: StepResult, acting: Mapping[str, Any] | None) -> None:
         """Go on at the first boundary: ``read`` brings the learner into its state, ``handed`` is what it knew."""
 
         def back() -> None:

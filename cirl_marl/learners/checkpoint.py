@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
 from collections.abc import Iterator, Mapping
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -16,7 +20,90 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.errors import RunError
 from cirl_marl.learners.algorithms import RESERVED, parameters_of
-from cirl_marl.learners.trees import is_plain
+
+KIND = "__kind__"
+"""Key that says what a table stands for, if it is no table."""
+UNREADABLE = (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, SafetensorError)
+"""What damaged files, or those of something else, raise."""
+
+
+def write_tree(folder: Path, name: str, value: Any) -> None:
+    """Write tables, lists, tuples, numbers, texts, arrays and tensors, nested at will.
+
+    Raises:
+        TypeError: for anything else.
+    """
+    arrays: dict[str, np.ndarray[Any, Any]] = {}
+    told = json.dumps(_told(value, arrays, ()))
+    save_file(arrays, folder / f"{name}.safetensors")
+    (folder / f"{name}.json").write_text(told + "\n")
+
+
+def read_tree(folder: Path, name: str) -> Any:
+    """Return what ``write_tree`` wrote; a ``RunError`` names a file that is missing or says something else."""
+    path = folder / f"{name}.safetensors"
+    try:
+        arrays = load_file(path)
+        path = folder / f"{name}.json"
+        return _meant(json.loads(path.read_text()), arrays)
+    except UNREADABLE as error:
+        raise RunError(f"{path}: cannot be read: {error}") from error
+
+
+def is_plain(value: object) -> bool:
+    """Return whether a value can be written; tensors only if nothing is learnt about them."""
+    if isinstance(value, torch.Tensor):
+        return not value.requires_grad
+    if isinstance(value, Mapping):
+        return all(isinstance(key, str) and is_plain(each) for key, each in value.items())
+    if isinstance(value, deque | tuple | list):
+        return all(map(is_plain, value))
+    return value is None or isinstance(value, bool | int | float | str | np.generic | np.ndarray)
+
+
+def _told(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: tuple[object, ...]) -> Any:
+    """Return what stands for a value in JSON; arrays are gathered by the names on their paths."""
+    if isinstance(value, torch.Tensor):
+        return {KIND: "tensor", "is": _told(value.detach().cpu().numpy(), arrays, path)}
+    if isinstance(value, np.ndarray):
+        key = ".".join(map(str, path))
+        key = f"{key}#{len(arrays)}" if key in arrays else key
+        arrays[key] = np.array(value, order="C")
+        return {KIND: "array", "is": key}
+    if isinstance(value, Mapping):
+        if all(isinstance(key, str) and key != KIND for key in value):
+            return {key: _told(each, arrays, (*path, key)) for key, each in value.items()}
+        told = [[_told(key, arrays, path), _told(each, arrays, (*path, key))] for key, each in value.items()]
+        return {KIND: "table", "is": told}
+    if isinstance(value, tuple | list | deque):
+        items = [_told(each, arrays, (*path, place)) for place, each in enumerate(value)]
+        return {KIND: "tuple", "is": items} if isinstance(value, tuple) else items
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"a {type(value).__name__} cannot be kept")
+
+
+def _meant(told: Any, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Any:
+    if isinstance(told, list):
+        return [_meant(each, arrays) for each in told]
+    if not isinstance(told, dict):
+        return told
+    if KIND not in told:
+        return {key: _meant(each, arrays) for key, each in told.items()}
+    inside = told["is"]
+    match told[KIND]:
+        case "array":
+            return np.array(arrays[inside])  # its own, to be written to
+        case "tensor":
+            return torch.from_numpy(_meant(inside, arrays))
+        case "table":
+            return {_meant(key, arrays): _meant(each, arrays) for key, each in inside}
+        case "tuple":
+            return tuple(_meant(each, arrays) for each in inside)
+    raise ValueError(f"unknown kind {told[KIND]!r}")
+
 
 MATRICES = ("exploration_mat", "exploration_matrices")
 """Noise that depends on the state, drawn at the beginning of a rollout."""
@@ -109,7 +196,7 @@ def set_normaliser_state(env: VecNormalize, state: Mapping[str, Any], *, returns
         env.returns = _array(state["returns"])
 
 
-class Settled(RunningMeanStd):
+class FrozenStatistics(RunningMeanStd):
     """Statistics that no longer follow what is seen."""
 
     def __init__(self, known: RunningMeanStd) -> None:
@@ -121,10 +208,14 @@ class Settled(RunningMeanStd):
         """Do nothing."""
 
 
-def settle(env: VecNormalize) -> None:
+def freeze_statistics(env: VecNormalize) -> None:
     """Let the statistics of observations stay as they are."""
     known: Any = env.obs_rms
-    settled = {key: Settled(each) for key, each in known.items()} if isinstance(known, dict) else Settled(known)
+    settled = (
+        {key: FrozenStatistics(each) for key, each in known.items()}
+        if isinstance(known, dict)
+        else FrozenStatistics(known)
+    )
     env.obs_rms = settled  # type: ignore[assignment]
 
 

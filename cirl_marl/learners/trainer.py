@@ -23,18 +23,16 @@ from stable_baselines3.common.vec_env import VecNormalize
 from cirl_marl.environments.rewards import WEIGHED
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
+from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
-from cirl_marl.learners.lockstep import Interrupted, Lockstep, NetworkWorld, Participant, wait
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingInterrupted, wait
 from cirl_marl.learners.policies import Policies, Policy
-from cirl_marl.learners.price import FIRST, ServicePrice
-from cirl_marl.learners.run import EvaluationsFile, MetricsFile, RunConfig, RunDirectory, steps_of
-from cirl_marl.learners.selection import Score, Selection, score_of
+from cirl_marl.learners.run_directory import EvaluationsFile, MetricsFile, RunConfig, RunDirectory, steps_of
 from cirl_marl.learners.stacked.conditions import first_obstacle, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.start import begin_again, begin_from
-from cirl_marl.learners.streams import Streams
-from cirl_marl.learners.trees import read_tree, write_tree
+from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, ValidationEpisodes, score_of
 
 CHECKPOINTS = 10
 """Checkpoints of a run, evenly spaced."""
@@ -120,10 +118,10 @@ class Training:
             self.world.go_on(self._told["world"])
         self._price = self._priced(checkpoint)
         asked = config.recipe.run
-        self._evaluation: Selection | None = None
+        self._evaluation: ValidationEpisodes | None = None
         if asked.evaluations:
             own = MultiAgentVectorEnv(env.network, num_envs=asked.episodes, agents=env.agents, **config.options)
-            self._evaluation = Selection(own)
+            self._evaluation = ValidationEpisodes(own)
         self._evaluated = -1
         self._saving: Path | None = None
         self._stacked: Container[str] = ()
@@ -132,7 +130,7 @@ class Training:
         self._every = self._asked_every or None
         self._appoint_demonstrators()
 
-    def _priced(self, checkpoint: Path | None) -> ServicePrice | None:
+    def _priced(self, checkpoint: Path | None) -> ServiceMultiplier | None:
         """Return the price of service if it moves; a resumed one goes on."""
         asked = self.config.recipe.run
         if not asked.price_rate or asked.min_service is None or not self.env.network.services:
@@ -142,7 +140,7 @@ class Training:
                 f"recipe '{self.config.recipe.name}': run.price_rate: reward '{self.env.reward_mode}' has no price of "
                 f"service that could move; choose {', '.join(WEIGHED)}, or a price_rate of 0"
             )
-        price = ServicePrice(self.env, asked.min_service, asked.price_rate, asked.price_damping)
+        price = ServiceMultiplier(self.env, asked.min_service, asked.price_rate, asked.price_damping)
         if checkpoint is not None:
             price.load(checkpoint)
         return price
@@ -302,7 +300,7 @@ class Training:
         learner.write_state(folder, more, stacked=learner.name in self._stacked)
         self._spent += time.perf_counter() - began
 
-    def _evaluate(self, evaluation: Selection) -> None:
+    def _evaluate(self, evaluation: ValidationEpisodes) -> None:
         """Play its episodes by the policies of now, keep these if they are the best so far, and move the price."""
         self._bring_up_to_date()
         policies = {
@@ -319,7 +317,7 @@ class Training:
         if self._evaluations is not None:
             figures = score.said() | {"circularity_weight": self.env.circularity_weight}
             self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
-        if self._price is not None and self.joint_steps * self.config.envs >= FIRST * self.config.steps:
+        if self._price is not None and self.joint_steps * self.config.envs >= MULTIPLIER_FROM * self.config.steps:
             self._price.heed(score.assured)
 
     @property
@@ -384,7 +382,7 @@ def run_together(
             lockstep.run(hooks, partial(_keep, trainings, lockstep, interrupted))
             for training in trainings:
                 training.finish()
-    except Interrupted:
+    except TrainingInterrupted:
         for training in trainings:
             training.stop("interrupted", "stopped by the user")
         raise KeyboardInterrupt from None
@@ -402,11 +400,11 @@ def _keep(trainings: Sequence[Training], lockstep: Lockstep, interrupted: Callab
     """Ask for checkpoints when it is time, or when somebody wants to stop, and write those that are complete.
 
     Raises:
-        Interrupted: when everything is written, or if somebody who is shown what to do cannot be saved.
+        TrainingInterrupted: when everything is written, or if somebody who is shown what to do cannot be saved.
     """
     stopping = interrupted()
     if stopping and (lockstep.busy or all(training.run is None for training in trainings)):
-        raise Interrupted
+        raise TrainingInterrupted
     if stopping or (any(training.due for training in trainings) and not lockstep.busy):
         for training in trainings:
             training.ask()
@@ -414,7 +412,7 @@ def _keep(trainings: Sequence[Training], lockstep: Lockstep, interrupted: Callab
         for training in trainings:
             training.keep("interrupted" if stopping else "running")
         if stopping:
-            raise Interrupted
+            raise TrainingInterrupted
 
 
 def _participants(

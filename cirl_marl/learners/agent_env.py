@@ -39,7 +39,7 @@ class JointEnv(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Handed:
+class StepResult:
     """What a learner is handed after a joint step, one row for each row of its view.
 
     Attributes:
@@ -65,7 +65,7 @@ class Handed:
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
 
-_NOTHING = Handed(np.zeros(0), np.zeros(0, dtype=np.float32), np.zeros(0, dtype=bool))
+_NO_STEP = StepResult(np.zeros(0), np.zeros(0, dtype=np.float32), np.zeros(0, dtype=bool))
 """Before the joint environment is reset."""
 
 
@@ -94,7 +94,7 @@ class JointStep:
     infos: Infos
 
 
-class CopyView:
+class AgentInNetworkCopy:
     """One copy of the environment, as an agent if a row is one's: what ``env_method`` and ``get_attr`` reach.
 
     Attributes that it lacks are those of the joint environment.
@@ -120,7 +120,7 @@ class CopyView:
         return float(self.env.local_rewards()[str(self.agent)][self.index])
 
 
-class Seat(VecEnv):
+class AgentVecEnv(VecEnv):
     """The B copies of the joint environment as one learner sees them.
 
     Time limits reach the learner as Stable-Baselines3 expects them: ``done`` with ``TimeLimit.truncated`` (unless
@@ -135,14 +135,19 @@ class Seat(VecEnv):
     """
 
     def __init__(
-        self, env: JointEnv, name: str, view: View, wait: Callable[[], object], row: Callable[..., Any] = CopyView
+        self,
+        env: JointEnv,
+        name: str,
+        view: View,
+        wait: Callable[[], object],
+        row: Callable[..., Any] = AgentInNetworkCopy,
     ) -> None:
         """Seat the learner ``name``; ``wait`` returns when every learner has acted and the environment has moved.
 
         ``row`` returns what attributes of a row are those of, from the environment, the copy and the agent.
         """
         self.name, self.view, self.copies = name, view, env.num_envs
-        self.handed: Handed = _NOTHING
+        self.handed: StepResult = _NO_STEP
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
         self.views = [row(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
@@ -158,7 +163,7 @@ class Seat(VecEnv):
         """Show the first observation after a reset of the joint environment."""
         rows = self.num_envs
         seen = _rows_in_order(self.view.observe(observations, state))
-        self.handed = Handed(seen, np.zeros(rows, dtype=np.float32), np.ones(rows, dtype=bool))
+        self.handed = StepResult(seen, np.zeros(rows, dtype=np.float32), np.ones(rows, dtype=bool))
 
     @property
     def absent(self) -> bool:
@@ -172,13 +177,13 @@ class Seat(VecEnv):
         rewards = self.view.score(step.rewards).astype(np.float32)
         ended = np.concatenate([step.ended[agent] for agent in rows])
         if not ended.any():
-            self.handed = Handed(seen, rewards, ended)
+            self.handed = StepResult(seen, rewards, ended)
             return
         last = {agent: step.infos[agent]["final_observation"] for agent in agents}
         final = _rows_in_order(self.view.observe(last, lambda: step.infos[agents[0]]["final_state"]))
         returns, lengths = self.view.score(step.returns), np.concatenate([step.lengths[agent] for agent in rows])
         truncated = np.concatenate([step.truncated[agent] for agent in rows])
-        self.handed = Handed(seen, rewards, ended, final, returns, lengths, truncated)
+        self.handed = StepResult(seen, rewards, ended, final, returns, lengths, truncated)
 
     def paid(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Return the reward of each row, and whether its episode ended; arrays of its own, which PPO adds to."""
@@ -186,7 +191,7 @@ class Seat(VecEnv):
 
     def reset(self) -> VecEnvObs:
         """Return the current observation of every copy."""
-        if self.handed is _NOTHING:
+        if self.handed is _NO_STEP:
             raise CirlError(f"the seat of {self.title} has no observation: the joint environment is not reset")
         return self.handed.seen
 
@@ -236,7 +241,7 @@ class Seat(VecEnv):
         """Return False for each row: no Gymnasium wrapper is involved."""
         return [False for _ in self._chosen(indices)]
 
-    def _chosen(self, indices: int | Iterable[int] | None) -> list[CopyView]:
+    def _chosen(self, indices: int | Iterable[int] | None) -> list[AgentInNetworkCopy]:
         return [self.views[i] for i in self._get_indices(indices)]
 
 
