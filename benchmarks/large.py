@@ -22,7 +22,7 @@ from benchmarks.document import markdown_table, write_sections
 from benchmarks.generated import yearly_network
 from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.maximise import starting_stocks
+from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import solve
 

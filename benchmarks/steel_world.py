@@ -27,7 +27,7 @@ from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import achieved, bound, improved
-from cirl_marl.optimum.plan import Plan, Planned
+from cirl_marl.optimum.plans import HasPlan, Plan
 from cirl_marl.records.files import write_table
 
 GOODS = ("ore", "pig_iron", "dri", "scrap", "semis", "long", "flat", "goods")
@@ -173,7 +173,7 @@ class _Part:
     actions: Annotated[Floats, "normalised, shape (steps, entries)"]
 
 
-def gain_lines(plan: Planned) -> Iterator[str]:
+def gain_lines(plan: HasPlan) -> Iterator[str]:
     """Yield the table of what the plan gains where one kind of agent, or one country, keeps to it, or all but these."""
     network = plan.network
     kinds = {agent: next(r for r in network.copies if agent.startswith(f"{r}_")) for agent in plan.agents}
@@ -205,7 +205,7 @@ def gain_lines(plan: Planned) -> Iterator[str]:
         yield f"| {name} | {gains[i]:+.1f} | {service[i]:.4f} | {gains[i + 1]:+.1f} |"
 
 
-def planned() -> tuple[Planned, Iterator[str]]:
+def planned() -> tuple[HasPlan, Iterator[str]]:
     """Return the plan of the world at full service, and the table that says how good it is."""
     begun = time.process_time()
     found = bound(load_network(ENVS / "steel_world.toml"), min_service=1.0, degree=DEGREE)

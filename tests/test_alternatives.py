@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from cirl_marl import CirlError, MultiAgentVectorEnv, cli
 from cirl_marl.controllers.rollout import Rollout, beginning, rollout
 from cirl_marl.evaluation.simulations import ComparedQuantity, Simulation, rank_quantities, simulate_alternatives
-from cirl_marl.optimum.named import named_controller
+from cirl_marl.optimum.registry import named_controller
 from cirl_marl.report import alternatives as report
 from cirl_marl.report import trajectory
 

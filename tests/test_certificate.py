@@ -11,8 +11,8 @@ from scipy import sparse
 from cirl_marl import CirlError, Network, load_network
 from cirl_marl.optimum import Certificate, achieved, bound
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.certificate import verified
-from cirl_marl.optimum.maximise import starting_stocks
+from cirl_marl.optimum.certificate import verify
+from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import solve
 
@@ -33,7 +33,7 @@ def test_multipliers_of_an_over_constrained_program_prove_nothing_false(name: st
     scale = abs(reached)
     trusting = _if_signs_were_trusted(problem, multipliers)
     assert wrong > 0 and trusting < reached - 0.1 * scale, "the multipliers are no temptation"
-    proof = verified(problem, multipliers, best.solution)
+    proof = verify(problem, multipliers, best.solution)
     assert proof.bound >= reached - 1e-9 * scale
     assert proof.bound >= best.verify().objective - 1e-6 * scale
     assert proof.infeasibility == wrong

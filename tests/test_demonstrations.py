@@ -25,7 +25,7 @@ from cirl_marl.learners.demonstrations import demonstrate, in_copies
 from cirl_marl.learners.learner import derived_seed
 from cirl_marl.learners.recipe import Demonstrations
 from cirl_marl.learners.views import View
-from cirl_marl.optimum.named import CONTROLLERS, named_controller
+from cirl_marl.optimum.registry import CONTROLLERS, named_controller
 from cirl_marl.paper.published import ENVIRONMENTS
 from cirl_marl.paper.results import PaperRow
 from cirl_marl.paper.training import train_tuned

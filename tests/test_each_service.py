@@ -32,9 +32,9 @@ from cirl_marl.evaluation import compare, solve_baseline
 from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.optimum import Plan, achieved, bound, envelope, improved, search
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.controller import Optimum
-from cirl_marl.optimum.maximise import highest_service, starting_stocks
-from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.bounds import highest_service
+from cirl_marl.optimum.mpc import MPC, Optimum
+from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Programs
 
 Levels = float | list[float]

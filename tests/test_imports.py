@@ -61,7 +61,7 @@ def test_imports_go_one_way() -> None:
     [
         ("errors", "from cirl_marl.network import Network"),
         ("network/units", "if TYPE_CHECKING:\n    from cirl_marl.dynamics.motion import Dynamics"),
-        ("optimum/layout", "def late():\n    from cirl_marl.optimum import bound"),
+        ("optimum/matrices", "def late():\n    from cirl_marl.optimum import bound"),
     ],
 )
 def test_a_planted_circle_is_found(tmp_path: Path, module: str, line: str) -> None:
@@ -75,7 +75,7 @@ def test_a_planted_circle_is_found(tmp_path: Path, module: str, line: str) -> No
     graph = arrows(modules(tmp_path))
     assert circles(graph)
     assert "none" not in "\n".join(drawing(tmp_path)).split("circles of modules")[1].splitlines()[0]
-    if module != "optimum/layout":
+    if module != "optimum/matrices":
         assert wrong_way(graph)
 
 

@@ -9,9 +9,9 @@ import pytest
 from scipy import sparse
 
 from cirl_marl import load_network
-from cirl_marl.optimum import achieved, bound, improve, improved, program, routes, solver
+from cirl_marl.optimum import achieved, bound, improve, improved, program, reach, solver
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.merit import merit, prices
+from cirl_marl.optimum.improve import penalised_objective, prices
 
 
 @pytest.mark.parametrize(("scenario", "merged"), [(None, False), ("longer_lives", True)])
@@ -44,7 +44,7 @@ def test_least_arrivals_are_below_those_of_the_inverse() -> None:
         shares = random.dirichlet(np.ones(6), size=6)
         passed, arriving = kept * shares, (1 - kept) * random.dirichlet(np.ones(2), size=6)
         visits = np.full(6, 1 / (1 - kept))
-        found = routes._least(sparse.csc_array(passed), arriving, visits)
+        found = reach._least(sparse.csc_array(passed), arriving, visits)
         # all arrives somewhere, so that both stocks together get 1
         assert (found.sum(axis=1) <= 1.0).all()
         assert found.sum(axis=1) == pytest.approx(np.ones(6), abs=1e-7)
@@ -55,7 +55,7 @@ def test_hipo_proves_the_bound_that_the_others_prove(monkeypatch: pytest.MonkeyP
     """A large program is solved by HiPO, whose multipliers prove as much."""
     pytest.importorskip("highspy_extras")
     usual = bound("copper_net", min_service=0.9, degree=1, horizon=40)
-    monkeypatch.setattr(solver, "MANY", 0)
+    monkeypatch.setattr(solver, "LARGE_PROGRAM", 0)
     tried, run = list[solver.HighsOptions | None](), solver._Scaled.run
 
     def noted(scaled: Any, options: solver.HighsOptions | None, basis: Any, **others: Any) -> Any:
@@ -64,18 +64,18 @@ def test_hipo_proves_the_bound_that_the_others_prove(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(solver._Scaled, "run", noted)
     found = bound("copper_net", min_service=0.9, degree=1, horizon=40)
-    assert tried == [solver.FACTORED[0]]
+    assert tried == [solver.LARGE_SETTINGS[0]]
     assert found.basis is None
     assert found.verify().bound == pytest.approx(usual.objective, rel=solver.NEAR)
 
 
 def test_without_hipo_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     """The other interior points are tried for an hour; an error then names the extra."""
-    hurried = ({**solver.FACTORED[0]}, {**solver.FACTORED[1], "time_limit": 0.0})
-    monkeypatch.setattr(solver, "MANY", 0)
-    monkeypatch.setattr(solver, "FACTORED", hurried)
+    hurried = ({**solver.LARGE_SETTINGS[0]}, {**solver.LARGE_SETTINGS[1], "time_limit": 0.0})
+    monkeypatch.setattr(solver, "LARGE_PROGRAM", 0)
+    monkeypatch.setattr(solver, "LARGE_SETTINGS", hurried)
     monkeypatch.setattr(solver, "find_spec", lambda name: None)
-    with pytest.raises(solver.Unsolved, match=r"'copper_net'.*pip install 'cirl-marl\[large\]'"):
+    with pytest.raises(solver.SolverFailure, match=r"'copper_net'.*pip install 'cirl-marl\[large\]'"):
         bound("copper_net", min_service=0.9, degree=1, horizon=40)
 
 
@@ -91,4 +91,4 @@ def test_plans_of_large_networks_make_up_for_what_lacked(monkeypatch: pytest.Mon
     lacking = [1.0 - float(run.episode_levels.min()) for run in (before, after)]
     assert lacking[0] > 5e-4 and lacking[1] < 1e-4
     charged = prices(found)
-    assert merit(found, after, charged) > merit(found, before, charged)
+    assert penalised_objective(found, after, charged) > penalised_objective(found, before, charged)

@@ -19,9 +19,9 @@ from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.lifetimes import chain_of
 from cirl_marl.optimum import achieved, bound, envelope, improved
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import by_stage
 from cirl_marl.optimum.kernels import Kernel
 from cirl_marl.optimum.mpc import MPC
+from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
 
 Floats = NDArray[np.floating]

@@ -35,10 +35,10 @@ from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.network.elements import FIXED
 from cirl_marl.network.series import Series
-from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, held, improved
+from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, improved, reach
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.certificate import verified
-from cirl_marl.optimum.maximise import starting_stocks
+from cirl_marl.optimum.certificate import verify
+from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.reach import ComparisonSystem
 from cirl_marl.optimum.solver import solve
@@ -305,7 +305,7 @@ def test_controls_held_to_first_order_lie_below_the_bound() -> None:
     """Rows that hold the controls within an interval can only lower the optimum, and neutral control satisfies them."""
     admissible = Admissible.of(load_network("copper_net").with_options(episode={"horizon": 8}))
     start = starting_stocks(admissible.network, None)
-    free, held = (Programs(admissible, 2, None, held=each).program(start) for each in (False, True))
+    free, held = (Programs(admissible, 2, None, hold_controls=each).program(start) for each in (False, True))
     best, planned = (-float(problem.cost @ solve(problem).plan) for problem in (free, held))
     neutral = rollout(MultiAgentVectorEnv("copper_net", num_envs=1, horizon=8), Neutral()).episode_circularity[0]
     assert neutral < planned <= best + 1e-9
@@ -343,7 +343,7 @@ def test_any_multipliers_prove_a_bound(network: Network, seed: int, size: float)
     other = Certificate(
         equal=size * equal + rng.normal(size=len(equal)) * size, under=size * under + rng.normal(size=len(under)) * size
     )
-    weaker = verified(found.problem, other, found.solution)
+    weaker = verify(found.problem, other, found.solution)
     assert weaker.bound >= proof.objective - 1e-6 * scale
     assert weaker.infeasibility == pytest.approx(max(0.0, other.under.max(initial=0.0)))
 
@@ -501,7 +501,7 @@ def test_large_networks_are_reached_by_the_same_formula(network: Network, interv
     start, when = starting_stocks(network, None), range(network.episode.horizon)
     small = ComparisonSystem(Admissible.of(network)).reach(start, when)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(held, "DENSE", 0)
+        patch.setattr(reach, "DENSE", 0)
         large = ComparisonSystem(Admissible.of(network)).reach(start, when)
     np.testing.assert_allclose(large.upper, small.upper, rtol=1e-9, atol=1e-11 * start.sum())
     np.testing.assert_array_equal(large.uncut, small.uncut)
@@ -512,12 +512,12 @@ def test_the_series_is_cut_where_it_says() -> None:
     rng = np.random.default_rng(1)
     matrix = sparse.random_array((40, 40), density=0.2, rng=rng) - sparse.diags_array(rng.uniform(0, 3, 40))
     state, constant = rng.uniform(0, 1, (2, 40))
-    exact, _ = held.Held(matrix, 0.7)(state, constant)
+    exact, _ = reach.ZeroOrderHold(matrix, 0.7)(state, constant)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(held, "DENSE", 0)
+        patch.setattr(reach, "DENSE", 0)
         for neglected in (1e-3, 1e-6, 1e-9):
-            patch.setattr(held, "NEGLECTED", neglected)
-            found, missed = held.Held(matrix, 0.7)(state, constant)
+            patch.setattr(reach, "TRUNCATION", neglected)
+            found, missed = reach.ZeroOrderHold(matrix, 0.7)(state, constant)
             assert 0 < np.abs(found - exact).max() <= missed <= 40 * neglected * 10
 
 

@@ -20,7 +20,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
 from cirl_marl.optimum import NoCertificate, Plan, achieved, bound, improved, program, search, solver
 from cirl_marl.optimum.mpc import MPC
-from cirl_marl.optimum.population import starting_states
+from cirl_marl.optimum.plans import starting_states
 
 KILOTONNES = {"kg": 1e6, "kt": 1.0, "Gt": 1e-6}
 
@@ -146,7 +146,7 @@ def test_mpc_goes_on_where_a_plan_is_missing(monkeypatch: pytest.MonkeyPatch) ->
         nonlocal asked
         asked += 1
         if asked == 2:
-            raise solver.Unsolved("here")
+            raise solver.SolverFailure("here")
         return solve(self, *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(MPC, "_solved", hindered)

@@ -17,7 +17,7 @@ from cirl_marl import Arc, Network, Service, load_network
 from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum import Bound, NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import by_stage
+from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import solve
 from cirl_marl.reasons.prices import shadow_prices, with_bound

@@ -35,7 +35,7 @@ from cirl_marl.network.series import Series
 from cirl_marl.network.splits import splits
 from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout
+from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import solve
 
@@ -200,7 +200,7 @@ def assert_holds(played: Played, degree: int, weight: float | None = None, merge
         NoCertificate: if recipients may empty their donors from the start.
     """
     network, steps = played.network, played.network.episode.horizon
-    programs = Programs(Admissible.of(network, played.agents or None), degree, weight, merged=merged)
+    programs = Programs(Admissible.of(network, played.agents or None), degree, weight, merge_pieces=merged)
     layout, mass = programs.layout, float(played.start.sum())
     if len(played.intervals[0].pieces) % layout.pieces:
         return  # the oracle's means are over whole substeps
@@ -487,7 +487,7 @@ def test_fast_stocks_and_strong_loops(hoarded: float, merged: bool, style: str) 
     for degree in (1, 3):
         played = play(cycle(hoarded=hoarded), rng, style)
         assert_holds(played, degree, None, merged)
-    layout = Programs(Admissible.of(played.network), 1, None, merged=merged).layout
+    layout = Programs(Admissible.of(played.network), 1, None, merge_pieces=merged).layout
     assert layout.pieces == (1 if merged else 24)
 
 
@@ -495,7 +495,7 @@ def test_merged_pieces_are_as_tight() -> None:
     """One piece for an interval of 24 substeps proves nearly what 24 pieces prove, with a tenth of the variables."""
     admissible = Admissible.of(cycle(hoarded=500.0))
     start = admissible.network.initial.mean(axis=0)
-    fine, merged = (Programs(admissible, 2, None, merged=each).program(start, 0.8) for each in (False, True))
+    fine, merged = (Programs(admissible, 2, None, merge_pieces=each).program(start, 0.8) for each in (False, True))
     proved = [-float(problem.cost @ solve(problem).plan) for problem in (fine, merged)]
     assert len(merged.cost) < 0.1 * len(fine.cost)
     assert proved[1] == pytest.approx(proved[0], rel=0.05)

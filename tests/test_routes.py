@@ -15,7 +15,7 @@ from cirl_marl import Law, Network
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.dynamics.passes import Passes
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.routes import RouteBounds
+from cirl_marl.optimum.reach import RouteBounds
 
 
 @given(network=plain_networks, seed=st.integers(0, 1000))

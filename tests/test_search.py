@@ -13,10 +13,9 @@ from cirl_marl import Arc, CirlError, ControlError, MultiAgentVectorEnv, Network
 from cirl_marl.controllers import Neutral, Random
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.optimum import Incumbent, Plan, bound, search, search_each, standard_candidates
-from cirl_marl.optimum.controller import Optimum
-from cirl_marl.optimum.cross_entropy import SHORTFALL_PRICE
-from cirl_marl.optimum.gaussians import Gaussians, stages
-from cirl_marl.optimum.population import Population, starting_states
+from cirl_marl.optimum.cross_entropy import SHORTFALL_PRICE, Gaussians, knot_counts
+from cirl_marl.optimum.mpc import Optimum
+from cirl_marl.optimum.plans import Population, starting_states
 
 EVERYWHERE = PLAYED
 
@@ -118,7 +117,7 @@ def test_starts_by_name() -> None:
 
 def test_optimum_control_searches_where_nothing_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each copy of net_zero follows the plan found from its own start, and the controller says that it is no more."""
-    monkeypatch.setattr("cirl_marl.optimum.controller.search_each", partial(search_each, population=8, iterations=2))
+    monkeypatch.setattr("cirl_marl.optimum.mpc.search_each", partial(search_each, population=8, iterations=2))
     controller = Optimum(service_weight=1.0)
     run = rollout(MultiAgentVectorEnv("net_zero", num_envs=2, horizon=3), controller)
     assert controller.note.startswith("best plan found, no certificate: network 'net_zero'")
@@ -164,7 +163,7 @@ def test_method_finds_the_top_of_a_parabola() -> None:
 
     gaussians = Gaussians(merit(np.zeros((1, 1, 1, 2)))[:, 0], 64, 2, seed=0)
     best = -np.inf
-    for knots in stages(8, 80):
+    for knots in knot_counts(8, 80):
         gaussians.refine(knots)
         drawn = gaussians.draw()
         gaussians.learn(merit(drawn), drawn)

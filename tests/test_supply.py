@@ -36,9 +36,9 @@ from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import achieved, bound, improved
 from cirl_marl.optimum.admissible import Admissible
+from cirl_marl.optimum.constraints import idle_supplies
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.reach import Reach
-from cirl_marl.optimum.supplies import supplies
 
 Floats = NDArray[np.floating]
 EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
@@ -306,13 +306,13 @@ def test_supplies_keep_the_proportions_that_the_program_knows(
     network = replace(town((weight, 1 - weight), high), acting=("import",))
     nodes = tuple(replace(node, initial=(ore, ore)) if node.id == "ore_a" else node for node in network.nodes)
     network = replace(network, nodes=nodes)
-    programs = Programs(Admissible.of(network, ("import",)), 2, None, merged=merged)
+    programs = Programs(Admissible.of(network, ("import",)), 2, None, merge_pieces=merged)
     layout, planned, steps = programs.layout, programs.admissible.network, network.episode.horizon
     mines = [planned.arc_index[each] for each in ("mine_a", "mine_b")]
     uncut = np.ones((steps, len(planned.arcs)), dtype=bool)
     uncut[:, mines[0]] = ore > 1e3
     reached = Reach(np.zeros((steps, len(planned.nodes))), uncut, np.zeros(steps))
-    rows, limits = supplies(programs.admissible, reached, layout, range(steps))
+    rows, limits = idle_supplies(programs.admissible, reached, layout, range(steps))
     played = np.random.default_rng(seed).uniform(-1, 1, (steps, 1, 1))
     env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed)

@@ -24,7 +24,7 @@ from cirl_marl.cli.common import (
 )
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.jobs import PLACES
-from cirl_marl.optimum.named import CONTROLLERS
+from cirl_marl.optimum.registry import CONTROLLERS
 
 
 @app.command(rich_help_panel=COMPARING)

@@ -34,7 +34,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.figures import time_window
 from cirl_marl.evaluation.simulations import Simulation, rank_quantities, simulate_alternatives
 from cirl_marl.network import Network
-from cirl_marl.optimum.named import CONTROLLERS, SETTABLE, named_controller
+from cirl_marl.optimum.registry import CONTROLLERS, SETTABLE, named_controller
 
 
 @app.command(rich_help_panel=EPISODES)

@@ -140,7 +140,7 @@ def compare(
 
     Args:
         runs: training runs of one environment.
-        controllers: names of controllers, see ``optimum.named``.
+        controllers: names of controllers, see ``optimum.registry``.
         network: catalogue name, definition file or network; None is that of the first run.
         scenario: of ``network``; None is the default.
         episodes: at least 2.

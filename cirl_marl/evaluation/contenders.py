@@ -14,7 +14,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
-from cirl_marl.optimum.named import CONTROLLERS, named_controller
+from cirl_marl.optimum.registry import CONTROLLERS, named_controller
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from cirl_marl.jobs import Standing, Tell, check_place, raise_first, run_jobs
 from cirl_marl.learners import Recipe, RunDirectory, load_recipe
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, improved
-from cirl_marl.optimum.maximise import highest_service
+from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.optimum.mpc import SERVICE_FIRST
 
 WEIGHED = ("mixed", "mixed_difference", "team")

@@ -13,7 +13,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
-from cirl_marl.optimum.named import named_controller
+from cirl_marl.optimum.registry import named_controller
 
 FEWEST = 70
 """SampledEpisodes from which on shares of the spread are told."""

@@ -19,7 +19,7 @@ from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
 from cirl_marl.optimum.bounds import relative
-from cirl_marl.optimum.named import SETTABLE, named_controller
+from cirl_marl.optimum.registry import SETTABLE, named_controller
 
 ROUND_OFF = 1e-12
 """Share of the largest value of its kind by which a quantity may differ and yet count as the same."""
@@ -125,7 +125,7 @@ def simulate_alternatives(
     envs = [MultiAgentVectorEnv(network, num_envs=1, scenario=scenario, horizon=steps) for scenario in scenarios]
     _refuse(envs, controls, held)
     cases = list(product(envs, controls))
-    controllers = [named_controller(control, held=held if control in SETTABLE else None) for _, control in cases]
+    controllers = [named_controller(control, constants=held if control in SETTABLE else None) for _, control in cases]
     simulated = []
     for i, ((env, control), controller) in enumerate(zip(cases, controllers, strict=True)):
         choices = ((env.network.scenario_name, envs), (control, controls))

@@ -30,7 +30,7 @@ from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.environments.state import State
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError
-from cirl_marl.optimum.named import named_controller
+from cirl_marl.optimum.registry import named_controller
 
 Act = Callable[[], NDArray[np.float32]]
 """Returns what the controller does now, a row for each row of the learner's environment."""

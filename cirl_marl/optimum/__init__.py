@@ -1,12 +1,11 @@
 """The best achievable circularity: a proven upper bound, its certificate, its plan, and the best plan found."""
 
 from cirl_marl.optimum.admissible import NoCertificate
-from cirl_marl.optimum.bounds import Bound, Envelope, gap
+from cirl_marl.optimum.bounds import Bound, Envelope, bound, envelope, gap
 from cirl_marl.optimum.certificate import Certificate, Verification
 from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, standard_candidates
 from cirl_marl.optimum.improve import improved
-from cirl_marl.optimum.maximise import bound, envelope
-from cirl_marl.optimum.plan import Plan, achieved
+from cirl_marl.optimum.plans import Plan, achieved
 
 __all__ = [
     "Bound",

@@ -46,7 +46,7 @@ class Certificate:
     under: Floats
 
 
-def verified(problem: Program, certificate: Certificate, plan: Floats) -> Verification:
+def verify(problem: Program, certificate: Certificate, plan: Floats) -> Verification:
     """Compute the bound that the multipliers prove, without a solver.
 
     For every v that satisfies the program and any y and μ ≤ 0::
@@ -76,7 +76,7 @@ def verified(problem: Program, certificate: Certificate, plan: Floats) -> Verifi
     )
 
 
-def proved(problem: Program, certificate: Certificate) -> float:
+def dual_bound(problem: Program, certificate: Certificate) -> float:
     """Return the bound of ``verified`` alone."""
     return _proved(problem, certificate)[0]
 

@@ -27,19 +27,24 @@ from cirl_marl.controllers.scripted import Scripted
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.optimum.bounds import demanded_levels
-from cirl_marl.optimum.gaussians import Gaussians, stages
-from cirl_marl.optimum.maximise import DEGREE, check_options
-from cirl_marl.optimum.population import Episodes, Population, named, starting_states
+from cirl_marl.optimum.options import DEGREE, check_options, demanded_levels
+from cirl_marl.optimum.plans import Episodes, Population, by_state_name, starting_states
 
 SHORTFALL_PRICE = 10.0
 """What a service whose mean level is short of ``min_service`` by 1 costs, against λ̄/circularity_scale. The penalty is
 exact where more of it costs less than that; a steeper one lets the draws hug the demanded level and stall there."""
 KNOTS = 16
 """Stretches of an episode with deviations of their own, unless another number is asked for."""
-
 SearchReport = Callable[[float, Floats], None]
 """Takes the share of all episodes that is simulated and the best merit from each start so far, shape (starts,)."""
+ELITE_SHARE = 0.125
+"""Share of a population that makes up the elite."""
+MEAN_STEP = 0.6
+"""Weight of the elite's mean and variance against those of the iteration before."""
+SPREAD = 0.5
+"""First standard deviation, in normalised actions."""
+SPREAD_DECAY = 0.7
+"""Standard deviation at the beginning of a refinement against that of the one before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +130,7 @@ def search(
     if isinstance(initial, Mapping):
         given = initial
     elif initial is not None:
-        given = named(env, np.asarray(initial, dtype=float)[None])
+        given = by_state_name(env, np.asarray(initial, dtype=float)[None])
     env.reset(seed=EVALUATION_SEEDS, options={"initial_state": given})
     return search_each(
         env.network,
@@ -169,7 +174,7 @@ def search_each(
     if knots > network.episode.horizon:
         raise CirlError(f"knots: {knots} are more than the {network.episode.horizon} decisions of an episode")
     demanded = None if min_service is None else demanded_levels(network, min_service)
-    merit = _Merit(network.objective.circularity_scale, service_weight, demanded)
+    merit = _Objective(network.objective.circularity_scale, service_weight, demanded)
     starts = np.asarray(initial, dtype=float)
     copies = Population(network, agents, starts, population)
     known = standard_candidates(copies.agents) if candidates is None else dict(candidates)
@@ -191,7 +196,7 @@ def search_each(
     origin = best.copy
     gaussians = Gaussians(best.merit, population, copies.entries, seed)
     simulated, highest = len(known), best.merit
-    for count in stages(knots, iterations):
+    for count in knot_counts(knots, iterations):
         gaussians.refine(count)
         which = np.repeat(origin[:, None], population, axis=1)
         tried = copies.run(controllers, which, gaussians.draw(), told(population))
@@ -226,7 +231,7 @@ def standard_candidates(agents: Sequence[str]) -> dict[str, Controller]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Merit:
+class _Objective:
     """What is maximised; see ``search``."""
 
     scale: float
@@ -283,3 +288,69 @@ class _Best:
             np.where(better[:, None], other.levels, self.levels),
             np.where(better[:, None, None], other.actions, self.actions),
         )
+
+
+class Gaussians:
+    """Deviations from each start, independent in every stretch of time and entry; first constants around 0."""
+
+    def __init__(self, merit: Floats, population: int, entries: int, seed: int) -> None:
+        """Begin with constants.
+
+        Args:
+            merit: of no deviation, shape (starts,).
+            population: deviations drawn for each start.
+            entries: of an action.
+            seed: of the draws.
+        """
+        self._merit, self._elite = merit[:, None], np.zeros((len(merit), 1, 1, entries))
+        self._mean, self._variance = self._elite[:, 0].copy(), np.full((len(merit), 1, entries), SPREAD**2)
+        self._spread, self._population = SPREAD, population
+        self._random = np.random.default_rng(seed)
+
+    def refine(self, knots: int) -> None:
+        """Cut each stretch into equal parts, ``knots`` in all, and draw around the best deviation so far again.
+
+        Of the elite only that one stays: the others, all but equal by now, would take the variance away at once.
+        """
+        parts = knots // self._mean.shape[1]
+        if parts == 1:
+            return
+        self._spread *= SPREAD_DECAY
+        self._merit, self._elite = self._merit[:, :1], np.repeat(self._elite[:, :1], parts, axis=2)
+        self._mean = self._elite[:, 0].copy()
+        self._variance = np.full(self._mean.shape, self._spread**2)
+
+    def draw(self) -> Floats:
+        """Draw deviations, from the same normal numbers for each start, shape (starts, population, knots, entries)."""
+        normal = self._random.standard_normal((self._population, *self._mean.shape[1:]))
+        drawn: Floats = self._mean[:, None] + np.sqrt(self._variance)[:, None] * normal
+        return drawn
+
+    def learn(self, merit: Floats, deviation: Floats) -> None:
+        """Move the Gaussians towards the best deviations so far; those of earlier iterations compete.
+
+        Args:
+            merit: shape (starts, population).
+            deviation: as it came through the bounds of the actions, shape (starts, population, knots, entries).
+        """
+        merit = np.concatenate([self._merit, merit], axis=1)
+        deviation = np.concatenate([self._elite, deviation], axis=1)
+        order = np.argsort(-merit, axis=1, kind="stable")[:, : round(self._population * ELITE_SHARE)]
+        self._merit = np.take_along_axis(merit, order, axis=1)
+        self._elite = np.take_along_axis(deviation, order[:, :, None, None], axis=1)
+        self._mean += MEAN_STEP * (self._elite.mean(axis=1) - self._mean)
+        self._variance += MEAN_STEP * (self._elite.var(axis=1) - self._variance)
+
+
+def knot_counts(knots: int, iterations: int) -> list[int]:
+    """Return the number of knots in each iteration: 1, then ``knots`` halved as often as it can be, up to ``knots``.
+
+    >>> stages(12, 8)
+    [1, 1, 3, 3, 6, 6, 12, 12]
+    """
+    counts = [knots]
+    while counts[0] % 2 == 0:
+        counts.insert(0, counts[0] // 2)
+    if counts[0] > 1:
+        counts.insert(0, 1)
+    return [counts[i * len(counts) // iterations] for i in range(iterations)]

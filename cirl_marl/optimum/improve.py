@@ -19,12 +19,12 @@ from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats
+from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.bounds import Bound
-from cirl_marl.optimum.merit import demanded, merit, prices
-from cirl_marl.optimum.plan import achieved
-from cirl_marl.optimum.program import LinearProgram
-from cirl_marl.optimum.replan import replanned
-from cirl_marl.optimum.solver import best_values
+from cirl_marl.optimum.matrices import Layout
+from cirl_marl.optimum.plans import achieved
+from cirl_marl.optimum.program import LinearProgram, Programs
+from cirl_marl.optimum.solver import Infeasible, SolverFailure, best_values, solve
 
 DIFFERENCE = 1e-6
 """Step of the difference quotients, relative to the scale of a stock or to half the range of a control."""
@@ -32,6 +32,14 @@ MOST_SLOPES = 50_000_000
 """Entries of the largest Jacobians of all intervals that are written, 0.4 GB."""
 TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions."""
+PENALTY = 3.0
+"""Price of what a service lacks in the merit, times the price that the bound puts on it."""
+ROUNDS = 2
+"""Most programs that are solved."""
+DEGREE = 1
+"""Degree of these programs, whatever that of the bound: they are solved several times."""
+TOLERATED = 1e-4
+"""What a service may lack of its demand without a further round."""
 
 
 def improved(
@@ -57,10 +65,10 @@ def improved(
     dynamics = Dynamics(bound.network)
     inputs = dynamics.rows.nodes.stop + bound.actions.shape[1]
     if bound.actions.shape[0] * inputs * (dynamics.rows.nodes.stop + len(bound.network.arcs)) > MOST_SLOPES:
-        return replanned(bound, enough=enough, progress=progress)
+        return refine(bound, enough=enough, progress=progress)
     charged = prices(bound)
     best, run = bound, achieved(bound)
-    reached, trust, slopes = merit(bound, run, charged), TRUST, None
+    reached, trust, slopes = penalised_objective(bound, run, charged), TRUST, None
     for done in range(rounds):
         if trust < SMALLEST or enough(run):
             break
@@ -72,7 +80,7 @@ def improved(
             continue
         candidate = replace(best, actions=np.clip(best.actions + step, -1.0, 1.0))
         tried = achieved(candidate)
-        gained = merit(bound, tried, charged) - reached
+        gained = penalised_objective(bound, tried, charged) - reached
         if gained > 0:
             best, run, reached, trust, slopes = candidate, tried, reached + gained, min(1.0, 2 * trust), None
         else:
@@ -177,7 +185,7 @@ def _step(
         equal=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, services))], format="csr"),
         equal_to=np.zeros(steps * outputs),
         under=under,
-        under_to=np.append(limits.ravel(), -demanded(bound)),
+        under_to=np.append(limits.ravel(), -demand(bound)),
         low=low,
         high=high,
     )
@@ -222,3 +230,91 @@ def _cost(bound: Bound, size: int, level: int, nodes: int) -> Floats:
         cost /= network.objective.circularity_scale
         cost[level : level + services] = -bound.service_weight / (steps * max(services, 1))
     return cost
+
+
+def prices(bound: Bound) -> Floats:
+    """Return what the merit charges for a unit that each service lacks, which covers what the certificate asks for it.
+
+    Shape (services,); 0 if nothing is demanded.
+    """
+    services = len(bound.network.services)
+    if bound.min_service is None:
+        return np.zeros(services)
+    charged = -bound.certificate.under[len(bound.certificate.under) - services :]
+    return PENALTY * np.maximum(charged, bound.network.objective.circularity_scale)
+
+
+def penalised_objective(bound: Bound, run: Rollout, prices: Floats) -> float:
+    """Return the objective of the bound that an episode reaches, less the price of what its services lack."""
+    circularity = float(run.episode_circularity[0])
+    if bound.service_weight is not None:
+        scale = bound.network.objective.circularity_scale
+        return circularity / scale + bound.service_weight * float(run.episode_service[0])
+    return circularity - float(prices @ np.maximum(0.0, demand(bound) - run.episode_levels[0]))
+
+
+def demand(bound: Bound) -> Floats:
+    """Return the mean level demanded of each service, 0 for none, shape (services,)."""
+    return np.zeros(len(bound.network.services)) if bound.min_service is None else bound.min_service
+
+
+def refine(
+    bound: Bound,
+    *,
+    rounds: int = ROUNDS,
+    enough: Callable[[Rollout], bool] = lambda run: False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Bound:
+    """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
+
+    Each round solves the program of the bound with controls that are constant within an interval to first order
+    (``Programs``), which the simulator carries out more faithfully. Where an episode delivers less of a service than
+    its program promised, the next one demands that much more: the lower end l of its band becomes
+
+        l·(1 + Σ max(0, promised level − delivered level)),
+
+    summed over the episodes so far, that of the bound's plan being the first. The best episode counts, by the merit of
+    ``improved``; rounds end when no service lacks more than KEPT.
+
+    Args:
+        bound: with the actions to start from.
+        rounds: most programs to solve.
+        enough: asked of each episode that is better than those before, whether to stop there.
+        progress: called with the share of them that is solved; 1 when no more are needed.
+    """
+    admissible = Admissible.of(bound.network, bound.agents or None)
+    charged, best, run = prices(bound), bound, achieved(bound)
+    reached = penalised_objective(bound, run, charged)
+    raised = 1.0 + _shortfall(bound.problem.layout, bound.solution, run, 1.0)
+    for done in range(rounds):
+        if enough(run):
+            break
+        asked = replace(admissible, served=admissible.served * raised)
+        programs = Programs(asked, DEGREE, bound.service_weight, hold_controls=True)
+        try:
+            problem = programs.program(bound.initial, bound.min_service)
+            planned = solve(problem, label="the program of a better plan", certify=False).plan
+        except (Infeasible, SolverFailure):  # more than can be had: what was found so far is the plan
+            break
+        layout = programs.layout
+        candidate = replace(bound, actions=normalised_actions(asked, layout, planned.reshape(-1, layout.size)))
+        tried = achieved(candidate)
+        progress((done + 1) / rounds)
+        if (worth := penalised_objective(bound, tried, charged)) > reached:
+            best, run, reached = candidate, tried, worth
+        lacking = _shortfall(layout, planned, tried, raised)
+        if lacking.mean(axis=0).max(initial=0.0) <= TOLERATED:
+            break
+        raised += lacking
+    progress(1.0)
+    return best
+
+
+def _shortfall(layout: Layout, planned: Floats, run: Rollout, raised: float | Floats) -> Floats:
+    """Return what an episode lacks of the levels that its program promised, shape (steps, services).
+
+    The program's levels are of bands that were ``raised``.
+    """
+    levels = planned.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
+    lacking: Floats = np.maximum(np.minimum(levels * raised, 1.0) - run.levels[0].T, 0.0)
+    return lacking

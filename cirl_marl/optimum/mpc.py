@@ -2,8 +2,8 @@
 
 Every ``replan`` decisions each copy solves the linear program of ``cirl_marl.optimum`` from its true current stocks and
 carries out the first planned actions; what the program promised and the simulator did not do is made up for by the
-next plan. Controls are held within an interval to first order (``Programs(held=True)``): that bounds nothing and plans
-better. Nothing is random.
+next plan. Controls are held within an interval to first order (``Programs(hold_controls=True)``): that bounds nothing
+and plans better. Nothing is random.
 
 A receding window ends before the episode does. What comes after it is priced by the multipliers y of the program of the
 whole episode, solved once from the start of the episode: the rows of the interval after the window are moved into the
@@ -25,15 +25,19 @@ from cirl_marl.controllers.basic import Arrays, Planner
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError
 from cirl_marl.network import Floats
-from cirl_marl.optimum.actions import normalised_actions
-from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import demanded_levels
-from cirl_marl.optimum.maximise import check_options
+from cirl_marl.optimum.admissible import Admissible, NoCertificate, normalised_actions
+from cirl_marl.optimum.bounds import Bound, bound
+from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
+from cirl_marl.optimum.improve import improved
+from cirl_marl.optimum.options import check_options, demanded_levels
+from cirl_marl.optimum.plans import Plan, starting_states
 from cirl_marl.optimum.program import Program, Programs
-from cirl_marl.optimum.solver import Basis, Infeasible, Solution, Unsolved, solve
+from cirl_marl.optimum.solver import Basis, Infeasible, Solution, SolverFailure, solve
 
 SERVICE_FIRST = 1000.0
 """Weight of the mean service level, against λ̄/circularity_scale, where a demanded level is out of reach."""
+BOUND = 0.3
+"""About the share of solving for the bound in the work on a plan; the rest is to improve it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,8 +153,8 @@ class MPC(Planner):
         self.note = ""
         self._env = env
         self._admissible = Admissible.of(network, env.agents or None)
-        self._programs = Programs(self._admissible, self._degree, self._weight, held=True)
-        self._urgent = Programs(self._admissible, self._degree, SERVICE_FIRST, held=True)
+        self._programs = Programs(self._admissible, self._degree, self._weight, hold_controls=True)
+        self._urgent = Programs(self._admissible, self._degree, SERVICE_FIRST, hold_controls=True)
         self._outlooks: dict[int, _Plan] = {}
         self._plans = []
         for copy in range(env.num_envs):
@@ -184,7 +188,7 @@ class MPC(Planner):
         window = rest if self._horizon is None else rest[: self._horizon]
         try:
             return self._solved(copy, rest, window, last)
-        except Unsolved as missing:
+        except SolverFailure as missing:
             self.note = f"MPC goes on as it planned before, or neutrally, where a plan is missing: {missing}"
             return self._older(copy, window, last)
 
@@ -244,14 +248,14 @@ class MPC(Planner):
         what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
             problem = self._priced(self._programs, stock, intervals, demanded, prices)
-            solution = solve(problem, basis, what=what, certified=certified)
+            solution = solve(problem, basis, label=what, certify=certified)
         except Infeasible:
             if demanded is None:
                 raise
             unit = self._env.network.objective.circularity_scale
             prices = None if prices is None else prices / unit
             problem = _capped(self._priced(self._urgent, stock, intervals, demanded, prices))
-            solution = solve(problem, basis, what=what, certified=certified)
+            solution = solve(problem, basis, label=what, certify=certified)
         planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
         actions = self._actions(problem, intervals, planned)
         return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)
@@ -277,3 +281,77 @@ def _capped(problem: Program) -> Program:
     held = np.arange(len(problem.under_to)) >= len(problem.under_to) - services
     sign = np.where(held, -1.0, 1.0)
     return replace(problem, under=sparse.csr_array(sparse.diags_array(sign) @ under), under_to=problem.under_to * sign)
+
+
+class Optimum(Planner):
+    """Open-loop optimal control: once started, every copy has a plan of its own for the whole episode.
+
+    Attributes:
+        plans: once started, whose plan each copy carries out: bounds, or incumbents where nothing is proved.
+        note: empty if the plans are those of bounds.
+    """
+
+    ahead = 0.99
+
+    def __init__(self, *, min_service: ArrayLike | None = None, service_weight: float | None = None) -> None:
+        """Choose the objective; see ``bound``."""
+        self._min_service, self._service_weight = min_service, service_weight
+        self.plans: list[Bound] | list[Incumbent] = []
+        self._plan = Plan(())
+
+    def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
+        """Solve a program for the start of every copy and improve its plan; ``seed`` has no effect.
+
+        Where no program bounds the network (``NoCertificate``), look for plans by simulation, from all starts at once.
+
+        Raises:
+            CirlError: for a service that no plan reaches, a solver that fails, or an environment in which nobody acts.
+        """
+        try:
+            self.plans, self.note = self._bounded(env, progress), ""
+        except NoCertificate as missing:
+            self.plans = self._found(env, progress)
+            self.note = f"best plan found, no certificate: {missing}"
+        self._plan = Plan(self.plans)
+        self._plan.start(env, seed)
+
+    def act(self, observations: Arrays) -> Arrays:
+        """Return the planned actions of the next interval."""
+        return self._plan.act(observations)
+
+    def _bounded(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Bound]:
+        plans: list[Bound] = []
+        known: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
+        for copy, start in enumerate(env.physical.stock[env.rows.nodes].T):
+            told = _told(progress, copy, env.num_envs)
+            if (key := start.tobytes()) in known:
+                plans.append(known[key])
+                told(1.0)
+                continue
+            found = bound(
+                env.network,
+                start,
+                min_service=self._min_service,
+                service_weight=self._service_weight,
+                agents=env.agents or None,
+            )
+            told(0.0)
+            plans.append(improved(found, progress=told))
+            known[key] = plans[-1]
+        return plans
+
+    def _found(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Incumbent]:
+        return search_each(
+            env.network,
+            starting_states(env),
+            min_service=self._min_service,
+            service_weight=self._service_weight,
+            agents=env.agents or None,
+            knots=min(KNOTS, env.network.episode.horizon),
+            progress=lambda share, merit: progress(share),
+        )
+
+
+def _told(progress: Callable[[float], None], copy: int, copies: int) -> Callable[[float], None]:
+    """Return what takes the share of a copy's improvement that is done; its bound is solved."""
+    return lambda improvement: progress((copy + BOUND + (1 - BOUND) * improvement) / copies)

@@ -13,17 +13,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 
+from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.layout import Layout
-from cirl_marl.optimum.monotone import falls
-from cirl_marl.optimum.objective import measures, objective
-from cirl_marl.optimum.reach import ComparisonSystem, Delayed, Reach
-from cirl_marl.optimum.rows import Chained, ProgramRows
-from cirl_marl.optimum.scheduled import deliveries, openings, orders
-from cirl_marl.optimum.settled import ends, has_fast, settled
-from cirl_marl.optimum.shared import followers, passing
-from cirl_marl.optimum.supplies import supplies
+from cirl_marl.optimum.constraints import (
+    balances,
+    constant_schedules,
+    delivery_limits,
+    flow_laws,
+    held_controls,
+    idle_supplies,
+    throughputs,
+    valve_envelopes,
+)
+from cirl_marl.optimum.matrices import ChainedRows, Layout, ProgramRows
+from cirl_marl.optimum.quasi_steady import decay_rows, end_laws, has_fast_stocks, quasi_steady_rows
+from cirl_marl.optimum.reach import ComparisonSystem, DelayLine, Reach
 from cirl_marl.optimum.vintages import Lifetimes
 
 LARGE = 30_000
@@ -84,8 +89,8 @@ class Programs:
         degree: int,
         service_weight: float | None,
         *,
-        held: bool = False,
-        merged: bool | None = None,
+        hold_controls: bool = False,
+        merge_pieces: bool | None = None,
     ) -> None:
         """Write down what does not depend on the start.
 
@@ -93,31 +98,31 @@ class Programs:
             admissible: ranges of the flows.
             degree: d of the test polynomials.
             service_weight: w of λ̄/circularity_scale + w·service; None if λ̄ is maximised.
-            held: whether controls are constant within an interval to first order; the program then makes better plans
-                and bounds nothing.
-            merged: whether an interval has fewer pieces than the simulator has substeps; None: if the program were
-                large otherwise.
+            hold_controls: whether controls are constant within an interval to first order; the program then makes
+                better plans and bounds nothing.
+            merge_pieces: whether an interval has fewer pieces than the simulator has substeps; None: if the program
+                were large otherwise.
         """
         self.admissible = admissible
         lifetimes = admissible.lifetimes
         living = lifetimes.planned is not lifetimes.reached
         self._system = ComparisonSystem(Admissible.of(lifetimes.reached, admissible.agents) if living else admissible)
-        self.layout = layout = _layout(admissible, self._system.substeps, merged, degree)
+        self.layout = layout = _layout(admissible, self._system.substeps, merge_pieces, degree)
         fading = ComparisonSystem(admissible) if living and layout.merged else self._system
-        self._equal, self._under = Chained(layout), Chained(layout)
+        self._equal, self._under = ChainedRows(layout), ChainedRows(layout)
         for kind in np.unique(admissible.kinds).tolist():
             linked_equal, equal, linked_under, under = (ProgramRows(layout) for _ in range(4))
-            _balances(layout, linked_equal)
-            orders(admissible, layout, equal, under)
-            _laws(admissible, layout, kind, equal, under)
-            passing(admissible, layout, kind, equal)
-            if held:
-                _held(admissible, layout, kind, equal)
-            deliveries(admissible, layout, kind, linked_under)
-            falls(admissible, layout, kind, linked_under)
+            balances(layout, linked_equal)
+            constant_schedules(admissible, layout, equal, under)
+            flow_laws(admissible, layout, kind, equal, under)
+            throughputs(admissible, layout, kind, equal)
+            if hold_controls:
+                held_controls(admissible, layout, kind, equal)
+            delivery_limits(admissible, layout, kind, linked_under)
+            decay_rows(admissible, layout, kind, linked_under)
             if layout.merged:
-                ends(admissible, layout, kind, equal, under)
-                settled(admissible, layout, kind, fading.of_kind(kind), linked_under)
+                end_laws(admissible, layout, kind, equal, under)
+                quasi_steady_rows(admissible, layout, kind, fading.of_kind(kind), linked_under)
             measures(layout, admissible.served[kind], under)
             self._equal.add(kind, linked_equal, equal)
             self._under.add(kind, linked_under, under)
@@ -149,8 +154,8 @@ class Programs:
         start = lifetimes.start_planned @ initial
         equal, equal_to = self._equal.over(kinds, start, cut)
         under, under_to = self._under.over(kinds, start, cut)
-        opened, opened_to = openings(self.admissible, reached, layout, when)
-        supplied, supplied_to = supplies(self.admissible, reached, layout, when)
+        opened, opened_to = valve_envelopes(self.admissible, reached, layout, when)
+        supplied, supplied_to = idle_supplies(self.admissible, reached, layout, when)
         lived, lived_to = lifetimes.rows(layout, initial, when)
         blocks, limits = [under, opened, supplied, lived], [under_to, opened_to, supplied_to, lived_to]
         if min_service is not None:
@@ -175,7 +180,7 @@ class Programs:
 def _reached(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, intervals: range) -> tuple[Reach, Floats]:
     """Return what the planned network can reach, and the most that leaves lifetimes, shape (steps, lifetimes)."""
     delayed = [
-        Delayed(each.reached_arc, each.reached_node, each.slots(initial), lifetimes.network.episode.control_interval)
+        DelayLine(each.reached_arc, each.reached_node, each.slots(initial), lifetimes.network.episode.control_interval)
         for each in lifetimes.lived
         if not len(each.rate)
     ]
@@ -198,91 +203,16 @@ def _layout(admissible: Admissible, substeps: int, merged: bool | None, degree: 
     nodes = len(network.nodes)
     pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.lived else substeps
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
-    orders = np.bincount(network.donors[admissible.scheduled], minlength=nodes)
+    constant_schedules = np.bincount(network.donors[admissible.scheduled], minlength=nodes)
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
-    openings = np.flatnonzero(movable & (exits > 0) & (orders > 0))
-    valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (orders > 0)))
-    fine = Layout(network, pieces, pieces < substeps, False, degree, valves, openings)
+    valve_envelopes = np.flatnonzero(movable & (exits > 0) & (constant_schedules > 0))
+    valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (constant_schedules > 0)))
+    fine = Layout(network, pieces, pieces < substeps, False, degree, valves, valve_envelopes)
     few = max(1, degree - 1)
     if pieces > few and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
         coarse = replace(fine, pieces=few, coarse=True)
-        return replace(coarse, merged=True) if merged or has_fast(admissible, coarse.length) else coarse
+        return replace(coarse, merged=True) if merged or has_fast_stocks(admissible, coarse.length) else coarse
     return fine
-
-
-def _balances(layout: Layout, rows: ProgramRows) -> None:
-    """Add Y_i − Y_{i−1} − δ/(d + 1)·S F_i, which is 0, for i = 0 … d (theorem 1); keys (moment, node).
-
-    Y_i = ((d − i) X_i + (i + 1) X_{i+1})/(d + 1) are the means weighted with the polynomials of degree d − 1;
-    Y_{−1} and Y_d are the stocks at the two ends of the piece, δ its length.
-    """
-    network, d = layout.network, layout.degree
-    moment, node = layout.moment_column, np.arange(len(network.stores))
-    row = rows.add(moment, node)
-    for side, sign in ((network.donors, 1.0), (network.recipients, -1.0)):
-        arcs = np.flatnonzero(side < len(node))
-        rows.put(row[:, side[arcs]], layout.flow(moment) + arcs, sign * layout.portion)
-    for j in layout.moments:
-        piece, i = divmod(j, d + 1)
-        if i < d:  # Y_i
-            rows.put(row[j], layout.stock(j) + node, (d - i) / (d + 1))
-            rows.put(row[j], layout.stock(j + 1) + node, (i + 1) / (d + 1))
-        else:
-            rows.put(row[j], layout.end(piece) + node, 1.0)
-        if i > 0:  # − Y_{i−1}
-            rows.put(row[j], layout.stock(j - 1) + node, -(d - i + 1) / (d + 1))
-            rows.put(row[j], layout.stock(j) + node, -i / (d + 1))
-        else:
-            rows.at_start(row[j], piece, node, -1.0)
-
-
-def _laws(admissible: Admissible, layout: Layout, step: int, equal: ProgramRows, under: ProgramRows) -> None:
-    """Add the flow laws of an interval: rows that are 0 and rows at most 0; keys (0, moment, what, which, side)."""
-    network, moment = admissible.network, layout.moment_column
-
-    def hold(what: int, which: Integers, column: Integers, driver: Integers, factor: Floats) -> None:
-        """Hold low·driver ≤ column ≤ high·driver, with columns of shape (moments, which)."""
-        low, high = factor
-        given = low == high
-        row = equal.add(0, moment, what, which[given])
-        equal.put(row, column[:, given], 1.0)
-        equal.put(row, driver[:, given], -low[given])
-        for side, sign, bound in ((0, 1.0, high), (1, -1.0, low)):
-            row = under.add(0, moment, what, which[~given], side)
-            under.put(row, column[:, ~given], sign)
-            under.put(row, driver[:, ~given], -sign * bound[~given])
-
-    valves, driven = layout.valves, ~admissible.scheduled & ~admissible.lived
-    arcs = np.setdiff1d(np.flatnonzero(driven), followers(admissible, step))
-    place = np.arange(len(valves))
-    hold(1, place, layout.valve(moment) + place, layout.stock(moment) + valves, admissible.valve[:, step, valves])
-    # behind a valve that several outflows share F_i = w·a·Z_i with Z_i = v·X_i; else F_i = v·w·a·X_i
-    driver = admissible.driver[arcs]
-    through = (network.donors[arcs] == driver) & np.isin(driver, valves)
-    factor = np.where(through, admissible.own[:, step, arcs], admissible.factor[:, step, arcs])
-    behind = layout.valve(moment) + np.searchsorted(valves, driver)
-    column = np.where(through, behind, layout.stock(moment) + driver)
-    hold(2, arcs, layout.flow(moment) + arcs, column, factor * admissible.base[step, arcs])
-
-
-def _held(admissible: Admissible, layout: Layout, step: int, rows: ProgramRows) -> None:
-    """Add F_i − F_{i−1} − r (X_i − X_{i−1}), r = v·w·a at neutral, and the same for Z; keys (1, moment, what, which).
-
-    For a constant factor r' it is (r' − r)(X_i − X_{i−1}), a product of two differences, here held at 0.
-    """
-    moment = layout.moment_column[1:]
-    free = ~admissible.scheduled & ~admissible.lived & (admissible.factor[0, step] < admissible.factor[1, step])
-    arcs, valves = np.flatnonzero(free), np.arange(len(layout.valves))
-    opened = admissible.neutral_valve[step, layout.valves]
-    parts = (
-        (0, arcs, layout.flow, arcs, admissible.driver[arcs], admissible.neutral_rate[step, arcs]),
-        (1, valves, layout.valve, valves, layout.valves, opened),
-    )
-    for what, which, first, place, driver, rate in parts:
-        row = rows.add(1, moment, what, which)
-        for at, sign in ((moment, 1.0), (moment - 1, -1.0)):
-            rows.put(row, first(at) + place, sign)
-            rows.put(row, layout.stock(at) + driver, -sign * rate)
 
 
 def _box(
@@ -315,3 +245,52 @@ def _box(
     high[:, layout.imbalance] = most @ weights
     low[:, layout.opening :], high[:, layout.opening :] = valve[:, :, layout.openings]
     return low.ravel(), high.ravel()
+
+
+def measures(layout: Layout, low: Floats, rows: ProgramRows) -> None:
+    """Add low·level − q ≤ 0 for each service and ±Δ·σ_env·f̄ − imbalance ≤ 0; their keys are (1, …).
+
+    The level is at most min(1, q/low): a finite upper end of the band could only lower it further.
+    """
+    network, count = layout.network, len(layout.moments)
+    for s, service in enumerate(network.services):
+        row = rows.add(1, s)
+        rows.put(row, layout.level + s, low[s])  # level ≤ q/low; level ≤ 1 is a box
+        if service.quantity == "stock":
+            stages = network.stages if isinstance(network, StagedNetwork) else {}
+            for store in (store for each in service.providers for store in stages.get(each, (each,))):
+                rows.put(row, layout.end(-1) + network.node_index[store], -1.0)
+        else:
+            rows.put(row, layout.flow(layout.moment_column) + network.metered(service), -1.0 / count)
+    weights = -network.circularity_weights[1]
+    counted = np.flatnonzero(weights)
+    row = rows.add(1, len(network.services), [0, 1])
+    for each, sign in zip(row, (1.0, -1.0), strict=True):
+        rows.put(each, layout.flow(layout.moment_column) + counted, sign * weights[counted] / count)
+    rows.put(row, layout.imbalance, -1.0)
+
+
+def circularity_weights(layout: Layout) -> Floats:
+    """Return the weights of the mean of λ over an interval on its variables, shape (size,), mass."""
+    network = layout.network
+    weights = np.zeros(layout.size)
+    counted = network.circularity_weights.sum(axis=0)
+    if network.objective.net_zero == "abs":
+        counted = network.circularity_weights[0]
+        weights[layout.imbalance] = -1.0
+    for i in layout.moments:
+        weights[layout.flow(i) : layout.valve(i)] = counted / len(layout.moments)
+    return weights
+
+
+def objective(layout: Layout, service_weight: float | None) -> tuple[Floats, float]:
+    """Return the weights of the objective on the variables of an interval, and what it has beside them."""
+    network = layout.network
+    weights, constant = circularity_weights(layout), 0.0
+    if service_weight is not None:
+        weights = weights / network.objective.circularity_scale
+        if network.services:
+            weights[layout.level : layout.imbalance] = service_weight / len(network.services)
+        else:
+            constant = service_weight
+    return weights, constant

@@ -14,17 +14,141 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import linalg, sparse
+from scipy.sparse.linalg import splu
 
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.dynamics.passes import Passes
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
-from cirl_marl.optimum.held import Held
-from cirl_marl.optimum.routes import ROUNDING, RouteBounds
 
+DENSE = 256
+"""Rows of the largest system whose solution is kept as matrices."""
+TRUNCATION = 1e-17
+"""Sum of the terms of the series that are left out, relative to the change that the first term makes."""
+ROUNDING = 1e-9
+"""Relative widening of every bound; rounding errors are far smaller."""
+CONVERGED = 1e-3
+"""Relative fall of an upper bound in a round below which no further is made."""
+ROUNDS = 1000
+"""Most such rounds."""
 ROUND_OFF = 1e-13
 """Mass by which bounds are widened in each substep, relative to the mass in the network."""
+
+
+class ZeroOrderHold:
+    """x after a substep h, e^{Mh} x + ∫ e^{Ms} c ds, of a sparse matrix M.
+
+    Of a small system both matrices are kept. Of a large one they would be full, so the series
+    x + h Σ_k (Mh)^k/(k + 1)! (M x + c) is summed. With μ = ‖Mh‖₁ the terms from K on are, in the 1-norm, at most
+    μ^K/(K + 1)!·1/(1 − μ/(K + 2)) of the first, since each is at most μ/(K + 2) of the one before.
+    """
+
+    def __init__(self, matrix: Any, interval: float) -> None:
+        """Take M, in coordinates, 1/time, and h."""
+        self._size, self._interval = matrix.shape[0], interval
+        self._neglected = 0.0
+        if self._size <= DENSE:
+            # exp of [[M, I], [0, 0]]·h has both in its upper blocks (Van Loan 1978)
+            extended = np.zeros((2 * self._size, 2 * self._size))
+            extended[: self._size, : self._size], extended[: self._size, self._size :] = (
+                matrix.toarray(),
+                np.eye(self._size),
+            )
+            solved = linalg.expm(extended * interval)
+            self._solution, self._response = solved[: self._size, : self._size], solved[: self._size, self._size :]
+            return
+        self._matrix = sparse.csr_array(matrix)
+        norm = float(abs(self._matrix).sum(axis=0).max(initial=0.0)) * interval
+        self._terms, term = 1, norm / 2  # the first term that is left out, relative to the first
+        while norm >= self._terms + 2 or term / (1 - norm / (self._terms + 2)) > TRUNCATION:
+            self._terms += 1
+            term *= norm / (self._terms + 1)
+        self._neglected = term / (1 - norm / (self._terms + 2))
+
+    def __call__(self, state: Floats, constant: Floats) -> tuple[Floats, float]:
+        """Return x after the substep, from ``state`` and with c = ``constant``, and how far off it may be at most."""
+        if self._size <= DENSE:
+            return self._solution @ state + self._response @ constant, 0.0
+        term = self._interval * (self._matrix @ state + constant)
+        missed = self._neglected * float(np.abs(term).sum())
+        after = state + term
+        for k in range(1, self._terms):
+            term = self._matrix @ term * (self._interval / (k + 1))
+            after += term
+        return after, missed
+
+
+class RouteBounds:
+    """Bounds of what leaves such nodes in one interval, per mass that enters them.
+
+    With the least shares P̲ among these nodes and R̲ into stocks, at least (I − P̲)⁻¹ R̲ arrives. The greatest number of
+    visits V_ij to node j by what enters i solves V = I + max_s P(s) V, a Markov decision process; from a V that is too
+    large this iteration falls towards it, so any iterate bounds it. What enters i reaches a stock in a share of at most
+    V_i R̄, and of at most 1.
+
+    Attributes:
+        longest: most visits of all nodes together, at least 1.
+        visits: V, shape (nodes, nodes).
+    """
+
+    def __init__(self, admissible: Admissible, passes: Passes, step: int, wider: RouteBounds | None = None) -> None:
+        """Take the ranges of shares in interval ``step``; the visits of ``wider`` ranges are where to begin from."""
+        network = admissible.network
+        stores, nodes = len(network.stores), len(network.nodes)
+        self._stores, inner = stores, nodes - stores
+        arcs = np.flatnonzero(network.donors >= stores)
+        places = (network.donors[arcs] - stores, network.recipients[arcs])
+        low, high = (sparse.csc_array((rate, places), shape=(inner, nodes)) for rate in admissible.rate(step)[:, arcs])
+        total = passes.total(step)
+        arrives = _least(low[:, stores:], low[:, :stores].toarray(), total)
+        self.longest = float(total.max(initial=1.0))
+        visits, fewer = np.repeat(total[:, None], inner, axis=1), np.empty(0)
+        if wider is not None:
+            fewer = np.eye(inner) + passes.best(wider.visits, step)
+            if (fewer <= wider.visits * (1 + ROUNDING)).all():  # a bound: V ≥ I + max_s P(s) V
+                visits = np.minimum(visits, wider.visits * (1 + ROUNDING))
+        for _ in range(ROUNDS if inner else 0):
+            fewer = np.minimum(visits, np.eye(inner) + passes.best(visits, step))
+            fallen = (visits - fewer).max()
+            visits = fewer
+            if fallen <= CONVERGED * visits.max():
+                break
+        most = np.minimum(visits @ high[:, :stores].toarray(), 1.0)
+        self._least = sparse.csr_array(arrives.T * (1 - ROUNDING))
+        self._most = sparse.csr_array(most.T * (1 + ROUNDING))
+        self.visits: Floats = visits
+        self._visits = sparse.csr_array(visits.T * (1 + ROUNDING))
+
+    def least(self, entering: Any) -> Any:
+        """Return the least that stocks get of what enters nodes, shape (nodes, …) → (stores, …)."""
+        return entering[: self._stores] + self._least @ entering[self._stores :]
+
+    def most(self, entering: Any) -> Any:
+        """Return the most that stocks get, likewise."""
+        return entering[: self._stores] + self._most @ entering[self._stores :]
+
+    def through(self, entering: Any) -> Any:
+        """Return the most that passes through the nodes that store nothing, given what enters these from elsewhere."""
+        return self._visits @ entering
+
+
+def _least(passed: Any, arriving: Floats, visits: Floats) -> Floats:
+    """Return a lower bound of A = (I − P̲)⁻¹ R̲ that is as near as its equation can be solved.
+
+    No inverse of I − P̲ has a negative entry, so what exceeds R̲ + P̲ A by at most η is too large by at most η visits.
+
+    Args:
+        passed: P̲, sparse, shape (nodes, nodes).
+        arriving: R̲, shape (nodes, stores).
+        visits: most visits of all nodes together by what enters each, shape (nodes,).
+    """
+    if not len(visits):
+        return arriving
+    found = splu(sparse.eye_array(len(visits), format="csc") - passed).solve(arriving)
+    above = max(float((found - arriving - passed @ found).max(initial=0.0)), 0.0) + 8 * float(np.finfo(float).eps)
+    least: Floats = np.maximum(found - above * visits[:, None], 0.0)
+    return least
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +168,7 @@ class Reach:
 
 
 @dataclass(frozen=True, slots=True)
-class Delayed:
+class DelayLine:
     """What comes out of a fixed lifetime.
 
     Attributes:
@@ -85,7 +209,7 @@ class ComparisonSystem:
         self._widest = kinds[int(np.argmax(ranges))]
         self._linear: dict[int, Linear] = {}
 
-    def reach(self, initial: Floats, intervals: range, delayed: Sequence[Delayed] = ()) -> Reach:
+    def reach(self, initial: Floats, intervals: range, delayed: Sequence[DelayLine] = ()) -> Reach:
         """Bound the stocks from ``initial``, shape (stores,), on, over the given intervals of the episode.
 
         What comes out of fixed lifetimes, ``delayed``, is at most what entered so many intervals before.
@@ -199,11 +323,13 @@ class Linear:
         rows = np.concatenate([rows, least.row, stores + most.row, own, stores + own])
         columns = np.concatenate([columns, least.col, stores + most.col, own, stores + own])
         values = np.concatenate([values, least.data, most.data, -released[1], -released[0]])
-        self.solution = Held(sparse.coo_array((values, (rows, columns)), shape=(2 * stores, 2 * stores)), substep)
+        self.solution = ZeroOrderHold(
+            sparse.coo_array((values, (rows, columns)), shape=(2 * stores, 2 * stores)), substep
+        )
         gains = (np.append(recipient[straight], most.row), np.append(p[straight], most.col))
         values = np.append(high[straight], most.data)
         self.gains = sparse.csr_array(sparse.coo_array((values, gains), shape=(stores, stores)))
-        self.growth = Held(self.gains, substep)
+        self.growth = ZeroOrderHold(self.gains, substep)
         self.sent = entering(high, past | split)[stores:]
         self.thrown = routes.through(self.sent)
         taken = (high[pulled], (donor[pulled], p[pulled]))

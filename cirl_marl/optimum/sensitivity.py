@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import Bound
-from cirl_marl.optimum.layout import Layout
+from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import solve
 
@@ -27,22 +27,24 @@ WIDER = 10.0
 """Factor by which boxes are widened that follow from the start, so that no multiplier rests on them."""
 
 
-def resting_on_rows(found: Bound, admissible: Admissible) -> Bound:
+def resting_on_rows(proven: Bound, admissible: Admissible) -> Bound:
     """Return a bound with boxes so wide that its multipliers rest on rows wherever they can.
 
     Boxes of stocks and of what these drive follow from the start and from all that may happen. An optimum that lies on
     one lies on rows as well, as a rule, and either may have the multiplier; more of a stock moves both. Where no rows
     hold it the objective rises a little; it is a bound all the same.
     """
-    problem, free = found.problem, _reached(admissible, found.problem.layout)
+    problem, free = proven.problem, _reached(admissible, proven.problem.layout)
     high = problem.high.reshape(-1, problem.layout.size).copy()
     largest = high.max(axis=0)
     # a stock that nothing reaches has a box of 0, which no factor widens
     largest[free & (largest == 0)] = high.max()
     high[:, free] = WIDER * np.maximum(high, largest)[:, free]
     wider = replace(problem, high=high.ravel())
-    solution = solve(wider, found.basis, what="the program of the shadow prices")
-    return replace(found, problem=wider, solution=solution.plan, certificate=solution.certificate, basis=solution.basis)
+    solution = solve(wider, proven.basis, label="the program of the shadow prices")
+    return replace(
+        proven, problem=wider, solution=solution.plan, certificate=solution.certificate, basis=solution.basis
+    )
 
 
 def _reached(admissible: Admissible, layout: Layout) -> NDArray[np.bool_]:
@@ -62,13 +64,13 @@ def _reached(admissible: Admissible, layout: Layout) -> NDArray[np.bool_]:
     return found
 
 
-def changes(found: Bound, admissible: Admissible, other: Program) -> Floats:
+def changes(proven: Bound, admissible: Admissible, altered: Program) -> Floats:
     """Return how much the objective of a bound rises, to first order, with the numbers of another program.
 
     Args:
-        found: the bound, resting on rows.
+        proven: the bound, resting on rows.
         admissible: of its network.
-        other: a program with the same rows and variables.
+        altered: a program with the same rows and variables.
 
     Returns:
         The parts of it by interval, shape (steps,). What changes in one interval may make room in later ones, and these
@@ -77,40 +79,40 @@ def changes(found: Bound, admissible: Admissible, other: Program) -> Floats:
     Raises:
         ValueError: if the rows or variables differ.
     """
-    problem, v, layout = found.problem, found.solution, found.problem.layout
-    y, mu = found.certificate.equal, np.minimum(found.certificate.under, 0.0)
-    pairs = ((problem.equal, other.equal), (problem.under, other.under))
-    if any(ours.shape != theirs.shape for ours, theirs in pairs) or layout.size != other.layout.size:
+    problem, v, layout = proven.problem, proven.solution, proven.problem.layout
+    y, mu = proven.certificate.equal, np.minimum(proven.certificate.under, 0.0)
+    pairs = ((problem.equal, altered.equal), (problem.under, altered.under))
+    if any(ours.shape != theirs.shape for ours, theirs in pairs) or layout.size != altered.layout.size:
         raise ValueError("the programs differ in their rows or variables")
     reduced = problem.cost - problem.equal.T @ y - problem.under.T @ mu
     least, most = np.maximum(reduced, 0.0), np.minimum(reduced, 0.0)
-    wider = np.where(np.tile(_reached(admissible, layout), len(v) // layout.size), 0.0, other.high - problem.high)
-    cost = (other.cost - problem.cost) * v + least * (other.low - problem.low) + most * wider
+    wider = np.where(np.tile(_reached(admissible, layout), len(v) // layout.size), 0.0, altered.high - problem.high)
+    cost = (altered.cost - problem.cost) * v + least * (altered.low - problem.low) + most * wider
     steps = len(v) // layout.size
     by_interval = cost.reshape(steps, -1).sum(axis=1)
-    rights = (other.equal_to - problem.equal_to, other.under_to - problem.under_to)
+    rights = (altered.equal_to - problem.equal_to, altered.under_to - problem.under_to)
     for (ours, theirs), multipliers, right in zip(pairs, (y, mu), rights, strict=True):
         parts = multipliers * (right - (theirs @ v - ours @ v))
         by_interval += np.bincount(problem.interval_of_rows(ours), parts, steps)
-    rise: Floats = other.constant - problem.constant - by_interval
+    rise: Floats = altered.constant - problem.constant - by_interval
     return rise
 
 
-def of_stocks(found: Bound, programs: Programs) -> Floats:
+def of_stocks(proven: Bound, programs: Programs) -> Floats:
     """Return how much the objective of a bound rises for a unit of mass more in a stock, new at the start of intervals.
 
     Of a node with a lifetime it is new as well: it leaves as what has just entered does. What more of a stock changes
     in boxes and in the envelopes of products is left out.
 
     Args:
-        found: the bound of a whole episode, resting on rows.
+        proven: the bound of a whole episode, resting on rows.
         programs: what its program was made by, or made alike.
 
     Returns:
         Shape (steps, stores), 1.
     """
-    problem, lifetimes = found.problem, programs.admissible.lifetimes
-    y, mu = found.certificate.equal, np.minimum(found.certificate.under, 0.0)
+    problem, lifetimes = proven.problem, programs.admissible.lifetimes
+    y, mu = proven.certificate.equal, np.minimum(proven.certificate.under, 0.0)
     planned, steps = problem.layout.network, programs.admissible.network.episode.horizon
     worth, tops = np.empty((steps, len(planned.stores))), [0, 0]
     for step in range(steps):
@@ -121,7 +123,7 @@ def of_stocks(found: Bound, programs: Programs) -> Floats:
             for block, multipliers, top in zip(blocks, (y, mu), tops, strict=True)
         )
         tops = [top + block.shape[0] for top, block in zip(tops, blocks, strict=True)]
-    last = len(mu) - (0 if found.min_service is None else len(planned.services))
+    last = len(mu) - (0 if proven.min_service is None else len(planned.services))
     for each in reversed(lifetimes.lived):
         out = lifetimes.of_new(each, problem.layout)
         rows = out.shape[1]

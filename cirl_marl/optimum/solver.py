@@ -17,13 +17,11 @@ from scipy import sparse
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import NoCertificate
-from cirl_marl.optimum.certificate import Certificate, verified
+from cirl_marl.optimum.certificate import Certificate, verify
 from cirl_marl.optimum.program import LinearProgram, Program
 
 STATUS = tuple(highspy.HighsBasisStatus(i) for i in range(len(highspy.HighsBasisStatus.__members__)))
 """HiGHS's basis statuses by their numbers."""
-
-
 WARM_ITERATIONS = 2000
 """Simplex iterations from a given basis after which interior points, which need none, are the faster way."""
 PRIMAL = 4
@@ -43,9 +41,9 @@ of a control interval, rows fix a stock several times over. Interior points with
 """
 EXTRA = "highspy_extras"
 """Package that brings HiPO."""
-MANY = 100_000
+LARGE_PROGRAM = 100_000
 """Variables from which on a program is large: crossover may then take hours."""
-FACTORED: tuple[HighsOptions, ...] = (
+LARGE_SETTINGS: tuple[HighsOptions, ...] = (
     {"solver": "hipo", "run_crossover": "off", "kkt_tolerance": 1e-5},
     {"solver": "ipx", "run_crossover": "off", "time_limit": 3600.0},
 )
@@ -66,7 +64,7 @@ class Infeasible(CirlError):
     """A program without solution."""
 
 
-class Unsolved(NoCertificate):
+class SolverFailure(NoCertificate):
     """A program that HiGHS does not solve, whatever is tried; the message says which, and how it ended."""
 
 
@@ -107,8 +105,8 @@ def solve(
     problem: Program,
     basis: Basis | None = None,
     *,
-    what: str = "the program",
-    certified: bool = True,
+    label: str = "the program",
+    certify: bool = True,
     same_rows: bool = False,
 ) -> Solution:
     """Minimise cᵀv over the program.
@@ -120,9 +118,9 @@ def solve(
     Args:
         problem: the program.
         basis: from which to start.
-        what: is solved, for the message of an error.
+        label: is solved, for the message of an error.
         same_rows: whether ``basis`` is of a program that differs in the cost alone.
-        certified: whether multipliers must prove the answer good; else what HiGHS calls optimal is taken at its word,
+        certify: whether multipliers must prove the answer good; else what HiGHS calls optimal is taken at its word,
             and of other answers that satisfy the rows the best.
 
     Raises:
@@ -136,12 +134,12 @@ def solve(
         highs = scaled.run(settings, basis if settings is None else None, primal=same_rows)
         ended = highs.getModelStatus()
         status, refused = highs.modelStatusToString(ended), ended in NO_PLAN
-        if refused and settings is not None and not certified:
+        if refused and settings is not None and not certify:
             break
         if not scaled.is_feasible(highs):
             continue
         solution = scaled.solution(highs)
-        if not certified and ended == highspy.HighsModelStatus.kOptimal:
+        if not certify and ended == highspy.HighsModelStatus.kOptimal:
             return solution
         distance = scaled.distance(problem, solution)
         if distance < best:
@@ -149,11 +147,11 @@ def solve(
         if best <= (OPTIMAL if several is SETTINGS else NEAR):
             break
     if found is None and refused:  # presolve errs now and then, so the last settings, without it, have the last word
-        raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {what}")
-    if found is None or (certified and best > USABLE):
-        missing = len(problem.cost) >= MANY and not find_spec(EXTRA)
+        raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {label}")
+    if found is None or (certify and best > USABLE):
+        missing = len(problem.cost) >= LARGE_PROGRAM and not find_spec(EXTRA)
         advice = f"; of {len(problem.cost):,} variables HiPO may: pip install 'cirl-marl[large]'" if missing else ""
-        raise Unsolved(f"network '{name}': HiGHS did not solve {what}: {status}{advice}")
+        raise SolverFailure(f"network '{name}': HiGHS did not solve {label}: {status}{advice}")
     return found
 
 
@@ -174,9 +172,9 @@ def best_values(problem: LinearProgram, size: Floats) -> Floats | None:
 
 def _settings(problem: LinearProgram) -> Sequence[HighsOptions]:
     """Return what is tried for a program; HiPO only where its package is installed, as HiGHS takes another one else."""
-    if len(problem.cost) < MANY:
+    if len(problem.cost) < LARGE_PROGRAM:
         return SETTINGS
-    return FACTORED if find_spec(EXTRA) else FACTORED[1:]
+    return LARGE_SETTINGS if find_spec(EXTRA) else LARGE_SETTINGS[1:]
 
 
 class _Scaled:
@@ -254,7 +252,7 @@ class _Scaled:
         """Return how far the multipliers leave the plan from the bound that they prove, relative to the bound."""
         if not np.isfinite(solution.certificate.equal).all() or not np.isfinite(solution.certificate.under).all():
             return math.inf
-        proof = verified(problem, solution.certificate, solution.plan)
+        proof = verify(problem, solution.certificate, solution.plan)
         # an objective near 0 is measured by the solver's tolerance on its largest term
         return abs(proof.bound - proof.objective) / max(abs(proof.bound), self._scale * FEASIBLE / OPTIMAL)
 

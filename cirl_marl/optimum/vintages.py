@@ -31,14 +31,14 @@ from cirl_marl.dynamics.stages import StagedNetwork, inside, staged
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Node
 from cirl_marl.optimum.kernels import Kernel, released
-from cirl_marl.optimum.layout import Layout
+from cirl_marl.optimum.matrices import Layout
 
 LOOSE = 2e-4
 """Distance of the bounds of what leaves, relative to it, above which intervals have more pieces."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lived:
+class PassiveLifetime:
     """A lifetime that nobody controls.
 
     Attributes:
@@ -92,7 +92,7 @@ class Lifetimes:
         rows = Rows(self._written)
         self.stocks = rows.nodes.stop
         neutral = network.control_bounds[1]
-        self.lived: list[Lived] = []
+        self.lived: list[PassiveLifetime] = []
         for node in whole:
             assert node.lifetime is not None and isinstance(self.planned, StagedNetwork)
             place, chain, planned = network.node_index[node.id], node.lifetime.chain, self.planned
@@ -102,7 +102,7 @@ class Lifetimes:
                 if node.control is not None:
                     rate = rate / neutral[network.control_rows[node.id].start]
             self.lived.append(
-                Lived(
+                PassiveLifetime(
                     node=node,
                     rows=rows.stages.get(place, np.array([place])),
                     leaving=planned.arc_index[planned.leaving[node.id]],
@@ -134,7 +134,7 @@ class Lifetimes:
                 pieces += 1
         return min(pieces, most)
 
-    def _looseness(self, each: Lived, pieces: int, degree: int) -> float:
+    def _looseness(self, each: PassiveLifetime, pieces: int, degree: int) -> float:
         """Return how far bounds of what leaves are apart, relative to it, where as much enters all the time."""
         assert each.node.lifetime is not None and each.node.lifetime.chain is not None
         count = pieces * self.network.episode.horizon
@@ -185,7 +185,7 @@ class Lifetimes:
             limits.append(to)
         return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
 
-    def of_new(self, each: Lived, layout: Layout) -> Floats:
+    def of_new(self, each: PassiveLifetime, layout: Layout) -> Floats:
         """Return what leaves of a unit of mass that is new in a stock at the start of each interval of an episode.
 
         In a fixed lifetime it counts as what entered in the interval before.
@@ -205,7 +205,7 @@ class Lifetimes:
         found = released(lifetime.chain, np.repeat(each.rate, layout.pieces), layout.length, layout.degree)
         return found[:: layout.pieces].reshape(steps, -1)
 
-    def _of_chain(self, each: Lived, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
+    def _of_chain(self, each: PassiveLifetime, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
         assert each.node.lifetime is not None and each.node.lifetime.chain is not None
         during = each.rate[intervals.start : intervals.stop]
         key = (each.node.id, during.tobytes(), layout.pieces)
@@ -221,7 +221,7 @@ class Lifetimes:
         low, high = (sparse.csr_array(bound.reshape(count, count)) for bound in (kernel.low, kernel.high))
         return sparse.vstack([out - high @ into, low @ into - out], format="csr"), np.concatenate([known, -known])
 
-    def _of_line(self, each: Lived, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
+    def _of_line(self, each: PassiveLifetime, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
         slots = each.slots(initial)
         steps, moments, delay = len(intervals), len(layout.moments), len(slots)
         leaving, entering = _columns(each, layout, steps)
@@ -235,7 +235,7 @@ class Lifetimes:
         return sparse.vstack([matrix, -matrix], format="csr"), np.concatenate([known.ravel(), -known.ravel()])
 
 
-def _columns(each: Lived, layout: Layout, steps: int) -> tuple[Integers, Integers]:
+def _columns(each: PassiveLifetime, layout: Layout, steps: int) -> tuple[Integers, Integers]:
     """Return the columns of what leaves, shape (moments of all,), and of what enters, shape (moments of all, arcs)."""
     moments = np.array([layout.flow(moment) for moment in layout.moments])
     first = (layout.size * np.arange(steps)[:, None] + moments).ravel()

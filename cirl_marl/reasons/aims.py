@@ -25,8 +25,8 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.certificate import verified
-from cirl_marl.optimum.maximise import DEGREE
+from cirl_marl.optimum.certificate import verify
+from cirl_marl.optimum.options import DEGREE
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Basis, solve
 from cirl_marl.reasons.courses import courses, setting
@@ -116,9 +116,9 @@ class _WeighedPlan:
     def against(self, weights: Floats) -> tuple[Floats, float]:
         """Return the terms of an episode that is best for weights, and what no episode exceeds."""
         problem = replace(self._problem, cost=-(weights @ self._columns))
-        solution = solve(problem, self._basis, what="the program of the best for some weights", same_rows=True)
+        solution = solve(problem, self._basis, label="the program of the best for some weights", same_rows=True)
         self._basis = solution.basis or self._basis
-        proof = verified(problem, solution.certificate, solution.plan)
+        proof = verify(problem, solution.certificate, solution.plan)
         return self._columns @ solution.plan, proof.bound
 
 

@@ -17,7 +17,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
-from cirl_marl.optimum.bounds import by_stage
+from cirl_marl.optimum.options import by_stage
 from cirl_marl.reasons.terms import PlannedEpisode
 
 ALIKE = 1e-4

@@ -16,8 +16,7 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Arc, Compartment, Control, Node
 from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum.admissible import Admissible
-from cirl_marl.optimum.bounds import Bound
-from cirl_marl.optimum.maximise import bound, highest_service
+from cirl_marl.optimum.bounds import Bound, bound, highest_service
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.sensitivity import changes, of_stocks, resting_on_rows
 

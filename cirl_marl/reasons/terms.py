@@ -16,7 +16,7 @@ from cirl_marl.drawing.style import spoken
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Arc, Node, Role
-from cirl_marl.optimum.layout import Layout
+from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
 KINDS = ("circularity", "services", "set-points")

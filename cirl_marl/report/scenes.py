@@ -22,8 +22,7 @@ from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.declared import itemised
-from cirl_marl.optimum.controller import Optimum
-from cirl_marl.optimum.mpc import SERVICE_FIRST
+from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
 
 QUANTILES = (0.025, 0.5, 0.975)
 USUAL, PLAN = "business as usual", "plan of the bound"

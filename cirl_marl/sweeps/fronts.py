@@ -16,7 +16,7 @@ import numpy as np
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.jobs import Tell
 from cirl_marl.optimum import NoCertificate, bound, gap
-from cirl_marl.optimum.maximise import highest_service
+from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.records.files import write_json
 from cirl_marl.sweeps.cells import DIGITS, Cell, plain_name
 

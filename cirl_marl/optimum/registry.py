@@ -17,13 +17,13 @@ CONTROLLERS = ("neutral", "constant", "random", "scripted", "lqr", "mpc", "optim
 
 
 def named_controller(
-    name: str, *, held: Mapping[str, float] | None = None, min_service: ArrayLike | None = None
+    name: str, *, constants: Mapping[str, float] | None = None, min_service: ArrayLike | None = None
 ) -> Controller:
     """Return a controller, not yet started.
 
     Args:
         name: one of CONTROLLERS.
-        held: agent → constant value in [−1, 1], of a constant or scripted controller.
+        constants: agent → constant value in [−1, 1], of a constant or scripted controller.
         min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for;
             None: as much as can be had.
 
@@ -32,15 +32,15 @@ def named_controller(
     """
     if name not in CONTROLLERS:
         raise CirlError(unknown("control", name, CONTROLLERS))
-    if held and name not in SETTABLE:
+    if constants and name not in SETTABLE:
         raise CirlError(f"values of single agents go with {' or '.join(SETTABLE)} control, not with {name}")
     if min_service is not None and name not in ("mpc", "optimum"):
         raise CirlError(f"a demanded service level goes with mpc or optimum control, not with {name}")
     makers: Mapping[str, Callable[[], Controller]] = {
         "neutral": Neutral,
-        "constant": lambda: Constant(held),
+        "constant": lambda: Constant(constants),
         "random": Random,
-        "scripted": lambda: Scripted(held),
+        "scripted": lambda: Scripted(constants),
         "lqr": LQR,
         "mpc": lambda: _mpc(min_service),
         "optimum": lambda: _optimum(min_service),
@@ -55,7 +55,6 @@ def _mpc(min_service: ArrayLike | None) -> Controller:
 
 
 def _optimum(min_service: ArrayLike | None) -> Controller:
-    from cirl_marl.optimum.controller import Optimum
-    from cirl_marl.optimum.mpc import SERVICE_FIRST
+    from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
 
     return Optimum(min_service=min_service, service_weight=SERVICE_FIRST if min_service is None else None)

@@ -1,0 +1,123 @@
+"""What a bound is asked for, checked: the stocks at the start, the demanded service levels, and the options."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cirl_marl.dynamics.rows import Rows
+from cirl_marl.dynamics.stages import inside
+from cirl_marl.errors import CirlError, unknown
+from cirl_marl.network import Floats, Network
+from cirl_marl.network.ages import spread
+
+DEGREE = 2
+"""Degree of the test polynomials; docs/bound.md has the gap against it."""
+
+
+def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike | None) -> Floats:
+    """Return the stocks that ``initial`` describes (see ``bound``), as the simulator has them, mass.
+
+    Those of nodes with a lifetime are spread over its stages by history or growth, unless they are given by stage.
+
+    Raises:
+        CirlError: for an unknown node, a wrong shape, or a stock that is negative or not finite.
+    """
+    start: Floats = network.initial.mean(axis=0)
+    stores = {node.id: i for i, node in enumerate(network.stores)}
+    if isinstance(initial, Mapping):
+        for node, stock in initial.items():
+            if node not in stores:
+                raise CirlError(f"initial: {unknown('node', node, stores)}")
+            start[stores[node]] = stock
+    elif initial is not None:
+        start = np.asarray(initial, dtype=float)
+        if start.ndim != 1:
+            raise CirlError(f"initial has shape {start.shape}, expected {(len(stores),)}")
+    start = by_stage(network, start)
+    check_stocks(Rows(inside(network)).start_names, start)
+    return start
+
+
+def check_options(service_weight: float | None, min_service: ArrayLike | None, degree: int) -> None:
+    """Refuse options of ``bound`` that cannot be used.
+
+    Raises:
+        CirlError: naming the option and its value.
+    """
+    if service_weight is not None and min_service is not None:
+        raise CirlError("service_weight and min_service are two ways to ask for service: give one of them")
+    if service_weight is not None and not 0 <= service_weight < math.inf:
+        raise CirlError(f"service_weight {service_weight!r} must be finite and not negative")
+    if min_service is not None:
+        check_service(min_service)
+    if not isinstance(degree, int | np.integer) or isinstance(degree, bool) or degree < 1:
+        raise CirlError(f"degree must be a whole number of at least 1, got {degree!r}")
+
+
+def by_stage(network: Network, stocks: ArrayLike) -> Floats:
+    """Return stocks of nodes, shape (..., stores), as the simulator has them, those with a lifetime by stage.
+
+    What is given by stage already stays as it is; the others are spread by history or growth.
+
+    Raises:
+        CirlError: for another shape.
+    """
+    given, rows = np.asarray(stocks, dtype=float), Rows(inside(network))
+    count = len(network.stores)
+    if given.shape[-1:] == (rows.nodes.stop,):
+        return given.copy()
+    if given.shape[-1:] != (count,):
+        raise CirlError(f"initial has shape {given.shape}, expected (..., {count})")
+    whole = np.zeros((*given.shape[:-1], rows.nodes.stop))
+    whole[..., :count] = given
+    for i, stages in rows.stages.items():
+        whole[..., stages] = given[..., i, None] * spread(network.stores[i], network.episode.control_interval)
+    return whole
+
+
+def check_stocks(names: Sequence[str], stocks: Floats) -> None:
+    """Refuse stocks, as many as ``names`` begin with, that no episode can start from.
+
+    Raises:
+        CirlError: naming a stock that is negative or not finite.
+    """
+    for name, stock in zip(names, stocks.tolist(), strict=False):
+        if not 0 <= stock < math.inf:
+            raise CirlError(f"initial: the stock of '{name}' is {stock}; it must be finite and not negative")
+
+
+def check_service(min_service: ArrayLike) -> None:
+    """Refuse mean service levels outside [0, 1].
+
+    Raises:
+        CirlError: naming the first of them.
+    """
+    for level in np.ravel(min_service).tolist():
+        if not 0 <= level <= 1:
+            raise CirlError(f"min_service {level!r} must lie in [0, 1]")
+
+
+def demanded_levels(network: Network, min_service: ArrayLike, episodes: tuple[int, ...] = ()) -> Floats:
+    """Return the demanded mean level of each service, shape (*episodes, services); a number is for every service.
+
+    Raises:
+        CirlError: for a shape that cannot be broadcast to it.
+    """
+    shape = (*episodes, len(network.services))
+    try:
+        return np.broadcast_to(np.asarray(min_service, dtype=float), shape)
+    except ValueError:
+        ids = ", ".join(service.id for service in network.services) or "none"
+        message = f"min_service has shape {np.shape(min_service)}, expected {shape}: a level for each service ({ids})"
+        raise CirlError(message) from None
+
+
+def levels_text(network: Network, levels: Floats) -> str:
+    """Say levels of the services, shape (services,): a single number if they are all the same."""
+    if len(set(levels.tolist())) == 1:
+        return f"{levels[0]:g}"
+    return ", ".join(f"{level:g} of '{service.id}'" for level, service in zip(levels, network.services, strict=True))
