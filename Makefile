@@ -44,7 +44,7 @@ wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clea
 	$(PYTHON) tests/installed.py build/clean
 
 docs: $(VENV)/.docs  ## the documents as a site in build/site; what is broken or stale ends it (some minutes)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 notebooks: $(VENV)/.docs  ## run the notebooks whose scripts have changed and keep what comes out (minutes each)
 	$(BIN)/python -m docs.site.notebooks

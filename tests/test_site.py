@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -242,10 +243,49 @@ def _without_figures(line: str) -> str:
     return re.sub(r"[-+−]?\d[\d.,]*(?:e[-+]?\d+)?|\s+|[─━]", "", line)
 
 
+TINY = """\
+INHERIT: {mkdocs}
+docs_dir: {docs}
+theme: {{name: mkdocs}}
+plugins: []
+hooks: ["{hooks}"]
+extra_css: []
+nav: [{{First: first.md}}, {{Second: second.md}}]
+"""
+"""A site with the strictness, the validation and the way of printing of ours, without its theme and plugins."""
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(
+    ("link", "code"),
+    [
+        ("[fine](second.md#a-heading) ![fine](dot.png)", 0),
+        ("[broken](no_such_page.md)", 1),
+        ("[broken](second.md#no-such-heading)", 1),
+        ("![broken](no_such_picture.png)", 1),
+    ],
+    ids=["clean", "page", "anchor", "picture"],
+)
+def test_the_way_we_build_is_strict(link: str, code: int, tmp_path: Path) -> None:
+    """Two pages, built as ``make docs`` builds ours: what leads nowhere is printed and ends it, and nothing else is."""
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "first.md").write_text(f"# First\n\n{link}\n")
+    (tmp_path / "docs" / "second.md").write_text("# Second\n\n## A heading\n")
+    (tmp_path / "docs" / "dot.png").write_bytes(b"")
+    config = tmp_path / "mkdocs.yml"
+    hooks = ROOT / "docs" / "site" / "warnings_only.py"
+    config.write_text(TINY.format(mkdocs=ROOT / "mkdocs.yml", docs=tmp_path / "docs", hooks=hooks))
+    done = built(ROOT, tmp_path / "site", "--config-file", str(config))
+    assert done.returncode == code, done.stderr
+    target = re.findall(r"\((\S+)\)", link)[0]
+    said = done.stderr + done.stdout
+    assert (f"'{target}'" in said and "Aborted with 1 warnings in strict mode" in said) if code else said == ""
+
+
 @pytest.mark.slow
 def test_the_site_builds(tmp_path: Path) -> None:
     """Strictly; with a page for each network, recipe, model and package; and no page asks the network for anything."""
-    pytest.importorskip("mkdocs", reason="needs the extra 'docs'")
+    pytest.importorskip("mkdocstrings", reason="needs the extra 'docs'")
     done = built(ROOT, tmp_path / "site")
     assert done.returncode == 0, done.stderr[-3000:]
     for place, names in (("networks", cirl_marl.networks()), ("recipes", cirl_marl.recipes()), ("models", models())):
@@ -261,7 +301,7 @@ def test_the_site_builds(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_broken_link_ends_the_build(tmp_path: Path) -> None:
     """A page, an anchor or a file that is not there, in a copy of the checkout without the pages of networks."""
-    pytest.importorskip("mkdocs", reason="needs the extra 'docs'")
+    pytest.importorskip("mkdocstrings", reason="needs the extra 'docs'")
     copy = tmp_path / "checkout"
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "runs", "build", "*_cache", "tests"))
     hooks = copy / "docs" / "site" / "hooks.py"
@@ -277,7 +317,9 @@ def test_a_broken_link_ends_the_build(tmp_path: Path) -> None:
     assert all(each in done.stderr for each in broken)
 
 
-def built(checkout: Path, site: Path) -> subprocess.CompletedProcess[str]:
-    """Build the site of a checkout."""
-    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(site)]
-    return subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
+def built(checkout: Path, site: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Build the site of a checkout by the command of ``make docs``."""
+    (line,) = re.findall(r"^docs:.*\n\tNO_MKDOCS_2_WARNING=1 \S+ (.*)$", (ROOT / "Makefile").read_text(), re.M)
+    command = [sys.executable, *line.split(), "--site-dir", str(site), *options]
+    env = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    return subprocess.run(command, cwd=checkout, env=env, capture_output=True, text=True, check=False)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.best_plans import LEFT_OUT, read_plan, replayed
-from cirl_marl import Network, VectorEnv, load_network
+from cirl_marl import MultiAgentVectorEnv, Network, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.controllers.schedule import Schedule
@@ -43,7 +43,7 @@ def network_page(name: str) -> GeneratedPage:
         CirlError: if a result that it shows is missing, or of another definition.
     """
     network = load_network(name)
-    env = VectorEnv(network, num_envs=1)
+    env = MultiAgentVectorEnv(network, num_envs=1)
     begun = beginning(env, None)
     begun.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0].copy(), env.physical.flow[:, 0].copy()
@@ -160,7 +160,7 @@ def _copies(network: Network) -> str:
     )
 
 
-def _spaces(network: Network, env: VectorEnv) -> Iterator[str]:
+def _spaces(network: Network, env: MultiAgentVectorEnv) -> Iterator[str]:
     """Yield what agents set, in physical units, and what they see, with what it is divided by."""
     low, neutral, high = network.control_bounds
     own = [agent for agent in env.agents if _is_own(network, agent)]
@@ -273,7 +273,7 @@ def check_study(name: str, folder: Path = STUDY) -> None:
     seeds = [int(row["start seed"]) for row in kept]
     network = load_network(name)
     column = f"circularity ({network.mass_unit})"
-    run = rollout(VectorEnv(network, num_envs=len(kept)), Neutral(), seed=seeds[0])
+    run = rollout(MultiAgentVectorEnv(network, num_envs=len(kept)), Neutral(), seed=seeds[0])
     for row, now in zip(kept, run.episode_circularity.tolist(), strict=True):
         before = float(row.get(column, "nan"))
         if not abs(now - before) <= SAME * abs(now):
