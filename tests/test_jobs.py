@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -196,22 +197,54 @@ def test_places_that_cannot_be(
     assert list(tmp_path.iterdir()) == []
 
 
+QUEUE = "3 at a time in the queue of Slurm"
+NO_QUEUE = "3 at a time on this machine, as there is no Slurm here (no sbatch): submitit runs them"
+
+
+def controller() -> str:
+    """Return why no job of Slurm can be done on this machine; empty if one can."""
+    if shutil.which("sbatch") is None:
+        return "no sbatch here"
+    asked = subprocess.run(["sinfo", "--noheader"], capture_output=True, check=False, timeout=60)
+    return "" if asked.returncode == 0 and asked.stdout else "sbatch is here, but no controller of Slurm answers sinfo"
+
+
 @pytest.mark.slow
 @installed("submitit")
-def test_slurm_through_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("said_of_the_place", [NO_QUEUE, QUEUE], ids=["without", "with"])
+def test_slurm_through_submitit(said_of_the_place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without Slurm it says that it is none, and does the same; what submitit does not take is refused."""
+    if said_of_the_place == NO_QUEUE:
+        (tmp_path / "bin").mkdir()
+        (tmp_path / "bin" / "tail").symlink_to(str(shutil.which("tail")))  # submitit's only command
+        monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    elif lacking := controller():
+        pytest.skip(lacking)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(TESTS), str(TESTS.parent)]))
     jobs = written(tmp_path, a="die", b="raise")
     with pytest.raises(CirlError, match="--slurm slurm_partitoin=long: submitit says: "):
         run_jobs(jobs, tmp_path / "jobs", on="slurm", settings={"slurm_partitoin": "long"})
     said: list[str] = []
     failures = run_jobs(jobs, tmp_path / "jobs", on="slurm", workers=3, say=said.append)
-    assert said == ["3 at a time on this machine, as there is no Slurm here (no sbatch): submitit runs them"]
+    assert said == [said_of_the_place]
     found = {each.name: each.said for each in failures}
     assert found["b"] == "ValueError: paper is out"
     assert found["a"].endswith(": the pen breaks")
     assert jobs[2].is_done()
     assert run_jobs(written(tmp_path), tmp_path / "jobs", on="slurm", settings={"timeout_min": "5"}) == []
+
+
+@pytest.mark.medium
+@installed("submitit")
+def test_a_queue_that_takes_no_jobs_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine may have the commands of Slurm and no controller: what sbatch says stands in one line."""
+    for name in ("sbatch", "srun", "sinfo"):
+        (tmp_path / name).write_text("#!/bin/sh\necho 'sbatch: fatal: no configuration source' >&2\nexit 1\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert controller() == "sbatch is here, but no controller of Slurm answers sinfo"
+    with pytest.raises(CirlError, match=r"^--on slurm: sbatch: fatal: no configuration source$"):
+        run_jobs(written(tmp_path), tmp_path / "jobs", on="slurm")
 
 
 @pytest.mark.slow

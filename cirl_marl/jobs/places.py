@@ -136,7 +136,7 @@ class Slurm:
         Raises:
             CirlError: if submitit is not installed, or does not take the settings.
         """
-        submitit = _wanted("submitit")
+        submitit = self._submitit = _wanted("submitit")
         self._executor = submitit.AutoExecutor(folder=folder / "slurm")
         parameters = {"name": "cirl", "cpus_per_task": 1, "timeout_min": MINUTES}
         try:
@@ -155,9 +155,16 @@ class Slurm:
             )
 
     def start(self, work: Work) -> SlurmJob:
-        """Put a job into the queue."""
+        """Put a job into the queue.
+
+        Raises:
+            CirlError: if the queue does not take it, for instance as no controller answers.
+        """
         with _one_thread():
-            return SlurmJob(self._executor.submit(work))
+            try:
+                return SlurmJob(self._executor.submit(work))
+            except self._submitit.core.utils.FailedJobError as error:
+                raise CirlError(f"--on slurm: {_last_line(error)}") from error
 
 
 class RayTask:
