@@ -35,8 +35,8 @@ from cirl_marl.network.series import Series
 
 if TYPE_CHECKING:
     from cirl_marl.learners.teams.team import Team, independent
-    from cirl_marl.reasons.aims import infer
-    from cirl_marl.reasons.explaining import explain
+    from cirl_marl.reasons.explanation import explain
+    from cirl_marl.reasons.inverse import infer
 
 __version__ = "0.1.0"
 
@@ -83,9 +83,9 @@ register()
 
 LATE = {
     "Team": "cirl_marl.learners.teams.team",
-    "explain": "cirl_marl.reasons.explaining",
+    "explain": "cirl_marl.reasons.explanation",
     "independent": "cirl_marl.learners.teams.team",
-    "infer": "cirl_marl.reasons.aims",
+    "infer": "cirl_marl.reasons.inverse",
 }
 """Where names are that are loaded when they are first asked for: what trains loads torch."""
 

@@ -33,11 +33,11 @@ from cirl_marl.controllers.basic import Random
 from cirl_marl.controllers.rollout import beginning
 from cirl_marl.controllers.schedule import schedule
 from cirl_marl.optimum import Bound, NoCertificate, bound
-from cirl_marl.reasons.aims import Aims, infer
-from cirl_marl.reasons.courses import courses
+from cirl_marl.reasons.inverse import ObjectiveWeights, infer
+from cirl_marl.reasons.objective_terms import PlannedEpisode, objective_terms
+from cirl_marl.reasons.plans import episodes_of_plan
 from cirl_marl.reasons.prices import shadow_prices
-from cirl_marl.reasons.terms import PlannedEpisode, terms
-from cirl_marl.report.aims import aims_sentences, write_aims
+from cirl_marl.report.objective_weights import weights_sentences, write_weights
 from cirl_marl.report.trajectory import write_trajectory
 
 
@@ -63,13 +63,13 @@ def course(found: Bound) -> PlannedEpisode:
     return PlannedEpisode("plan", found.initial, found.stock[1:], found.flow)
 
 
-def shares(found: Aims, weights: list[float]) -> Any:
+def shares(found: ObjectiveWeights, weights: list[float]) -> Any:
     """Return weights as shares."""
     scaled = np.array(weights) * found.spread
     return scaled / scaled.sum()
 
 
-def holds(found: Aims, weights: list[float]) -> None:
+def holds(found: ObjectiveWeights, weights: list[float]) -> None:
     """Assert that the cone contains these weights, and that its centre is within 5 % where it is that narrow."""
     assert found.fits(weights) and found.distance < 1e-6
     true = shares(found, weights)
@@ -87,7 +87,7 @@ def test_the_weight_of_a_plan_is_found(weight: float) -> None:
     """The level is worth serving where it costs less than its weight: steps of 3 % enclose the weight."""
     found = infer(ladder(), course(bound(ladder(), service_weight=weight)), within=0.0)
     holds(found, [1.0, weight])
-    assert found.found == [0, 1], "the cone is narrow"
+    assert found.identifiable == [0, 1], "the cone is narrow"
     assert found.weights(found.centre)[1] == pytest.approx(weight, rel=0.05)
 
 
@@ -110,7 +110,7 @@ def test_a_demanded_level_is_worth_its_shadow_price(network: str) -> None:
     """A plan that was made for a level, not for weights, is best for the prices of the levels."""
     short = load_network(network).with_options(episode={"horizon": 4})
     prices = shadow_prices(short, min_service=0.9)
-    weighed = terms(short, ["circularity", "services"])
+    weighed = objective_terms(short, ["circularity", "services"])
     parts = [each for each in weighed if each.kind == "circularity"]
     found = infer(short, course(prices.bound), kinds=["circularity", "services"], within=1e-4)
     assert found.fits([1.0] * len(parts) + (-prices.level).tolist())
@@ -129,7 +129,7 @@ def test_set_points_bend() -> None:
     assert [each.kind for each in found.terms] == ["circularity", "set-points"]
     # 3 = 5 − w₁ · 4/(2 w₂), so w₂ = w₁
     np.testing.assert_allclose(found.weights(found.centre), [1.0, 1.0], rtol=1e-4)
-    assert found.found == [0, 1] and found.distance < 1e-9
+    assert found.identifiable == [0, 1] and found.distance < 1e-9
 
 
 def test_what_nothing_changes_cannot_be_told() -> None:
@@ -141,7 +141,7 @@ def test_what_nothing_changes_cannot_be_told() -> None:
     found = infer(other, course(bound(other, service_weight=1.1)), within=0.0)
     idle = [each.name for each in found.terms].index("put into landfills")
     assert found.spread[idle] == 0 and (found.low[idle], found.high[idle]) == (0.0, 1.0)
-    assert any("put into landfills" in said and "nothing" in said for said in aims_sentences(found))
+    assert any("put into landfills" in said and "nothing" in said for said in weights_sentences(found))
 
 
 @pytest.mark.medium
@@ -162,7 +162,7 @@ def test_a_poor_plan_is_far_from_the_best() -> None:
     least = minimize_scalar(short, bounds=(0.02, 0.98), method="bounded", options={"xatol": 1e-4})
     assert found.distance == pytest.approx(least.fun, abs=1e-3)
     assert found.distance > 0.01
-    assert any("short of the best" in said for said in aims_sentences(found))
+    assert any("short of the best" in said for said in weights_sentences(found))
 
 
 def test_tables_of_plan_and_simulate_are_the_same_course(tmp_path: Path) -> None:
@@ -173,26 +173,26 @@ def test_tables_of_plan_and_simulate_are_the_same_course(tmp_path: Path) -> None
     planned.write(tmp_path / "plan.csv")
     begun = beginning(env, 3)
     write_trajectory(tmp_path, "simulated", env, begun, planned.rollout, "title")
-    (one,) = courses(network, tmp_path / "plan.csv", seed=3)
-    (two,) = courses(network, tmp_path / "simulated.csv")
+    (one,) = episodes_of_plan(network, tmp_path / "plan.csv", seed=3)
+    (two,) = episodes_of_plan(network, tmp_path / "simulated.csv")
     for which in ("initial", "stock", "flow"):
         np.testing.assert_allclose(getattr(one, which), getattr(two, which), rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(one.flow, planned.rollout.flow, rtol=1e-7, atol=1e-9)
     with pytest.raises(CirlError, match=r"of another start \(--seed\), scenario or definition"):
-        courses(network, tmp_path / "plan.csv")
+        episodes_of_plan(network, tmp_path / "plan.csv")
     other = load_network("copper_net").with_options(episode={"horizon": 5})
     for file in ("plan.csv", "simulated.csv"):
         with pytest.raises(CirlError, match=f"{file}: unknown column"):
-            courses(other, tmp_path / file)
+            episodes_of_plan(other, tmp_path / file)
         with pytest.raises(CirlError, match="has 5 intervals, an episode of 'carbo_net' has 160"):
-            courses(load_network("carbo_net"), tmp_path / file)
+            episodes_of_plan(load_network("carbo_net"), tmp_path / file)
     text = (tmp_path / "plan.csv").read_text().splitlines()
     (tmp_path / "bad.csv").write_text("\n".join([text[0], text[1].replace(text[1].split(",")[2], "x", 1), *text[2:]]))
     with pytest.raises(CirlError, match=r"bad\.csv, line 2: .* is 'x', not a number"):
-        courses(network, tmp_path / "bad.csv", seed=3)
+        episodes_of_plan(network, tmp_path / "bad.csv", seed=3)
     (tmp_path / "short.csv").write_text("\n".join([*text[:2], "1,2"]))
     with pytest.raises(CirlError, match=r"line 3: has 2 cells"):
-        courses(network, tmp_path / "short.csv", seed=3)
+        episodes_of_plan(network, tmp_path / "short.csv", seed=3)
 
 
 @pytest.mark.medium
@@ -201,7 +201,7 @@ def test_policies_have_aims_too(copper_run: Path, tmp_path: Path) -> None:
     found = infer("copper_net", copper_run, episodes=2, kinds=["circularity", "services"])
     assert len(found.plans) == 2 and found.network.episode.horizon == 5 and 0 <= found.distance <= 1
     assert (found.low <= found.centre + 1e-9).all() and (found.centre <= found.high + 1e-9).all()
-    path = write_aims(found, tmp_path / "aims.csv")
+    path = write_weights(found, tmp_path / "aims.csv")
     assert len(path.read_text().splitlines()) == 1 + len(found.terms)
     with pytest.raises(RunError, match="was trained on 'copper_net'"):
         infer("carbo_net", copper_run)

@@ -17,7 +17,7 @@ from cirl_marl import CirlError, MultiAgentVectorEnv, cli
 from cirl_marl.controllers.rollout import Rollout, beginning, rollout
 from cirl_marl.evaluation.simulations import ComparedQuantity, Simulation, rank_quantities, simulate_alternatives
 from cirl_marl.optimum.registry import named_controller
-from cirl_marl.report import alternatives as report
+from cirl_marl.report import differences as report
 from cirl_marl.report import trajectory
 
 GUIDE = Path(__file__).parent.parent / "envs" / "README.md"

@@ -18,8 +18,8 @@ from pages import COMPUTED, HOSTILE, bottles_at, shown, world
 from cirl_marl import load_network
 from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
 from cirl_marl.evaluation.statistics import Aggregate
-from cirl_marl.report.browser import write_page
-from cirl_marl.report.scenes import PLAN, PlanePoint, Story, of_alternatives
+from cirl_marl.report.page_html import write_page
+from cirl_marl.report.report_page import PLAN, PlanePoint, ReportPage, page_of_alternatives
 
 NEEDED = "a browser: Playwright of the extra 'browser', and Chromium (apt-get install chromium)"
 FLAGS = [
@@ -111,7 +111,7 @@ def two(folder: Path, **options: Any) -> list[Simulation]:
 def test_the_slider_moves_flows_to_the_numbers_of_the_csv(tmp_path: Path, opened: Any) -> None:
     """By keyboard: at each step ribbons, boxes, table and file tell what was simulated; widths are in proportion."""
     found = two(tmp_path)
-    path = write_page(tmp_path / "page.html", of_alternatives(found))
+    path = write_page(tmp_path / "page.html", page_of_alternatives(found))
     scale = shown(path.read_text(encoding="utf-8"))["networks"][0]["sketches"][0]["ways"]["lying"]["scale"]
     tab = opened(path)
     random = found[1].rollout
@@ -141,7 +141,7 @@ def test_the_slider_moves_flows_to_the_numbers_of_the_csv(tmp_path: Path, opened
 
 def test_hostile_texts_are_texts(tmp_path: Path, opened: Any) -> None:
     """Titles and sources that would run, end an element or compute in a spreadsheet stand there as they are."""
-    tab = opened(write_page(tmp_path / "page.html", of_alternatives(two(tmp_path, hostile=True))))
+    tab = opened(write_page(tmp_path / "page.html", page_of_alternatives(two(tmp_path, hostile=True))))
     assert tab.page.locator("#title").text_content() == HOSTILE == tab.page.title().replace("\n", "\u2028")
     assert tab.page.locator("script").count() == 2 and tab.page.locator("img").count() == 0
     tab.page.locator(".ribbon").first.focus()
@@ -153,7 +153,7 @@ def test_hostile_texts_are_texts(tmp_path: Path, opened: Any) -> None:
 def test_keyboard_and_screen_readers(tmp_path: Path, opened: Any) -> None:
     """One stop for the picture, arrows within; what is reached is told with value, unit, share and source."""
     found = two(tmp_path)
-    tab = opened(write_page(tmp_path / "page.html", of_alternatives(found)))
+    tab = opened(write_page(tmp_path / "page.html", page_of_alternatives(found)))
     page = tab.page
     for role, name in (("slider", "Time"), ("button", "Play"), ("radio", "random"), ("listbox", "Network, random")):
         assert page.get_by_role(role, name=name, exact=True).count() == 1, name
@@ -193,7 +193,7 @@ def test_keyboard_and_screen_readers(tmp_path: Path, opened: Any) -> None:
 def test_phone_dark_and_motion(tmp_path: Path, opened: Any) -> None:
     """A phone's width is enough, the diagram stands; dark is dark; with motion widths glide to the same value."""
     found = two(tmp_path)
-    path = write_page(tmp_path / "page.html", of_alternatives(found))
+    path = write_page(tmp_path / "page.html", page_of_alternatives(found))
     phone = opened(path, viewport={"width": 360, "height": 740}, color_scheme="dark", has_touch=True)
     assert phone.page.evaluate("document.documentElement.scrollWidth") == 360
     tops = phone.page.eval_on_selector_all(".box .body", "all => all.map(e => e.getBoundingClientRect().top)")
@@ -216,7 +216,7 @@ def test_phone_dark_and_motion(tmp_path: Path, opened: Any) -> None:
 
 def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
     """A world opens on its countries and one unfolds and folds again; a plan is what λ is held against; points."""
-    story = of_alternatives(simulate_alternatives(world(), controls=["neutral", "random"]))
+    story = page_of_alternatives(simulate_alternatives(world(), controls=["neutral", "random"]))
     points = (PlanePoint("plans", 0.9, -2.0, "first"), PlanePoint("plans", 0.95, -3.0))
     usual, plan = story.scenes
     front = np.array([[0.9, -1.0], [1.0, -1.5]])
@@ -245,7 +245,7 @@ def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
         "plans, first: λ̄ −2 kg, service 90.0\u00a0%",
         "plans: λ̄ −3 kg, service 95.0\u00a0%",
     ]
-    bare = opened(write_page(tmp_path / "p.html", Story("points", story.network, points=points, front=front)))
+    bare = opened(write_page(tmp_path / "p.html", ReportPage("points", story.network, points=points, front=front)))
     assert not bare.page.locator("#network").is_visible() and not bare.page.locator("#timed").is_visible()
     assert len(bare.texts("#figures tbody tr")) == 4
     assert [row["value"] for row in bare.downloaded() if row["scene"] == "plans"] == ["0.9", "-2", "0.95", "-3"]
@@ -256,7 +256,7 @@ def test_a_country_is_light_and_fast(tmp_path: Path, opened: Any) -> None:
     """The steel of Japan takes less than 2 MB and 2 s to the first picture."""
     network = load_network("steel_japan")
     path = write_page(
-        tmp_path / "steel.html", of_alternatives(simulate_alternatives(network, controls=["neutral", "random"]))
+        tmp_path / "steel.html", page_of_alternatives(simulate_alternatives(network, controls=["neutral", "random"]))
     )
     assert path.stat().st_size < 2e6
     tab = opened(path)
@@ -270,7 +270,7 @@ def test_a_world_is_light_enough(tmp_path: Path, opened: Any) -> None:
     """Five hundred nodes take less than 5 MB."""
     network = world(countries=31, horizon=26)
     path = write_page(
-        tmp_path / "w.html", of_alternatives(simulate_alternatives(network, controls=["neutral", "random"]))
+        tmp_path / "w.html", page_of_alternatives(simulate_alternatives(network, controls=["neutral", "random"]))
     )
     assert len(network.nodes) == 498 and path.stat().st_size < 5e6
     assert opened(path).page.locator(".box").count() == 33

@@ -27,7 +27,7 @@ from cirl_marl.learners import Progress, Recipe, RunDirectory, Training, load_re
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
 from cirl_marl.records.files import published
-from cirl_marl.report.comparison import FILES, write_comparison
+from cirl_marl.report.fronts import COMPARISON_FILES, write_comparison
 from cirl_marl.report.run import evaluate_run
 
 pytestmark = pytest.mark.medium
@@ -128,8 +128,10 @@ def test_evaluation_and_sweep_tell_how_far_they_are(bottles: Network, runs: list
 def test_files_are_whole_and_say_where_they_come_from(runs: list[Path], tmp_path: Path) -> None:
     """Every episode of every policy is a row; the provenance holds hashes of all that was read."""
     found = compare(runs, ["neutral"], episodes=3)
-    assert write_comparison(found, tmp_path / "out", episodes=3) == [tmp_path / "out" / name for name in FILES]
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(FILES)
+    assert write_comparison(found, tmp_path / "out", episodes=3) == [
+        tmp_path / "out" / name for name in COMPARISON_FILES
+    ]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(COMPARISON_FILES)
     with (tmp_path / "out" / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * 3

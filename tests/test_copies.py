@@ -14,7 +14,7 @@ from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import Definition, write_network
 from cirl_marl.drawing.digraph import save_network
-from cirl_marl.drawing.folding import folded
+from cirl_marl.drawing.folding import fold_copies
 from cirl_marl.learners import Recipe
 
 ONE = f'unit = "1", {SOURCE}'
@@ -179,7 +179,7 @@ def test_copies_are_folded_in_pictures(folder: Path) -> None:
     found = network(folder)
     run = rollout(MultiAgentVectorEnv(found, num_envs=1), Neutral())
     stock, flow = run.stock[-1], run.flow[-1]
-    seen, held, moved = folded(found, stock, flow)
+    seen, held, moved = fold_copies(found, stock, flow)
     assert {node.id for node in seen.nodes} == {
         "japan",
         "china",
@@ -195,15 +195,15 @@ def test_copies_are_folded_in_pictures(folder: Path) -> None:
     lost = {arc.id: float(flow[k]) for k, arc in enumerate(found.arcs)}
     assert arrows["japan", "between"] == pytest.approx(lost["japan_lost"]) and len(arrows) == 6
     assert float(seen.circularity(moved)) == pytest.approx(float(found.circularity(flow)))
-    open_, _, _ = folded(found, stock, flow, ["japan"])
+    open_, _, _ = fold_copies(found, stock, flow, ["japan"])
     shown = {arc.id for arc in open_.arcs}
     assert {"japan_sold", "japan_ore", "china_to_between"} <= shown and "china_sold" not in shown
     save_network(folder / "seen.png", found, stock, flow, unfolded=["japan"])
     assert (folder / "seen.png").stat().st_size > 1000
     with pytest.raises(CirlError, match=r"unknown copy to unfold 'jpan'\. Did you mean 'japan'\?"):
-        folded(found, stock, flow, ["jpan"])
+        fold_copies(found, stock, flow, ["jpan"])
     plain = load_network("copper_net")
-    assert folded(plain, stock, flow)[0] is plain
+    assert fold_copies(plain, stock, flow)[0] is plain
 
 
 def recipe(scheme: str) -> Recipe:

@@ -40,7 +40,7 @@ from cirl_marl.network import Network
 from cirl_marl.network.ages import remaining
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.network.lifetimes import chain_of
-from cirl_marl.report.tables import law_text, nodes_table
+from cirl_marl.report.terminal import law_text, nodes_table
 from cirl_marl.report.trajectory import write_trajectory
 
 Floats = NDArray[np.floating]

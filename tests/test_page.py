@@ -19,28 +19,28 @@ from pages import HOSTILE, bottles_at, shown, world
 from cirl_marl import CirlError, Network, load_network
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.sources import stated
-from cirl_marl.drawing.grouping import groups, sketches
-from cirl_marl.drawing.weave import NARROW, woven
+from cirl_marl.drawing.grouping import flow_diagrams, groups
+from cirl_marl.drawing.layered import NARROW, layered_layout
 from cirl_marl.errors import DefinitionError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.sampling import sample_episodes
 from cirl_marl.evaluation.simulations import simulate_alternatives
-from cirl_marl.report import browser
-from cirl_marl.report.browser import SCRIPTS, page, write_page
-from cirl_marl.report.document import document
-from cirl_marl.report.scenes import (
+from cirl_marl.report import page_html as html_module
+from cirl_marl.report.page_data import page_data
+from cirl_marl.report.page_html import SCRIPTS, page_html, write_page
+from cirl_marl.report.report_page import (
     PLAN,
     USUAL,
     PlanePoint,
-    Story,
-    of_alternatives,
-    of_comparison,
-    of_samples,
-    with_plan,
+    ReportPage,
+    add_plan,
+    page_of_alternatives,
+    page_of_comparison,
+    page_of_samples,
 )
 from cirl_marl.report.trajectory import trajectory_table
 
-PARTS = Path(browser.__file__).parent / "page"
+PARTS = Path(html_module.__file__).parent / "page"
 
 
 @st.composite
@@ -58,11 +58,11 @@ def test_nothing_overlaps(drawn: tuple[int, list[tuple[int, int]], list[float]])
     count, pairs, given_widths = drawn
     donors, recipients = np.array(pairs, dtype=np.intp).T
     widths, breadths = np.array(given_widths), np.full(count, 30.0)
-    found = woven(donors, recipients, widths, breadths, 14.0)
+    found = layered_layout(donors, recipients, widths, breadths, 14.0)
     crossed = defaultdict(list)
     for node in range(count):
         crossed[found.layers[node]].append((found.middles[node], 30.0))
-    for (donor, recipient), width, course in zip(pairs, given_widths, found.courses, strict=True):
+    for (donor, recipient), width, course in zip(pairs, given_widths, found.routes, strict=True):
         low, high = sorted((found.layers[donor], found.layers[recipient]))
         if course.side:
             assert found.layers[donor] >= found.layers[recipient]
@@ -79,15 +79,17 @@ def test_nothing_overlaps(drawn: tuple[int, list[tuple[int, int]], list[float]])
         items.sort()
         for (at, size), (next_, more) in pairwise(items):
             assert next_ - at >= (size + more) / 2 + NARROW - 1e-6
-    again = woven(donors, recipients, widths, breadths, 14.0)
-    assert np.array_equal(again.middles, found.middles) and again.courses == found.courses
+    again = layered_layout(donors, recipients, widths, breadths, 14.0)
+    assert np.array_equal(again.middles, found.middles) and again.routes == found.routes
 
 
 def test_the_larger_flow_leads_forward() -> None:
     """Of a cycle the least flow is the loop, and a source stands before all others."""
-    found = woven(np.array([0, 1, 2, 3]), np.array([1, 2, 3, 1]), np.array([2.0, 9, 9, 3]), np.full(4, 20.0), 10.0)
+    found = layered_layout(
+        np.array([0, 1, 2, 3]), np.array([1, 2, 3, 1]), np.array([2.0, 9, 9, 3]), np.full(4, 20.0), 10.0
+    )
     assert found.layers.tolist() == [0, 1, 2, 3]
-    assert [course.side != 0 for course in found.courses] == [False, False, False, True]
+    assert [course.side != 0 for course in found.routes] == [False, False, False, True]
 
 
 @pytest.mark.medium
@@ -97,14 +99,14 @@ def test_groups_fold_and_unfold() -> None:
     assert list(groups(network)) == [f"Country {c}" for c in range(4)]
     assert groups(world(countries=3)) == {}, "small"
     assert groups(load_network("steel_japan")) == {}
-    whole, *inside = sketches(network, np.ones(len(network.arcs)))
+    whole, *inside = flow_diagrams(network, np.ones(len(network.arcs)))
     assert [box.label for box in whole.boxes] == ["World market", "World store", *groups(network)]
     assert sum(len(ribbon.members) for ribbon in whole.ribbons) == 3 * 4 + 1, "what stays in a country is not drawn"
     assert {box.opens for box in whole.boxes} == {"", *groups(network)}
-    weave = whole.weaves["lying"]
+    weave = whole.layouts["lying"]
     assert weave.layers.tolist() == [1, 1, 2, 2, 2, 2], "the markets stand beside who takes more than he gives"
-    assert [course.back for course in weave.courses] == [weave.layers[each.donor] == 2 for each in whole.ribbons]
-    assert [course.side != 0 for course in weave.courses] == [each.members == (0,) for each in whole.ribbons]
+    assert [course.back for course in weave.routes] == [weave.layers[each.donor] == 2 for each in whole.ribbons]
+    assert [course.side != 0 for course in weave.routes] == [each.members == (0,) for each in whole.ribbons]
     assert [each.group for each in inside] == list(groups(network))
     assert {box.label for box in inside[1].boxes} == {"World market", "World store", *(f"part {i}" for i in range(16))}
     assert all("c1_" in network.arcs[k].id for ribbon in inside[1].ribbons for k in ribbon.members)
@@ -140,7 +142,7 @@ def test_sources_follow_scenario_and_file(tmp_path: Path) -> None:
 def test_the_page_shows_what_was_simulated(tmp_path: Path) -> None:
     """Stocks, flows, λ, service and controls are those of the CSV file, to six digits; start and units included."""
     (found,) = simulate_alternatives(bottles_at(tmp_path))
-    told = document(of_alternatives([found]))
+    told = page_data(page_of_alternatives([found]))
     header, rows = trajectory_table(found.env, found.begun, found.rollout)
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
     (scene,), (network,) = told["scenes"], told["networks"]
@@ -160,7 +162,7 @@ def test_the_page_shows_what_was_simulated(tmp_path: Path) -> None:
 def test_the_page_of_a_comparison(tmp_path: Path) -> None:
     """Business as usual comes first; bands are intervals over episodes, flows those of the first; the plan is best."""
     found = compare([], ["random", "neutral"], network=bottles_at(tmp_path, days=4), episodes=3)
-    story = of_comparison(found)
+    story = page_of_comparison(found)
     assert [scene.name for scene in story.scenes] == [USUAL, "random"]
     usual, random = story.scenes
     entry = next(each for each in found.entries if each.name == "random")
@@ -172,12 +174,12 @@ def test_the_page_of_a_comparison(tmp_path: Path) -> None:
     np.testing.assert_allclose(usual.start + moved, entry.rollout.stock[0], rtol=1e-9, err_msg="the first start")
     assert random.figures["gap"] == found.rows[0].figure("gap") and len(story.front)
     env = next(each.env for each in simulate_alternatives(found.network))
-    best = with_plan(of_comparison(found, without=["random"]), found, env)
+    best = add_plan(page_of_comparison(found, without=["random"]), found, env)
     assert [scene.name for scene in best.scenes] == [USUAL, PLAN]
     assert found.entries[0].bound is not None
     planned, bound = float(best.scenes[-1].circularity.value.mean()), float(found.entries[0].bound[0])
     assert float(entry.circularity[0]) < planned <= bound + 1e-9
-    told = document(best)
+    told = page_data(best)
     assert [scene["plan"] for scene in told["scenes"]] == [False, True]
     mean = found.rows[1].figure("bound")
     assert mean is not None and told["scenes"][0]["figures"]["bound"][0] == pytest.approx(mean.value, rel=1e-5)
@@ -190,7 +192,7 @@ def test_the_page_of_samples(tmp_path: Path) -> None:
     bottles_at(tmp_path)
     path.write_text(path.read_text().replace("rate = { value = 0.05,", 'rate = { value = 0.05, deviation = "9 %",'))
     found = sample_episodes(load_network(path), samples=5)
-    (scene,) = document(of_samples(found, "neutral"))["scenes"]
+    (scene,) = page_data(page_of_samples(found, "neutral"))["scenes"]
     assert {values[0] for values in scene["levels"]} == {None}
     np.testing.assert_allclose(scene["lambda"]["high"], np.quantile(found.circularity, 0.975, axis=0), rtol=1e-5)
     assert scene["controls"] is None and "5 samples" in scene["about"]
@@ -199,7 +201,7 @@ def test_the_page_of_samples(tmp_path: Path) -> None:
 def test_no_text_can_run(tmp_path: Path) -> None:
     """Hostile titles and sources stand in the data as they are, nowhere as markup; hashes allow the script alone."""
     network = bottles_at(tmp_path, hostile=True)
-    text = page(of_alternatives(simulate_alternatives(network)))
+    text = page_html(page_of_alternatives(simulate_alternatives(network)))
     told = shown(text)
     assert told["title"] == HOSTILE == told["networks"][0]["arcs"][0]["label"]
     assert HOSTILE in {source for *_, source in told["networks"][0]["arcs"][0]["told"]}
@@ -234,12 +236,12 @@ def test_the_script_has_no_way_out() -> None:
 def test_a_page_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What cannot be written, or shown, leaves the page that was there."""
     network = bottles_at(tmp_path, days=2)
-    story = of_alternatives(simulate_alternatives(network))
+    story = page_of_alternatives(simulate_alternatives(network))
     path = write_page(tmp_path / "new" / "page.html", story)
     before = path.read_text(encoding="utf-8")
     with pytest.raises(CirlError, match="network 'bottles': there is nothing to show, neither episodes nor points"):
-        write_page(path, Story("nothing", network))
-    (other,) = of_alternatives(simulate_alternatives(network, steps=3)).scenes
+        write_page(path, ReportPage("nothing", network))
+    (other,) = page_of_alternatives(simulate_alternatives(network, steps=3)).scenes
     with pytest.raises(CirlError, match=r"2 intervals of 1 day, '.*' 3 of 1: a page shows them by one clock"):
         write_page(path, replace(story, scenes=(*story.scenes, other)))
 
@@ -259,6 +261,6 @@ def test_points_alone_are_a_page(tmp_path: Path) -> None:
     """A sweep has no episodes: what is there are its points and the bound."""
     network: Network = bottles_at(tmp_path)
     points = (PlanePoint("plans", 0.9, -2.0), PlanePoint("plans", float("nan"), -3.0))
-    told = document(Story("sweep", network, points=points, front=np.array([[0.9, -1.0], [1.0, -1.5]])))
+    told = page_data(ReportPage("sweep", network, points=points, front=np.array([[0.9, -1.0], [1.0, -1.5]])))
     assert told["scenes"] == told["networks"] == [] and told["front"] == [[0.9, -1], [1, -1.5]]
     assert [each["service"] for each in told["points"]] == [0.9, None]

@@ -26,14 +26,14 @@ from cirl_marl.learners.policies import DifferentiablePolicy, Policies, Policy
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation, Recipe, Run
 from cirl_marl.learners.views import OneAgent
 from cirl_marl.reasons import extras
-from cirl_marl.reasons.explaining import explain
-from cirl_marl.reasons.inputs import _memories, inputs
-from cirl_marl.reasons.rules import rules
-from cirl_marl.reasons.signals import columns, signal
-from cirl_marl.reasons.watching import Watching, played
-from cirl_marl.reasons.words import of_inputs, of_rule
-from cirl_marl.report.browser import page
-from cirl_marl.report.reasons import reasons_of, write_reasons
+from cirl_marl.reasons.attribution import _memories, attribute_inputs
+from cirl_marl.reasons.explanation import explain
+from cirl_marl.reasons.interventions import Recorder, play_episodes
+from cirl_marl.reasons.observations import policy_columns, signal_of
+from cirl_marl.reasons.rules import distil_rules
+from cirl_marl.reasons.sentences import input_sentence, rule_sentences
+from cirl_marl.report.explanations import read_reasons, write_reasons
+from cirl_marl.report.page_html import page_html
 from cirl_marl.report.run import evaluate_story
 
 Floats = NDArray[np.floating]
@@ -76,9 +76,9 @@ def test_a_linear_policy_is_attributed_exactly() -> None:
     weights[[0, 1, size - 1]] = 0.05, -0.2, 0.4
     known = {"use_to_collection": lambda seen: (seen @ torch.as_tensor(weights, dtype=seen.dtype))[:, None]}
     policies, watching = Known(env, known), None
-    watching = Watching(policies)
-    usual = played(env, watching, FIRST)
-    found, other = inputs(env, policies, policies, watching.seen, usual, FIRST, top=3)
+    watching = Recorder(policies)
+    usual = play_episodes(env, watching, FIRST)
+    found, other = attribute_inputs(env, policies, policies, watching.seen, usual, FIRST, top=3)
     seen = watching.seen.observations["use_to_collection"].reshape(-1, size)
     sizes = np.abs(weights * (seen - seen.mean(axis=0))).mean(axis=0)
     order = np.argsort(-sizes)
@@ -89,8 +89,10 @@ def test_a_linear_policy_is_attributed_exactly() -> None:
     assert found.missed < 1e-4
     assert found.least_held is not None and found.least_held.circularity.value == 0.0
     assert abs(found.top_held.circularity.value) > 1e-6
-    assert "looks at" in of_inputs(env.network, found) and "acts more as it rises" in of_inputs(env.network, found)
-    assert not other.share.any() and "always does the same" in of_inputs(env.network, other)
+    assert "looks at" in input_sentence(env.network, found) and "acts more as it rises" in input_sentence(
+        env.network, found
+    )
+    assert not other.share.any() and "always does the same" in input_sentence(env.network, other)
 
 
 def dated(network: Network) -> Network:
@@ -114,11 +116,11 @@ def test_a_rule_is_found_again() -> None:
         return torch.where(late & full, 1.0, -1.0)[:, None]
 
     policies = Known(env, {"use_to_collection": opens})
-    usual = played(env, policies, FIRST)
-    found = rules(env, policies, usual, FIRST, leaves=4)
+    usual = play_episodes(env, policies, FIRST)
+    found = distil_rules(env, policies, usual, FIRST, leaves=4)
     rule, idle = found.rules
     assert rule.explained > 0.99 and idle.explained == 1.0
-    said = of_rule(network, rule)
+    said = rule_sentences(network, rule)
     opened = next(each for each in said if "opens" in each)
     assert opened.startswith("From 2031 on, while stock of Copper in use is above 2") or opened.startswith(
         "From 2031 on, while stock of Copper in use is above 1"
@@ -130,7 +132,7 @@ def test_a_rule_is_found_again() -> None:
     assert leaf.control[0] == pytest.approx(high) and low < high
     # it loses what it gets wrong close to the limit, next to nothing
     assert abs(rule.cost.circularity.value) < 2e-2 * abs(rule.cost.usual)
-    assert of_rule(network, idle)[0].startswith("Always")
+    assert rule_sentences(network, idle)[0].startswith("Always")
 
 
 def settings(algorithm: str, scheme: str = "independent", **more: Any) -> LearnerSettings:
@@ -178,12 +180,12 @@ def test_every_kind_of_policy_is_differentiated(tmp_path: Path, kind: str) -> No
     """The function that is differentiated does, row by row, what the policy did; gradients add up."""
     policies = Trained(learnt(tmp_path, kind))
     env = policies.run.make_env(3)
-    watching = Watching(policies)
-    usual = played(env, watching, FIRST)
+    watching = Recorder(policies)
+    usual = play_episodes(env, watching, FIRST)
     seen = watching.seen
     for agent in env.agents:
         name, policy = next(each for each in policies.policies.items() if agent in each[1].view.agents)
-        acting, where, view = DifferentiablePolicy(policy), columns(env, policy.view, agent), policy.view
+        acting, where, view = DifferentiablePolicy(policy), policy_columns(env, policy.view, agent), policy.view
         flat = {each: seen.observations[each].reshape(18, -1) for each in view.agents}
         place = view.row_agents.index(agent) if view.row_agents else 0
         rows = torch.as_tensor(view.rows(flat)[18 * place : 18 * (place + 1)].astype(np.float32))
@@ -201,7 +203,7 @@ def test_every_kind_of_policy_is_differentiated(tmp_path: Path, kind: str) -> No
                 )
         if kind == "joint":
             assert set(where.names) == {name for each in AGENTS for name in env.observation_names[each]}
-    for each in inputs(env, policies, Trained(tmp_path / "run"), seen, usual, FIRST):
+    for each in attribute_inputs(env, policies, Trained(tmp_path / "run"), seen, usual, FIRST):
         assert each.missed < 0.02 and each.share.sum() == pytest.approx(1.0)
 
 
@@ -210,26 +212,26 @@ def test_a_run_is_explained_and_written(tmp_path: Path) -> None:
     """Text, tables and picture; a page of the run finds them, one of another checkpoint does not."""
     own_copper_run = learnt(tmp_path, "independent")
     run = Trained(own_copper_run).run
-    assert reasons_of(run, "any") == ((), f"no reasons: cirl explain {run.path.name} finds them")
+    assert read_reasons(run, "any") == ((), f"no reasons: cirl explain {run.path.name} finds them")
     found = explain(own_copper_run, episodes=3)
     assert found.prices is not None and len(found.inputs) == 3 and found.rules is not None
     written = write_reasons(found, own_copper_run / "reasons")
     assert {path.name for path in written} == {
         "reasons.txt", "reasons.json", "prices.csv", "inputs.csv", "rules.csv", "reasons.png",
     }  # fmt: skip
-    sections, missing = reasons_of(run, found.checkpoint)
+    sections, missing = read_reasons(run, found.checkpoint)
     assert not missing and "\n".join(sections[0][1]) in (own_copper_run / "reasons" / "reasons.txt").read_text("utf-8")
     with (own_copper_run / "reasons" / "inputs.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     shares = [float(row["share"]) for row in rows if row["agent"] == "use_to_collection"]
     assert sum(shares) == pytest.approx(1.0) and shares == sorted(shares, reverse=True)
-    assert "another checkpoint" in reasons_of(run, "000000001-best")[1]
+    assert "another checkpoint" in read_reasons(run, "000000001-best")[1]
     (_, _, _), story = evaluate_story(run, episodes=2, seed=0, progress=lambda what, share: None)
-    assert shown(page(story))["reasons"][1]["title"] == "Manufacture of products"
+    assert shown(page_html(story))["reasons"][1]["title"] == "Manufacture of products"
     told = json.loads((own_copper_run / "reasons" / "reasons.json").read_text())
     (own_copper_run / "reasons" / "reasons.json").write_text(json.dumps({**told, "sections": 3}))
     with pytest.raises(RunError, match=r"reasons\.json: cannot be read"):
-        reasons_of(run, found.checkpoint)
+        read_reasons(run, found.checkpoint)
 
 
 @pytest.mark.parametrize(
@@ -267,7 +269,7 @@ def test_signals_have_units() -> None:
     network = load_network("copper_net")
     units = {"stock of use": "kt", "flow of mine_to_refinery": "kt/day", "time": "day", "service level of x": "1"}
     for name, unit in units.items():
-        assert signal(network, name).unit == unit
-    assert signal(network, "stock of use").scale == network.compartments["use"].scale
-    assert signal(network, "time").scale == network.episode.horizon * network.episode.control_interval
-    assert signal(load_network("solids_net"), "truck.speed").scale == 1.0
+        assert signal_of(network, name).unit == unit
+    assert signal_of(network, "stock of use").scale == network.compartments["use"].scale
+    assert signal_of(network, "time").scale == network.episode.horizon * network.episode.control_interval
+    assert signal_of(load_network("solids_net"), "truck.speed").scale == 1.0

@@ -21,8 +21,8 @@ from small_networks import ONE_OF_EACH
 import cirl_marl
 from cirl_marl import Arc, CirlError, Network, Node, Role
 from cirl_marl.drawing import picture as drawing
-from cirl_marl.drawing.arrangement import arrangement_of
 from cirl_marl.drawing.digraph import Canvas, draw_network, save_before_after, save_network
+from cirl_marl.drawing.digraph_layout import digraph_layout
 from cirl_marl.drawing.picture import legend_of
 from cirl_marl.network import Floats
 from cirl_marl.report import curves
@@ -97,7 +97,7 @@ def test_catalogue_is_readable(name: str) -> None:
     """No box or label hides another; but for networks of more than twenty arcs no arrow passes behind a box."""
     network = cirl_marl.load_network(name)
     for aspect in (0.9, 1.6):
-        layout = arrangement_of(network, aspect)
+        layout = digraph_layout(network, aspect)
         assert layout.routes is not None
         for one, two in combinations(layout.positions, 2):
             assert (np.abs(one - two) > layout.box).any()
@@ -137,7 +137,7 @@ def test_long_chain_and_ring(tmp_path: Path, nodes: int) -> None:
             nodes=tuple(Node(id=f"n{i}", initial=(0.0, 0.0)) for i in range(nodes)),
             arcs=tuple(Arc(id=f"a{i}", donor=f"n{i}", recipient=f"n{j}", rate=0.1) for i, j in pairs),
         )
-        positions = arrangement_of(network, 1.4).positions
+        positions = digraph_layout(network, 1.4).positions
         assert len(np.unique(positions, axis=0)) == nodes
         width, height = np.ptp(positions, axis=0)
         assert 0.3 < width / max(height, 1.0) < 12
@@ -148,7 +148,7 @@ def test_long_chain_and_ring(tmp_path: Path, nodes: int) -> None:
 def test_opposite_arcs_keep_apart() -> None:
     """Two arcs between the same compartments bend to opposite sides."""
     network = cirl_marl.load_network("carbo_net")
-    routes = arrangement_of(network, 1.4).routes
+    routes = digraph_layout(network, 1.4).routes
     assert routes is not None
     there, back = (routes.curves[network.arc_index[arc]] for arc in ("urban_to_adjacent", "adjacent_to_urban"))
     assert np.hypot(*(there[:, None] - back).T).min() > 1.5

@@ -57,7 +57,7 @@ def compare(
     Where nothing bounds a network, optimum is the best plan that a search by simulation finds, without certificate.
     """
     from cirl_marl.evaluation import compare as compared
-    from cirl_marl.report.comparison import comparison_notes, comparison_table, write_comparison
+    from cirl_marl.report.fronts import comparison_notes, comparison_table, write_comparison
 
     names = common.listed(controllers)
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
@@ -71,10 +71,10 @@ def compare(
         for path in write_comparison(found, folder, controllers=names, **asked):
             say(f"wrote {path}")
     if page is not None:
-        from cirl_marl.report.browser import write_page
-        from cirl_marl.report.scenes import of_comparison
+        from cirl_marl.report.page_html import write_page
+        from cirl_marl.report.report_page import page_of_comparison
 
-        say(f"wrote {write_page(page, of_comparison(found))}")
+        say(f"wrote {write_page(page, page_of_comparison(found))}")
 
 
 @app.command(rich_help_panel=COMPARING)
@@ -104,7 +104,7 @@ def pareto(
     Finished trainings are kept: the same command goes on where it was stopped.
     """
     from cirl_marl.evaluation.pareto import pareto_front as swept
-    from cirl_marl.report.sweep import write_sweep
+    from cirl_marl.report.fronts import write_front
 
     page = common.page_for(html)
     folder = common.folder_for(
@@ -124,10 +124,10 @@ def pareto(
             say(f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {found.network.mass_unit}{about}")
     if found.reason:
         say(f"no bound: {found.reason}")
-    for path in write_sweep(found, folder, recipe=recipe, **asked):
+    for path in write_front(found, folder, recipe=recipe, **asked):
         say(f"wrote {path}")
     if page is not None:
-        from cirl_marl.report.browser import write_page
-        from cirl_marl.report.scenes import of_sweep
+        from cirl_marl.report.page_html import write_page
+        from cirl_marl.report.report_page import page_of_front
 
-        say(f"wrote {write_page(page, of_sweep(found))}")
+        say(f"wrote {write_page(page, page_of_front(found))}")

@@ -93,10 +93,10 @@ def simulate(
     else:
         _write_several(folder, files)
     if page is not None:
-        from cirl_marl.report.browser import write_page
-        from cirl_marl.report.scenes import of_alternatives
+        from cirl_marl.report.page_html import write_page
+        from cirl_marl.report.report_page import page_of_alternatives
 
-        say(f"wrote {write_page(page, of_alternatives(found))}")
+        say(f"wrote {write_page(page, page_of_alternatives(found))}")
 
 
 def _sample(
@@ -134,10 +134,10 @@ def _sample(
     else:
         say(f"which number causes the spread is told from {FEWEST} samples on")
     if page is not None:
-        from cirl_marl.report.browser import write_page
-        from cirl_marl.report.scenes import of_samples
+        from cirl_marl.report.page_html import write_page
+        from cirl_marl.report.report_page import page_of_samples
 
-        written.append(write_page(page, of_samples(found, controls[0])))
+        written.append(write_page(page, page_of_samples(found, controls[0])))
     say(f"wrote {', '.join(map(str, written))}")
 
 
@@ -153,7 +153,7 @@ def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
 
 def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
     """Write and say what became of alternatives, and what differs between them."""
-    from cirl_marl.report.alternatives import ROWS, differences_table, write_alternatives
+    from cirl_marl.report.differences import ROWS, differences_table, write_alternatives
 
     found = list(files.values())
     network, quantities = found[0].network, rank_quantities(found)
@@ -212,11 +212,11 @@ def plan(
     title = f"{env.network.title or env.network.name}: {'what was learnt' if control is None else control}"
     beside = write_decisions(path, found, title=title)
     if page is not None:
-        from cirl_marl.report.browser import write_page
-        from cirl_marl.report.scenes import PLAN, of_schedule
+        from cirl_marl.report.page_html import write_page
+        from cirl_marl.report.report_page import PLAN, page_of_schedule
 
         name = "trained" if control is None else PLAN if control == "optimum" and not controller.note else control
-        beside.append(write_page(page, of_schedule(found, name, note=controller.note)))
+        beside.append(write_page(page, page_of_schedule(found, name, note=controller.note)))
     console.print(decisions_table(found))
     console.print(savings_table(found))
     _say_figures(found.rollout, env.network, found.begun)

@@ -47,8 +47,8 @@ def explain(
     what they lose in the policy's place. Inputs and rules need the extra explain. `cirl report RUN --html` shows what
     is found.
     """
-    from cirl_marl.reasons.explaining import explain as explained
-    from cirl_marl.report.reasons import FOLDER, inputs_table, prices_table, write_reasons
+    from cirl_marl.reasons.explanation import explain as explained
+    from cirl_marl.report.explanations import FOLDER, inputs_table, prices_table, write_reasons
 
     is_run = (Path(source) / "config.json").is_file()
     if out is None:
@@ -65,7 +65,7 @@ def explain(
             progress=progress,
             **asked,
         )
-    from cirl_marl.reasons.words import paragraphs
+    from cirl_marl.reasons.sentences import paragraphs
 
     if found.prices is not None:
         console.print(prices_table(found.prices))
@@ -107,9 +107,9 @@ def infer(
     Inverse linear programming with the rows of the bound: the weights that fit form a cone, which several plans narrow.
     Weights are shares of all, each term measured by how much of it there is to be had.
     """
-    from cirl_marl.reasons.aims import infer as inferred
-    from cirl_marl.reasons.terms import KINDS
-    from cirl_marl.report.aims import aims_sentences, aims_table, write_aims
+    from cirl_marl.reasons.inverse import infer as inferred
+    from cirl_marl.reasons.objective_terms import KINDS
+    from cirl_marl.report.objective_weights import weights_sentences, weights_table, write_weights
 
     if out is not None:
         if out.suffix != ".csv":
@@ -128,8 +128,8 @@ def infer(
             episodes=episodes,
             progress=progress,
         )
-    console.print(aims_table(found))
-    for each in aims_sentences(found):
+    console.print(weights_table(found))
+    for each in weights_sentences(found):
         say(each)
     if out is not None:
-        say(f"wrote {write_aims(found, out)}")
+        say(f"wrote {write_weights(found, out)}")

@@ -126,7 +126,7 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     """
     from cirl_marl.learners.run_directory import RunDirectory
     from cirl_marl.report.run import choice, evaluate_run
-    from cirl_marl.report.tables import evaluation_table, local_returns_table
+    from cirl_marl.report.terminal import evaluation_table, local_returns_table
 
     with shares() as progress:
         figures, rollouts, env = evaluate_run(RunDirectory(run), episodes=episodes, seed=seed, progress=progress)
@@ -273,7 +273,7 @@ def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | No
     """Evaluate a run, say what came of it and draw its pictures; with ``page`` also hold it against the best."""
     from cirl_marl.learners.run_directory import RunDirectory
     from cirl_marl.report.run import choice, draw_run, evaluate_run, evaluate_story
-    from cirl_marl.report.tables import evaluation_table
+    from cirl_marl.report.terminal import evaluation_table
 
     run, story = RunDirectory(directory), None
     with shares() as progress:
@@ -287,7 +287,7 @@ def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | No
     for path in draw_run(run, rollouts, env):
         say(f"picture: {path}")
     if page is not None and story is not None:
-        from cirl_marl.report.browser import write_page
+        from cirl_marl.report.page_html import write_page
 
         say(f"wrote {write_page(page, story)}")
     if not run.metrics()["env_steps"]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @app.command("networks", rich_help_panel=NETWORKS)
 def list_networks() -> None:
     """List the networks and the learner recipes of the catalogue."""
-    from cirl_marl.report.tables import networks_table
+    from cirl_marl.report.terminal import networks_table
 
     found, known = {}, families()
     with bar("reading") as progress:
@@ -77,15 +77,15 @@ def show(
 ) -> None:
     """Show the compartments, flows and circularity of a network at its start state, and draw it."""
     from cirl_marl.drawing.digraph import save_network
-    from cirl_marl.drawing.folding import folded
-    from cirl_marl.report.tables import arcs_table, nodes_table
+    from cirl_marl.drawing.folding import fold_copies
+    from cirl_marl.report.terminal import arcs_table, nodes_table
 
     found = load_network(network, scenario=scenario)
     env = MultiAgentVectorEnv(found, num_envs=1)
     begun = beginning(env, seed)
     begun.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0], env.physical.flow[:, 0]
-    shown = folded(found, stock, flow, unfold or ())
+    shown = fold_copies(found, stock, flow, unfold or ())
     console.print(nodes_table(shown[0], shown[1]))
     console.print(arcs_table(shown[0], shown[2]))
     for service in found.services:

@@ -11,9 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cirl_marl.drawing.folding import folded
+from cirl_marl.drawing.folding import fold_copies
 from cirl_marl.drawing.picture import draw_network, largest_flow, legend_of
-from cirl_marl.drawing.style import number, save, spoken
+from cirl_marl.drawing.style import number, readable, save
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
@@ -67,7 +67,7 @@ class Canvas:
     def __init__(self, network: Network, *, window: bool) -> None:
         """Prepare pictures of ``network``; a ``CirlError`` if a window is wanted and pygame is not installed."""
         self._network = network
-        self._window = Window(spoken(network.name)) if window else None
+        self._window = Window(readable(network.name)) if window else None
         self._reference = max((arc.scale for arc in network.arcs), default=0.0)
         self._figure = Figure(figsize=FRAME_INCHES, dpi=FRAME_DPI, facecolor="white")
         self._agg = FigureCanvasAgg(self._figure)
@@ -78,11 +78,11 @@ class Canvas:
 
         ``time`` is that of the stocks, for the heading; for the others see ``draw_network``.
         """
-        network, stock, flow = folded(self._network, stock, flow)
+        network, stock, flow = fold_copies(self._network, stock, flow)
         reference = max(self._reference, largest_flow(flow))
         calendar, dates = labels(network, time)
         when = [*calendar, *dates[0]] if dates else [network.time_unit, number(time)]
-        title = f"{spoken(network.name)}, {' '.join(when)}"
+        title = f"{readable(network.name)}, {' '.join(when)}"
         draw_network(self._axes, network, stock, flow, title=title, circularity=circularity, reference_flow=reference)
         self._agg.draw()  # type: ignore[no-untyped-call]
         pixels = np.asarray(self._agg.buffer_rgba())  # type: ignore[no-untyped-call]
@@ -111,7 +111,7 @@ def save_network(
     Its folder is made; without a title it has that of the network. Copies are folded, but for those ``unfolded``. For
     the other arguments see ``draw_network``.
     """
-    network, stock, flow = folded(network, stock, flow, unfolded)
+    network, stock, flow = fold_copies(network, stock, flow, unfolded)
     figure = Figure(figsize=FRAME_INCHES)
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.87))
     draw_network(axes, network, stock, flow, title=title, circularity=circularity)
@@ -140,7 +140,7 @@ def save_before_after(
     reference = max(largest_flow(np.asarray(flow)) for _, flow in (before, after))
     for column, ((stock, flow), label, value) in enumerate(zip((before, after), labels, circularity, strict=True)):
         axes = figure.add_axes((0.005 + 0.5 * column, 0.1, 0.49, 0.78))
-        shown, stock, flow = folded(network, stock, flow)
+        shown, stock, flow = fold_copies(network, stock, flow)
         draw_network(axes, shown, stock, flow, title=label, circularity=value, reference_flow=reference, legend=False)
     figure.legend(**legend_of(network, reference), loc="lower center", ncols=3)
     return save(figure, path)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cirl_marl.drawing.style import spoken
+from cirl_marl.drawing.style import readable
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Arc, Law, Node, Role
@@ -25,7 +25,7 @@ class FoldedNetwork(Network):
         object.__setattr__(self, "nodes", tuple(sorted(self.nodes, key=lambda node: not node.stores)))
 
 
-def folded(
+def fold_copies(
     network: Network, stock: Floats, flow: Floats, unfolded: Collection[str] = ()
 ) -> tuple[Network, Floats, Floats]:
     """Return a network with its stocks and flows in which each copy is one box; one without copies is left as it is.
@@ -77,6 +77,6 @@ def _box(node: Node, region: str | None, network: Network) -> Node:
         own = any(node.id in nodes for nodes in network.copies.values())
         return node if own or node.stores else Node(id=MARKETS, title="Markets", stores=False)
     if node.role is Role.TECHNOSPHERE:
-        return Node(id=region, title=spoken(region).title())
-    name = {Role.NONRENEWABLE_RESERVOIR: "Reservoirs", Role.LANDFILL: "Landfills"}.get(node.role, spoken(node.role))
+        return Node(id=region, title=readable(region).title())
+    name = {Role.NONRENEWABLE_RESERVOIR: "Reservoirs", Role.LANDFILL: "Landfills"}.get(node.role, readable(node.role))
     return Node(id=f"all_{node.role.value}", title=name, role=node.role)

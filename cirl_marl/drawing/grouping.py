@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cirl_marl.drawing.sketch import Box, Ribbon, Sketch, placed, sketch
-from cirl_marl.drawing.style import spoken
+from cirl_marl.drawing.flow_diagram import Box, FlowDiagram, Ribbon, arrange_boxes, flow_diagram
+from cirl_marl.drawing.style import readable
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Role
 
@@ -27,7 +27,7 @@ def groups(network: Network) -> Mapping[str, list[int]]:
     """
     copies: Mapping[str, Sequence[str]] = network.copies
     if copies:
-        return {spoken(name).title(): [network.node_index[id_] for id_ in ids] for name, ids in copies.items()}
+        return {readable(name).title(): [network.node_index[id_] for id_ in ids] for name, ids in copies.items()}
     found: dict[str, list[int]] = defaultdict(list)
     for i, node in enumerate(network.nodes):
         name, mark, _ = node.label.partition(MARK)
@@ -37,15 +37,18 @@ def groups(network: Network) -> Mapping[str, list[int]]:
     return kept if len(network.nodes) > FOLDED_NODES and len(kept) >= LEAST_GROUPS else {}
 
 
-def sketches(network: Network, peaks: Floats) -> list[Sketch]:
+def flow_diagrams(network: Network, peaks: Floats) -> list[FlowDiagram]:
     """Return the diagrams of a network whose arcs carry at most ``peaks``: one, or one of groups and each inside."""
     folded = groups(network)
     if not folded:
-        return [sketch(network, peaks)]
-    return [_sketch(network, folded, "", peaks), *(_sketch(network, folded, name, peaks) for name in folded)]
+        return [flow_diagram(network, peaks)]
+    return [
+        _diagram_of_groups(network, folded, "", peaks),
+        *(_diagram_of_groups(network, folded, name, peaks) for name in folded),
+    ]
 
 
-def _sketch(network: Network, folded: Mapping[str, list[int]], unfolded: str, peaks: Floats) -> Sketch:
+def _diagram_of_groups(network: Network, folded: Mapping[str, list[int]], unfolded: str, peaks: Floats) -> FlowDiagram:
     """Return the diagram with one group unfolded, and of the rest only what it has to do with."""
     inside = set(folded.get(unfolded, ()))
     group = {i: name for name, members in folded.items() if name != unfolded for i in members}
@@ -75,7 +78,7 @@ def _sketch(network: Network, folded: Mapping[str, list[int]], unfolded: str, pe
         if (pair := (box_of[donor], box_of[recipient])) and pair[0] != pair[1]:
             between[pair].append(k)
     ribbons = [Ribbon(tuple(members), *pair) for pair, members in between.items()]
-    return placed(unfolded, boxes, ribbons, peaks, None if unfolded else _around_markets(boxes, ribbons, peaks))
+    return arrange_boxes(unfolded, boxes, ribbons, peaks, None if unfolded else _around_markets(boxes, ribbons, peaks))
 
 
 def _around_markets(boxes: Sequence[Box], ribbons: Sequence[Ribbon], peaks: Floats) -> Integers | None:

@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from cirl_marl.drawing.arrangement import Arrangement, Routes, arrangement_of, bezier
-from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, WARNING, number, shaped, spoken
+from cirl_marl.drawing.digraph_layout import DigraphLayout, Routes, bezier, digraph_layout
+from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, WARNING, check_shape, number, readable
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law, Role
 
@@ -65,11 +65,11 @@ def draw_network(
     Raises:
         CirlError: if an array has the wrong shape.
     """
-    stock, flow = shaped("stock", stock, (len(network.stores),)), shaped("flow", flow, (len(network.arcs),))
+    stock, flow = check_shape("stock", stock, (len(network.stores),)), check_shape("flow", flow, (len(network.arcs),))
     held = np.concatenate([stock, network.throughput(flow)])
     reference = largest_flow(flow) if reference_flow is None else reference_flow
     share = np.clip(np.nan_to_num(np.abs(flow)) / max(reference, 1e-12), 0, BROADEST)
-    layout = arrangement_of(network, axes.bbox.width / axes.bbox.height)
+    layout = digraph_layout(network, axes.bbox.width / axes.bbox.height)
     axes.clear()
     axes.set_axis_off()
     em = _frame(axes, layout, legend)
@@ -96,7 +96,7 @@ def legend_of(network: Network, reference: float) -> dict[str, Any]:
     roles = dict.fromkeys(node.role for node in sorted(network.nodes, key=lambda n: list(Role).index(n.role)))
     patches: dict[str, str] = {}
     for role in roles:
-        colour, name = ROLE_COLOURS[role], spoken(role).replace("nonrenewable", "non-renewable")
+        colour, name = ROLE_COLOURS[role], readable(role).replace("nonrenewable", "non-renewable")
         patches[colour] = f"{patches[colour]}, {name}" if colour in patches else name
     sign = network.sustainability
     arrows = {WARNING: "flow that lowers λ", GOOD: "flow that raises λ", NEUTRAL: "other flow"}
@@ -109,7 +109,7 @@ def legend_of(network: Network, reference: float) -> dict[str, Any]:
     return {"handles": handles, "frameon": False, "fontsize": 8, "labelcolor": MUTED, "handlelength": 1.2}
 
 
-def _frame(axes: Axes, layout: Arrangement, legend: bool) -> float:
+def _frame(axes: Axes, layout: DigraphLayout, legend: bool) -> float:
     """Set limits in em around the digraph and return the size of one em in points."""
     low, high = layout.extent()
     width, height = (72 * pixels / axes.figure.dpi for pixels in axes.bbox.size)
@@ -159,7 +159,7 @@ def _arrow(curve: Floats, width: float) -> Floats:
     return np.concatenate([sides[0], [neck + across * flare, tip, neck - across * flare], sides[1][::-1]])
 
 
-def _draw_boxes(axes: Axes, network: Network, layout: Arrangement, held: Floats, em: float) -> None:
+def _draw_boxes(axes: Axes, network: Network, layout: DigraphLayout, held: Floats, em: float) -> None:
     width, height = layout.box
     units = {True: network.mass_unit, False: f"{network.mass_unit}/{network.time_unit}"}
     for node, (x, y), amount, name in zip(network.nodes, layout.positions, held, layout.names, strict=True):
@@ -196,7 +196,7 @@ def _darker(colour: str) -> str:
     return "#" + "".join(f"{int(colour[i : i + 2], 16) * 6 // 10:02x}" for i in (1, 3, 5))
 
 
-def _draw_dots(axes: Axes, network: Network, layout: Arrangement, held: Floats, share: Floats, em: float) -> None:
+def _draw_dots(axes: Axes, network: Network, layout: DigraphLayout, held: Floats, share: Floats, em: float) -> None:
     """Draw a large network: dots whose area shows the stock or throughput, bent lines whose width shows the flow."""
     ends = layout.positions[network.donors], layout.positions[network.recipients]
     # Arcs that count towards λ come last, on top of the others.
@@ -214,7 +214,7 @@ def _draw_dots(axes: Axes, network: Network, layout: Arrangement, held: Floats, 
 
 
 def _write_title(axes: Axes, network: Network, circularity: float | None, title: str) -> None:
-    heading = title or network.title or spoken(network.name)
+    heading = title or network.title or readable(network.name)
     below = "" if circularity is None else f"λ = {number(circularity)} {network.mass_unit}    "
     below += f"flows in {network.mass_unit}/{network.time_unit}"
     axes.text(0.5, 1.075, heading, transform=axes.transAxes, fontsize=11, fontweight="bold", color=INK, ha="center")

@@ -58,7 +58,7 @@ def number(value: float) -> str:
     return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}"
 
 
-def shaped(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
+def check_shape(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
     """Return ``values`` as floats; a ``CirlError`` names them if they have another shape."""
     found = np.asarray(values, dtype=float)
     if found.shape != shape:
@@ -66,12 +66,12 @@ def shaped(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
     return found
 
 
-def spoken(identifier: str) -> str:
+def readable(identifier: str) -> str:
     """Write an id with spaces."""
     return identifier.replace("_", " ")
 
 
-def dressed(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9.0) -> None:
+def style_axes(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9.0) -> None:
     """Give axes the plain look of the reports, without touching matplotlib's settings."""
     axes.set_title(title, loc="left", fontsize=size + 1, color=INK, fontweight="bold")
     axes.set_ylabel(ylabel, fontsize=size, color=INK)
@@ -83,7 +83,7 @@ def dressed(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9.0)
         spine.set_color(NEUTRAL)
 
 
-def dated(time: Floats, network: Network) -> Floats:
+def axis_time(time: Floats, network: Network) -> Floats:
     """Return times as axes show them: as calendar years, if the network has a start."""
     return time if network.episode.start is None else years(network, time)
 

@@ -19,10 +19,10 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
+from cirl_marl.reasons.attribution import PairedDifference, paired_difference
 from cirl_marl.reasons.extras import trees
-from cirl_marl.reasons.inputs import Consequence, compared
-from cirl_marl.reasons.signals import Signal, columns, signal
-from cirl_marl.reasons.watching import Instead, SeenEpisodes, Watching, played
+from cirl_marl.reasons.interventions import RecordedEpisodes, Recorder, Substitution, play_episodes
+from cirl_marl.reasons.observations import Signal, policy_columns, signal_of
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies
@@ -76,7 +76,7 @@ class Rule:
     agent: str
     leaves: tuple[Leaf, ...]
     explained: float
-    cost: Consequence
+    cost: PairedDifference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,10 +89,10 @@ class TeamRules:
     """
 
     rules: tuple[Rule, ...]
-    together: Consequence
+    together: PairedDifference
 
 
-class Tree(Controller):
+class TreeController(Controller):
     """Acts for some agents by their trees; where it has none it does nothing."""
 
     def __init__(self, grown: Mapping[str, Any], seen: Mapping[str, Sequence[tuple[str, int]]]) -> None:
@@ -112,7 +112,7 @@ class Tree(Controller):
         return found
 
 
-def rules(
+def distil_rules(
     env: MultiAgentVectorEnv,
     policies: Policies,
     usual: Rollout,
@@ -137,21 +137,21 @@ def rules(
     where = {}
     for agent in env.agents:
         policy = next(each for each in policies.policies.values() if agent in each.view.agents)
-        where[agent] = columns(env, policy.view, agent)
+        where[agent] = policy_columns(env, policy.view, agent)
     places = {agent: each.seen for agent, each in where.items()}
-    watched: list[SeenEpisodes] = []
+    watched: list[RecordedEpisodes] = []
     grown: dict[str, Any] = {}
     work = ROUNDS + 1 + len(env.agents) + 1
     for round_ in range(ROUNDS + 1):
-        watching = Watching(policies, Tree(grown, places) if round_ else None)
+        watching = Recorder(policies, TreeController(grown, places) if round_ else None)
         # starts between those of one evaluation and the next are nobody's
-        played(env, watching, seed + (round_ + 1) * 100_000)
+        play_episodes(env, watching, seed + (round_ + 1) * 100_000)
         watched.append(watching.seen)
         grown = {agent: _grown(agent, watched, places[agent], leaves) for agent in env.agents}
         progress((round_ + 1) / work)
-    tree, found = Tree(grown, places), []
+    tree, found = TreeController(grown, places), []
     for a, agent in enumerate(env.agents):
-        cost = compared(played(env, Instead(policies, {agent: tree}), seed), usual)
+        cost = paired_difference(play_episodes(env, Substitution(policies, {agent: tree}), seed), usual)
         names = where[agent].names
         found.append(
             Rule(
@@ -162,12 +162,12 @@ def rules(
             )
         )
         progress((ROUNDS + 2 + a) / work)
-    together = compared(played(env, tree, seed), usual)
+    together = paired_difference(play_episodes(env, tree, seed), usual)
     progress(1.0)
     return TeamRules(rules=tuple(found), together=together)
 
 
-def _table(agent: str, watched: Sequence[SeenEpisodes], places: Sequence[tuple[str, int]]) -> tuple[Floats, Floats]:
+def _table(agent: str, watched: Sequence[RecordedEpisodes], places: Sequence[tuple[str, int]]) -> tuple[Floats, Floats]:
     """Return all features that an agent saw, as trees keep them, and what its policy did."""
     features = [
         np.stack([each.observations[whose][:, :, entry].ravel() for whose, entry in places], axis=1) for each in watched
@@ -176,7 +176,7 @@ def _table(agent: str, watched: Sequence[SeenEpisodes], places: Sequence[tuple[s
     return np.concatenate(features).astype(np.float32), np.concatenate(actions)
 
 
-def _grown(agent: str, watched: Sequence[SeenEpisodes], places: Sequence[tuple[str, int]], leaves: int) -> Any:
+def _grown(agent: str, watched: Sequence[RecordedEpisodes], places: Sequence[tuple[str, int]], leaves: int) -> Any:
     features, actions = _table(agent, watched, places)
     variance = float(actions.var(axis=0).mean())
     tree = trees().DecisionTreeRegressor(
@@ -188,7 +188,7 @@ def _grown(agent: str, watched: Sequence[SeenEpisodes], places: Sequence[tuple[s
     return tree.fit(features, actions if actions.shape[1] > 1 else actions.ravel())
 
 
-def _explained(tree: Any, agent: str, places: Sequence[tuple[str, int]], watched: Sequence[SeenEpisodes]) -> float:
+def _explained(tree: Any, agent: str, places: Sequence[tuple[str, int]], watched: Sequence[RecordedEpisodes]) -> float:
     features, actions = _table(agent, watched, places)
     left = actions - tree.predict(features).reshape(actions.shape)
     variance = float(actions.var(axis=0).sum())
@@ -201,7 +201,7 @@ def _leaves(
     tree: Any,
     names: Sequence[str],
     places: Sequence[tuple[str, int]],
-    watched: Sequence[SeenEpisodes],
+    watched: Sequence[RecordedEpisodes],
 ) -> tuple[Leaf, ...]:
     features, _ = _table(agent, watched, places)
     steps = np.concatenate([np.repeat(np.arange(len(each.actions[agent])), env.num_envs) for each in watched])
@@ -214,7 +214,9 @@ def _leaves(
         at = reached == leaf
         action = np.clip(grown.value[leaf].reshape(-1), -1.0, 1.0)
         held = low[:, steps[at]] + (action[:, None] + 1) / 2 * (high - low)[:, steps[at]]
-        conditions = tuple(Condition(signal(network, names[feature]), *ends) for feature, ends in sorted(ways.items()))
+        conditions = tuple(
+            Condition(signal_of(network, names[feature]), *ends) for feature, ends in sorted(ways.items())
+        )
         found.append(Leaf(conditions, action, held.mean(axis=1), float(at.mean())))
     return tuple(found)
 

@@ -12,7 +12,19 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
-from cirl_marl.drawing.style import DASHES, GRID, INK, MUTED, SERIES, dated, dressed, save, shaped, spoken, time_axis
+from cirl_marl.drawing.style import (
+    DASHES,
+    GRID,
+    INK,
+    MUTED,
+    SERIES,
+    axis_time,
+    check_shape,
+    readable,
+    save,
+    style_axes,
+    time_axis,
+)
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law
@@ -53,7 +65,7 @@ def save_circularity(
     ``runs`` are means of λ over the intervals, mass, and ``services`` service levels by control, of shape
     (episodes, steps), ``time`` the ends of the intervals, (steps,); other shapes raise a ``CirlError``.
     """
-    time = dated(time - network.episode.control_interval / 2, network)
+    time = axis_time(time - network.episode.control_interval / 2, network)
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1))
     names = list(dict.fromkeys([*runs, *services]))
@@ -61,8 +73,8 @@ def save_circularity(
         for name, values in curves.items():
             _draw_mean(axes, time, _matching(name, values, time), name, names.index(name), top=top)
     title = "Mean circularity of each step, averaged over episodes, with 95 % intervals"
-    dressed(above, title=title, ylabel=f"λ / {network.mass_unit}")
-    dressed(below, title="Service level", ylabel="service level")
+    style_axes(above, title=title, ylabel=f"λ / {network.mass_unit}")
+    style_axes(below, title="Service level", ylabel="service level")
     below.set_ylim(-0.03, 1.06)
     time_axis(below, time, network)
     if names:
@@ -85,7 +97,7 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
     for axes, (agent, values) in zip(panels, shown, strict=False):
         _draw_returns(axes, steps, _matching(agent, values, steps))
-        dressed(axes, title=spoken(agent), size=8.0)
+        style_axes(axes, title=readable(agent), size=8.0)
         axes.locator_params(nbins=4)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
@@ -132,19 +144,19 @@ def save_trajectory(
         CirlError: if an array has the wrong shape.
     """
     steps, mass = (len(time),), network.mass_unit
-    stock = shaped("stock", stock, (len(network.stores), *steps))
-    flow = shaped("flow", flow, (len(network.arcs), *steps))
-    circularity = shaped("circularity", circularity, steps)
+    stock = check_shape("stock", stock, (len(network.stores), *steps))
+    flow = check_shape("flow", flow, (len(network.arcs), *steps))
+    circularity = check_shape("circularity", circularity, steps)
     held = [node.label for node in network.stores]
     if load is not None:
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
         held += [f"on {network.compartments[arc].label}" for arc in on_the_way]
-        stock = np.concatenate([stock, shaped("load", load, (len(on_the_way), *steps))])
+        stock = np.concatenate([stock, check_shape("load", load, (len(on_the_way), *steps))])
     # what is a mean over an interval stands in its middle, a stock at its end
-    middle, held_at = (dated(each, network) for each in (time - network.episode.control_interval / 2, time))
+    middle, held_at = (axis_time(each, network) for each in (time - network.episode.control_interval / 2, time))
     if start is not None:
-        stock = np.column_stack([shaped("start", start, (len(stock),)), stock])
-        held_at = np.concatenate([dated(np.zeros(1), network), held_at])
+        stock = np.column_stack([check_shape("start", start, (len(stock),)), stock])
+        held_at = np.concatenate([axis_time(np.zeros(1), network), held_at])
     groups = _by_scale(np.abs(np.nan_to_num(stock)).max(axis=1, initial=0.0))
     heights = [1.25 if len(groups) == 1 else 0.9] * len(groups) + [1.25, 0.8, *([] if service is None else [0.5])]
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
@@ -156,10 +168,10 @@ def save_trajectory(
     flows, lambdas = panels[len(groups) : len(groups) + 2]
     _draw_largest(flows, middle, flow, [arc.label for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}")
     _draw_mean(lambdas, middle, circularity, "", 0)
-    dressed(lambdas, title="Mean circularity", ylabel=f"λ / {mass}")
+    style_axes(lambdas, title="Mean circularity", ylabel=f"λ / {mass}")
     if service is not None:
-        _draw_mean(panels[-1], middle, shaped("service", service, steps), "", 0)
-        dressed(panels[-1], title="Service level", ylabel="service level")
+        _draw_mean(panels[-1], middle, check_shape("service", service, steps), "", 0)
+        style_axes(panels[-1], title="Service level", ylabel="service level")
         panels[-1].set_ylim(-0.03, 1.06)
     time_axis(panels[-1], held_at, network)
     return save(figure, path)
@@ -186,12 +198,12 @@ def save_fronts(
             linestyle=line,
             linewidth=1.4,
             alpha=0.9,
-            label=spoken(each.name),
+            label=readable(each.name),
         )
     _widen(axes)
     if len(bound):
         _draw_bound(axes, bound)
-    dressed(axes, title=title, ylabel=f"λ̄ / {network.mass_unit}")
+    style_axes(axes, title=title, ylabel=f"λ̄ / {network.mass_unit}")
     axes.ticklabel_format(useOffset=False)
     of = "" if len(network.services) < 2 else " of the service that lacks most"
     axes.set_xlabel(f"mean service level{of}", fontsize=9)
@@ -231,7 +243,7 @@ def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, 
         return
     colour, dash = SERIES[index % len(SERIES)], DASHES[index % len(DASHES)]
     mean = episodes.mean(axis=0)
-    axes.plot(time, mean, color=colour, linestyle=dash, linewidth=1.8, label=spoken(name), marker=_dots(time))
+    axes.plot(time, mean, color=colour, linestyle=dash, linewidth=1.8, label=readable(name), marker=_dots(time))
     if count > 1:
         error = episodes.std(axis=0, ddof=1) / math.sqrt(count) * float(stdtrit(count - 1, 0.975))
         axes.fill_between(time, mean - error, np.minimum(mean + error, top), color=colour, alpha=0.2, linewidth=0)
@@ -265,7 +277,7 @@ def _draw_largest(axes: Axes, time: Floats, values: Floats, names: Sequence[str]
                   linewidth=1.5, label=names[row], marker=_dots(time))  # fmt: skip
     axes.ticklabel_format(axis="y", useOffset=False)
     more = f": {SHOWN} of {len(names)}, the largest changes" if len(names) > SHOWN else ""
-    dressed(axes, title=title + more, ylabel=unit)
+    style_axes(axes, title=title + more, ylabel=unit)
     if len(kept):
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
 

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from cirl_marl.controllers.rollout import Rollout, interval_ends
 from cirl_marl.controllers.schedule import Schedule
-from cirl_marl.drawing.style import SERIES, dated, dressed, number, save, time_axis
+from cirl_marl.drawing.style import SERIES, axis_time, number, save, style_axes, time_axis
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.network.declared import itemised
@@ -253,7 +253,7 @@ def save_decisions(path: str | Path, found: Schedule, *, title: str) -> Path:
     figure = Figure(figsize=(WIDTH, 1.0 + 2.1 * rows), layout="constrained")
     figure.suptitle(title, fontsize=11, fontweight="bold")
     grid, ends = figure.subplots(rows, COLUMNS, squeeze=False).ravel(), interval_ends(network)
-    time = dated(ends - network.episode.control_interval / 2, network)
+    time = axis_time(ends - network.episode.control_interval / 2, network)
     panels = [("mean circularity", network.mass_unit, run.circularity_mean[0], usual.circularity_mean[0])]
     for lever in shown:
         percent = lever.kind is ControlKind.SHARE
@@ -266,10 +266,10 @@ def save_decisions(path: str | Path, found: Schedule, *, title: str) -> Path:
         mark = "o" if len(time) == 1 else ""
         axes.plot(time, as_usual, color=SERIES[1], linestyle="--", marker=mark, label="as usual")
         axes.plot(time, planned, color=SERIES[0], marker=mark, label="plan")
-        dressed(axes, title=name, ylabel=unit, size=8.0)
+        style_axes(axes, title=name, ylabel=unit, size=8.0)
         if unit.startswith("%"):
             axes.set_ylim(bottom=0.0)
-        time_axis(axes, dated(np.array([0.0, ends[-1]]), network), network)
+        time_axis(axes, axis_time(np.array([0.0, ends[-1]]), network), network)
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
     handles, names = grid[0].get_legend_handles_labels()

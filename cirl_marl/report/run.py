@@ -21,8 +21,8 @@ from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.records.files import write_json
 from cirl_marl.report.curves import save_circularity, save_learning_curves
-from cirl_marl.report.reasons import reasons_of
-from cirl_marl.report.scenes import PLAN, Story, of_comparison, with_plan
+from cirl_marl.report.explanations import read_reasons
+from cirl_marl.report.report_page import PLAN, ReportPage, add_plan, page_of_comparison
 
 CONTROLLERS = ("neutral", "random")
 """Whom a run is compared with."""
@@ -57,7 +57,7 @@ def evaluate_run(
 
 def evaluate_story(
     run: RunDirectory, *, episodes: int, seed: int, progress: Callable[[str, float], None]
-) -> tuple[tuple[dict[str, Any], dict[str, Rollout], MultiAgentVectorEnv], Story]:
+) -> tuple[tuple[dict[str, Any], dict[str, Rollout], MultiAgentVectorEnv], ReportPage]:
     """Return what ``evaluate_run`` does, and the page: business as usual, the policies, and the plan of the bound.
 
     Reasons are on it if they were found of the checkpoint that acts; else it says how to find them.
@@ -66,11 +66,11 @@ def evaluate_story(
         [run], CONTROLLERS, episodes=episodes, seed=seed, progress=lambda what, share: progress(what, EVALUATED * share)
     )
     found = figures_of(run, comparison, bounds=True)
-    story = of_comparison(comparison, without=CONTROLLERS[1:])
-    reasons, missing = reasons_of(run, comparison.entries[0].checkpoint)
+    story = page_of_comparison(comparison, without=CONTROLLERS[1:])
+    reasons, missing = read_reasons(run, comparison.entries[0].checkpoint)
     notes = (*story.notes, f"{missing}.") if missing else story.notes
     story = replace(story, reasons=reasons, notes=notes)
-    return found, with_plan(story, comparison, run.make_env(1), part_of(progress, PLAN, EVALUATED, 1 - EVALUATED))
+    return found, add_plan(story, comparison, run.make_env(1), part_of(progress, PLAN, EVALUATED, 1 - EVALUATED))
 
 
 def figures_of(

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
-from cirl_marl.drawing.style import SERIES, dated, dressed, save, spoken, time_axis
+from cirl_marl.drawing.style import SERIES, axis_time, readable, save, style_axes, time_axis
 from cirl_marl.evaluation.sampling import SampledEpisodes, Sensitivity
 from cirl_marl.evaluation.statistics import defined
 from cirl_marl.network import Floats
@@ -112,13 +112,13 @@ def save_bands(path: str | Path, found: SampledEpisodes, *, title: str) -> Path:
     figure.suptitle(title, fontsize=11, fontweight="bold")
     grid, ends = figure.subplots(rows, COLUMNS, squeeze=False).ravel(), interval_ends(network)
     for axes, (name, unit, values) in zip(grid, shown, strict=False):
-        time = dated(ends if name.startswith("stock") else ends - network.episode.control_interval / 2, network)
+        time = axis_time(ends if name.startswith("stock") else ends - network.episode.control_interval / 2, network)
         lowest, low, middle, high, highest = np.quantile(values, QUANTILES, axis=0)
         axes.fill_between(time, lowest, highest, color=SERIES[0], alpha=0.18, linewidth=0, label="95 % of samples")
         axes.fill_between(time, low, high, color=SERIES[0], alpha=0.35, linewidth=0, label="half of them")
         axes.plot(time, middle, color=SERIES[0], label="median")
-        dressed(axes, title=spoken(name), ylabel=unit, size=8.0)
-        time_axis(axes, dated(np.array([0.0, ends[-1]]), network), network)
+        style_axes(axes, title=readable(name), ylabel=unit, size=8.0)
+        time_axis(axes, axis_time(np.array([0.0, ends[-1]]), network), network)
         if name.startswith("level"):
             axes.set_ylim(-0.03, 1.06)
     for axes in grid[len(shown) :]:

@@ -17,7 +17,7 @@ from cirl_marl.controllers.rollout import beginning, rollout
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.definitions.sources import stated, stated_settings
 from cirl_marl.drawing.digraph import save_network
-from cirl_marl.drawing.folding import folded as folded_network
+from cirl_marl.drawing.folding import fold_copies as folded_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 from cirl_marl.network.calendar import labels
@@ -25,7 +25,7 @@ from cirl_marl.network.declared import Changing
 from cirl_marl.network.elements import Law, Service
 from cirl_marl.optimum import gap
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table, settings
-from cirl_marl.report.tables import arcs_table, nodes_table
+from cirl_marl.report.terminal import arcs_table, nodes_table
 from docs.site.markdown import ROOT, GeneratedPage, folded, sections_about, shown, table
 
 STUDY = ROOT / "benchmarks" / "results" / "study"

@@ -12,7 +12,7 @@ from IPython.display import Image
 import cirl_marl
 from cirl_marl.evaluation import compare
 from cirl_marl.learners import train
-from cirl_marl.report.comparison import comparison_notes, save_comparison
+from cirl_marl.report.fronts import comparison_notes, save_comparison
 
 network = cirl_marl.load_network("carbo_net")
 print(f"{len(network.compartments)} compartments, {len(network.agents)} agents: {', '.join(network.agents)}")

@@ -22,7 +22,7 @@ RESTARTS = 6
 STRETCH = 1.6
 
 
-def place(network: Network, pitch: Floats, aspect: float) -> Floats:
+def place_nodes(network: Network, pitch: Floats, aspect: float) -> Floats:
     """Return the centre of each node, in em.
 
     Args:
@@ -33,7 +33,7 @@ def place(network: Network, pitch: Floats, aspect: float) -> Floats:
     Returns:
         Positions (x to the right, y upwards), shape (nodes, 2).
     """
-    layers = layered(network, pitch, aspect)
+    layers = layer_cells(network, pitch, aspect)
     edges = np.unique(np.sort(np.stack([network.donors, network.recipients], axis=1), axis=1), axis=0)
     small = 2 < len(network.nodes) <= SEARCHED_NODES and len(edges) <= SEARCHED_EDGES
     cells = _Search(network, edges, pitch, aspect).best(layers) if small else layers
@@ -67,7 +67,7 @@ def depths(network: Network) -> Integers:
     return depth
 
 
-def layered(network: Network, pitch: Floats, aspect: float) -> Floats:
+def layer_cells(network: Network, pitch: Floats, aspect: float) -> Floats:
     """Return cells (column, row) with the nodes ordered by depth and, within a depth, by their neighbours."""
     depth = depths(network)
     count = len(depth)

@@ -1,4 +1,4 @@
-"""A comparison shown: table, picture, and its files with every episode and what it all depends on."""
+"""Comparisons of policies and Pareto fronts of service and circularity: tables, pictures, and their files."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from rich.table import Table
 
 from cirl_marl.evaluation.comparison import FIGURES, Comparison
 from cirl_marl.evaluation.figures import provenance
-from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, defined
+from cirl_marl.evaluation.pareto import ParetoFront
+from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, defined, interquartile_mean
 from cirl_marl.records.files import published, write_json, write_table
 from cirl_marl.report.curves import PointSeries, save_fronts
 
-FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
+COMPARISON_FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
+PARETO_FILES = ("pareto.csv", "pareto.json", "pareto.png")
 
 
 def comparison_table(comparison: Comparison) -> Table:
@@ -90,11 +92,11 @@ def write_comparison(comparison: Comparison, folder: Path, **options: Any) -> li
     episodes = ["name", "training seed", "run", "episode", *units, "start seed"]
     rows = ["name", "training seeds", *(f"{name}{end}" for name in units for end in ("", ", low", ", high"))]
     with published(folder) as partial:
-        write_table(partial / FILES[0], episodes, _episodes(comparison))
-        write_table(partial / FILES[1], rows, _summary(comparison))
-        write_json(partial / FILES[2], summary_of(comparison, **options))
-        save_comparison(partial / FILES[3], comparison)
-    return [folder / name for name in FILES]
+        write_table(partial / COMPARISON_FILES[0], episodes, _episodes(comparison))
+        write_table(partial / COMPARISON_FILES[1], rows, _summary(comparison))
+        write_json(partial / COMPARISON_FILES[2], summary_of(comparison, **options))
+        save_comparison(partial / COMPARISON_FILES[3], comparison)
+    return [folder / name for name in COMPARISON_FILES]
 
 
 def summary_of(comparison: Comparison, **options: Any) -> dict[str, Any]:
@@ -141,3 +143,34 @@ def _summary(comparison: Comparison) -> Iterator[list[object]]:
             found = row.figure(which)
             cells += [None] * 3 if found is None else list(found.as_dict().values())
         yield cells
+
+
+def write_front(sweep: ParetoFront, folder: Path, **options: Any) -> list[Path]:
+    """Write table, provenance and picture, all of them or none, and return their paths."""
+    mass = sweep.network.mass_unit
+    header = ["kind", "least service level", f"circularity ({mass})", "circularity weight", "training seed"]
+    plain = [[each.kind, each.service, each.circularity, each.weight, each.seed] for each in sweep.points]
+    about = {"provenance": provenance(sweep.network, sweep.runs, **options), "no_bound": sweep.reason or None}
+    with published(folder) as partial:
+        write_table(partial / PARETO_FILES[0], header, plain)
+        write_json(partial / PARETO_FILES[1], about | {"columns": header, "points": plain})
+        title = f"{sweep.network.title or sweep.network.name}: service against circularity"
+        save_fronts(partial / PARETO_FILES[2], sweep.network, list(_series(sweep)), sweep.front, title=title)
+    return [folder / name for name in PARETO_FILES]
+
+
+def _series(sweep: ParetoFront) -> Iterator[PointSeries]:
+    """Yield what is drawn: of several seeds the interquartile mean at each weight."""
+    weights = sorted({each.weight for each in sweep.of("trained") if each.weight is not None})
+    alike = {
+        f"trained: {sweep.recipe.name if sweep.recipe else ''}": [
+            [each for each in sweep.of("trained") if each.weight == weight] for weight in weights
+        ],
+        "plan in the simulator": [[each] for each in sweep.of("plan")],
+        "neutral": [[each] for each in sweep.of("neutral")],
+    }
+    for name, groups in alike.items():
+        if groups:
+            service = np.array([interquartile_mean([each.service for each in group]) for group in groups])
+            mean = np.array([interquartile_mean([each.circularity for each in group]) for group in groups])
+            yield PointSeries(name, service, mean, joined=len(groups) > 1)

@@ -18,13 +18,15 @@ from cirl_marl.errors import CirlError, RunError, unknown
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.options import by_stage
-from cirl_marl.reasons.terms import PlannedEpisode
+from cirl_marl.reasons.objective_terms import PlannedEpisode
 
 ALIKE = 1e-4
 """Relative distance of circularities up to which an episode that is simulated again is the one in a table."""
 
 
-def courses(network: Network, plan: str | Path, *, seed: int | None = None, episodes: int = 4) -> list[PlannedEpisode]:
+def episodes_of_plan(
+    network: Network, plan: str | Path, *, seed: int | None = None, episodes: int = 4
+) -> list[PlannedEpisode]:
     """Return the episodes of a plan.
 
     A table with stocks and flows, as ``cirl simulate`` writes it, is taken as it is. One with controls alone, as
@@ -49,7 +51,7 @@ def courses(network: Network, plan: str | Path, *, seed: int | None = None, epis
     return [_of_controls(network, path, header, rows, seed)]
 
 
-def setting(network: Network, plans: Sequence[object]) -> tuple[Network, tuple[str, ...] | None]:
+def episode_setting(network: Network, plans: Sequence[object]) -> tuple[Network, tuple[str, ...] | None]:
     """Return the network with the horizon of the first run among plans, and who acts there; None is its own choice.
 
     Raises:

@@ -12,16 +12,23 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
-from cirl_marl.drawing.style import GOOD, SERIES, WARNING, dated, dressed, number, save, time_axis
+from cirl_marl.drawing.style import GOOD, SERIES, WARNING, axis_time, number, save, style_axes, time_axis
 from cirl_marl.errors import RunError
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
-from cirl_marl.reasons.explaining import Explanation
-from cirl_marl.reasons.inputs import Consequence
+from cirl_marl.reasons.attribution import PairedDifference
+from cirl_marl.reasons.explanation import Explanation
 from cirl_marl.reasons.prices import ShadowPrices
-from cirl_marl.reasons.words import conditions, does, moments, name, of_signal, paragraphs
+from cirl_marl.reasons.sentences import (
+    action_text,
+    compartment_label,
+    condition_text,
+    interval_names,
+    paragraphs,
+    signal_text,
+)
 from cirl_marl.records.files import published, write_json, write_table
 from cirl_marl.report.curves import WIDTH
 
@@ -63,7 +70,7 @@ def write_reasons(found: Explanation, folder: Path, **options: Any) -> list[Path
     return [folder / each for each in written]
 
 
-def reasons_of(run: RunDirectory, checkpoint: str) -> tuple[Reasons, str]:
+def read_reasons(run: RunDirectory, checkpoint: str) -> tuple[Reasons, str]:
     """Return what was written down of why a run's policies act as they do, and why nothing is shown; one is empty.
 
     Raises:
@@ -88,7 +95,7 @@ def reasons_of(run: RunDirectory, checkpoint: str) -> tuple[Reasons, str]:
 
 def prices_table(found: ShadowPrices) -> Table:
     """Return one row a stock, demand and agent: the first, the largest and the last price of it, or the whole."""
-    network, when = found.network, moments(found.network)
+    network, when = found.network, interval_names(found.network)
     mass = network.mass_unit
     table = Table(title=f"what a little more is worth in λ̄ ({mass})")
     for heading in ("more of", "what", when[0], "largest", when[-1]):
@@ -133,7 +140,7 @@ def _prices(found: Explanation) -> Iterator[list[object]]:
     prices, network = found.prices, found.network
     mass, rate = network.mass_unit, f"{network.mass_unit}/{network.time_unit}"
     yield ["more of", "compartment or service", "interval", "rise of λ̄", "unit"]
-    when = moments(network)
+    when = interval_names(network)
     for i, node in enumerate(network.stores):
         for step, value in enumerate(prices.stock[:, i].tolist()):
             yield ["stock at the start", node.id, when[step], _number(value), f"{mass} per {mass}"]
@@ -177,13 +184,13 @@ def _rules(found: Explanation) -> Iterator[list[object]]:
     for rule in found.rules.rules:
         for leaf in rule.leaves:
             control = "; ".join(_number(each) for each in leaf.control.tolist())
-            when, what = conditions(network, leaf.conditions) or "always", does(network, rule.agent, leaf)
+            when, what = condition_text(network, leaf.conditions) or "always", action_text(network, rule.agent, leaf)
             shares = _number(leaf.share), _number(rule.explained)
             yield [rule.agent, when, what, control, *shares, *_outcome(rule.cost)]
     yield ["all together", "", "", "", "", "", *_outcome(found.rules.together)]
 
 
-def _outcome(found: Consequence | None) -> list[str]:
+def _outcome(found: PairedDifference | None) -> list[str]:
     if found is None:
         return [""] * len(OUTCOME)
     ends = [end for each in (found.circularity, found.service) for end in (each.value, each.low, each.high)]
@@ -211,12 +218,14 @@ def save_reasons(path: Path, found: Explanation) -> Path:
 
 def _draw_stocks(axes: Any, network: Network, prices: ShadowPrices) -> None:
     begins = interval_ends(network) - network.episode.control_interval
-    time, largest = dated(begins, network), np.abs(prices.stock).max(axis=0)
+    time, largest = axis_time(begins, network), np.abs(prices.stock).max(axis=0)
     for place, i in enumerate(np.argsort(-largest, kind="stable")[:LINES].tolist()):
         if largest[i] > 0:
-            axes.plot(time, prices.stock[:, i], color=SERIES[place], label=name(network, network.stores[i].id))
+            axes.plot(
+                time, prices.stock[:, i], color=SERIES[place], label=compartment_label(network, network.stores[i].id)
+            )
     mass = network.mass_unit
-    dressed(axes, title=f"What one more {mass} in a stock is worth in λ̄", ylabel=f"{mass} per {mass}")
+    style_axes(axes, title=f"What one more {mass} in a stock is worth in λ̄", ylabel=f"{mass} per {mass}")
     time_axis(axes, time, network)
     if axes.lines:
         axes.legend(frameon=False, fontsize=8, ncols=2)
@@ -231,12 +240,12 @@ def _draw_room(axes: Any, network: Network, prices: ShadowPrices) -> None:
     labels = []
     for flat in order:
         side, a = divmod(flat, room.shape[1])
-        labels.append(f"{name(network, prices.bound.agents[a])}, {('lower', 'upper')[side]}")
+        labels.append(f"{compartment_label(network, prices.bound.agents[a])}, {('lower', 'upper')[side]}")
     values = [float(room.ravel()[each]) for each in order]
     axes.barh(range(len(values)), values, color=[GOOD if each > 0 else WARNING for each in values], height=0.6)
     axes.set_yticks(range(len(labels)), labels)
     axes.invert_yaxis()
-    dressed(axes, title="What one per cent more room is worth, by bound of a control")
+    style_axes(axes, title="What one per cent more room is worth, by bound of a control")
     axes.set_xlabel(f"rise of λ̄ / {network.mass_unit}", fontsize=9)
 
 
@@ -247,14 +256,14 @@ def _draw_inputs(axes: Any, found: Explanation) -> None:
             share = float(each.share[i])
             axes.barh(row, share, left=left, color=SERIES[i % len(SERIES)], height=0.7, alpha=0.85)
             if share > 0.12:
-                label, room = of_signal(found.network, each.signals[i]), int(105 * share)
+                label, room = signal_text(found.network, each.signals[i]), int(105 * share)
                 label = label if len(label) <= room else label[: room - 1] + "…"
                 axes.text(left + 0.005, row, label, va="center", fontsize=7, color="white")
             left += share
         cost = number(each.top_held.circularity.value)
         axes.text(1.01, row, cost, va="center", fontsize=7, transform=axes.get_yaxis_transform())
-    axes.set_yticks(range(len(found.inputs)), [name(found.network, each.agent) for each in found.inputs])
+    axes.set_yticks(range(len(found.inputs)), [compartment_label(found.network, each.agent) for each in found.inputs])
     axes.set_xlim(0, 1)
     axes.invert_yaxis()
-    dressed(axes, title="What agents look at, and the change of λ̄ when these inputs are held", size=8.0)
+    style_axes(axes, title="What agents look at, and the change of λ̄ when these inputs are held", size=8.0)
     axes.set_xlabel(f"share of the attribution; at the right change of λ̄ / {found.network.mass_unit}", fontsize=9)

@@ -8,12 +8,12 @@ from pathlib import Path
 from rich.table import Table
 
 from cirl_marl.drawing.style import number
-from cirl_marl.reasons.aims import Aims
-from cirl_marl.reasons.words import listed
+from cirl_marl.reasons.inverse import ObjectiveWeights
+from cirl_marl.reasons.sentences import joined_text
 from cirl_marl.records.files import write_atomically, write_table
 
 
-def aims_sentences(found: Aims) -> list[str]:
+def weights_sentences(found: ObjectiveWeights) -> list[str]:
     """Say how far the plans are from the best, which weights they tell, and which they do not."""
     plans = "This plan" if len(found.plans) == 1 else f"These {len(found.plans)} plans"
     falls = "falls" if len(found.plans) == 1 else "fall"
@@ -24,9 +24,9 @@ def aims_sentences(found: Aims) -> list[str]:
     ]
     names, weights = [each.name for each in found.terms], found.weights(found.centre)
     idle = [j for j in range(len(names)) if found.spread[j] == 0]
-    open_ = [j for j in range(len(names)) if j not in found.found and j not in idle]
+    open_ = [j for j in range(len(names)) if j not in found.identifiable and j not in idle]
     reference = next((j for j, weight in enumerate(weights.tolist()) if weight == 1.0), None)
-    for j in found.found:
+    for j in found.identifiable:
         worth = ""
         if reference is not None and j != reference and math.isfinite(weights[j]):
             unit = found.terms[reference].unit
@@ -38,11 +38,13 @@ def aims_sentences(found: Aims) -> list[str]:
         ends = f"{100 * found.low[j]:.3g} to {100 * found.high[j]:.3g} %"
         said.append(f"The weight of {names[j]} cannot be told closely: all from {ends} fit.")
     if idle:
-        said.append(f"Of {listed([names[j] for j in idle])} there is no telling: nothing that can be done changes it.")
+        said.append(
+            f"Of {joined_text([names[j] for j in idle])} there is no telling: nothing that can be done changes it."
+        )
     return said
 
 
-def aims_table(found: Aims) -> Table:
+def weights_table(found: ObjectiveWeights) -> Table:
     """Return one row a term: the range of its weight, as share of all, and the middle of the cone."""
     table = Table(title=f"weights under which the plan is within {100 * found.within:.3g} % of the best")
     for heading in ("term", "least", "most", "centre", "per unit", "unit"):
@@ -53,7 +55,7 @@ def aims_table(found: Aims) -> Table:
     return table
 
 
-def write_aims(found: Aims, path: Path) -> Path:
+def write_weights(found: ObjectiveWeights, path: Path) -> Path:
     """Write the table as CSV, whole or not at all, and return its path; missing folders are made."""
     header = ["term", "kind", "unit", "about", "to be had", "least share", "most share", "centre", "weight per unit"]
     header += ["share under which plans are best", "distance from the best"]
@@ -63,7 +65,7 @@ def write_aims(found: Aims, path: Path) -> Path:
     return path
 
 
-def _rows(found: Aims) -> list[tuple[str, str, str, str, float, float, float, float, float]]:
+def _rows(found: ObjectiveWeights) -> list[tuple[str, str, str, str, float, float, float, float, float]]:
     weights = found.weights(found.centre)
     return [
         (

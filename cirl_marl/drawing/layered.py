@@ -24,12 +24,12 @@ LANE = 8.0
 """Between the lanes of loops."""
 MOST_LOOPS = 12
 """Of more loops, those of two nodes run beside each other."""
-THREAD = 3.0
+LEAST_BREADTH = 3.0
 """Least breadth kept free for a ribbon."""
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class RibbonRoute:
     """How a ribbon gets from its donor to its recipient.
 
     ``via`` is where it passes each layer in between, across, from the first layer to the last; it runs ``back`` against
@@ -44,7 +44,7 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True)
-class Weave:
+class LayeredLayout:
     """Where everything of a flow diagram goes; across is measured from the first lane on.
 
     Attributes:
@@ -56,18 +56,18 @@ class Weave:
 
     layers: Integers
     middles: Floats
-    courses: tuple[Course, ...]
+    routes: tuple[RibbonRoute, ...]
     breadth: float
 
 
-def woven(
+def layered_layout(
     donors: Integers,
     recipients: Integers,
     widths: Floats,
     breadths: Floats,
     clearance: float,
     layers: Integers | None = None,
-) -> Weave:
+) -> LayeredLayout:
     """Place nodes of some ``breadths``, shape (nodes,), between which ribbons of ``widths`` run, shape (arcs,).
 
     ``clearance`` is kept free around a node. In ``layers`` that are given, shape (nodes,), only what stays in one is a
@@ -86,14 +86,14 @@ def woven(
         back = _beside_others(pairs, ahead) if crowded else np.zeros(len(pairs), dtype=bool)
     else:
         ahead, back = layers[donors] < layers[recipients], layers[donors] > layers[recipients]
-    threads = _Threads(layers, breadths, clearance)
+    threads = _LayerItems(layers, breadths, clearance)
     links = [
         threads.link(*(pair if forward else pair[::-1]), float(width)) if forward or backward else ()
         for pair, width, forward, backward in zip(pairs, widths, ahead, back, strict=True)
     ]
-    middles = threads.settled()
+    middles = threads.positions()
     courses = [
-        Course(via=tuple(float(middles[item]) for item in link), back=bool(backward))
+        RibbonRoute(via=tuple(float(middles[item]) for item in link), back=bool(backward))
         for link, backward in zip(links, back, strict=True)
     ]
     half = np.array(threads.sizes) / 2
@@ -108,7 +108,7 @@ def woven(
         replace(each, via=tuple(at - low for at in each.via), lane=each.lane - low if each.side else 0.0)
         for each in courses
     ]
-    return Weave(layers, middles[: len(breadths)] - low, tuple(shifted), float(high - low))
+    return LayeredLayout(layers, middles[: len(breadths)] - low, tuple(shifted), float(high - low))
 
 
 def _beside_others(pairs: Sequence[tuple[int, int]], ahead: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -163,7 +163,7 @@ def _layers(order: Sequence[int], donors: Integers, recipients: Integers) -> Int
     return np.array([used[int(layer)] for layer in layers], dtype=np.intp)
 
 
-class _Threads:
+class _LayerItems:
     """Nodes, and what passes a layer without stopping there, as items that share the breadth of their layer."""
 
     def __init__(self, layers: Integers, breadths: Floats, clearance: float) -> None:
@@ -177,11 +177,11 @@ class _Threads:
         passed = range(self.layers[donor] + 1, self.layers[recipient])
         items = tuple(range(len(self.sizes), len(self.sizes) + len(passed)))
         self.layers += passed
-        self.sizes += [max(width, THREAD)] * len(passed)
+        self.sizes += [max(width, LEAST_BREADTH)] * len(passed)
         self._links += [(one, two, width + 0.1) for one, two in pairwise((donor, *items, recipient))]
         return items
 
-    def settled(self) -> Floats:
+    def positions(self) -> Floats:
         """Return the middle of each item: close to what it is connected with, and clear of its neighbours."""
         members: list[list[int]] = [[] for _ in range(max(self.layers, default=-1) + 1)]
         for item, place in enumerate(self.layers):
@@ -255,14 +255,14 @@ class _Threads:
 
 
 def _lanes(
-    arcs: Integers, starts: Integers, ends: Integers, widths: Floats, threads: _Threads, middles: Floats
-) -> list[tuple[int, Course]]:
+    arcs: Integers, starts: Integers, ends: Integers, widths: Floats, threads: _LayerItems, middles: Floats
+) -> list[tuple[int, RibbonRoute]]:
     """Give every loop a lane, short ones inside: on the side to which both its ends are closer."""
-    found: list[tuple[int, Course]] = []
+    found: list[tuple[int, RibbonRoute]] = []
     taken: dict[int, list[tuple[range, float]]] = {-1: [], 1: []}
     for arc in sorted(arcs.tolist(), key=lambda k: (int(starts[k] - ends[k]), k)):
         layers = range(int(ends[arc]), int(starts[arc]) + 1)
-        width, (low, high) = max(float(widths[arc]), THREAD), threads.span(layers, middles)
+        width, (low, high) = max(float(widths[arc]), LEAST_BREADTH), threads.span(layers, middles)
         edges = {-1: low, 1: high}
         for side, others in taken.items():
             met = [edge for span, edge in others if span[0] <= layers[-1] and layers[0] <= span[-1]]
@@ -271,5 +271,5 @@ def _lanes(
         side = min((1, -1), key=lambda each: lengths[each])
         lane = edges[side] + side * (LANE + width / 2)
         taken[side].append((layers, lane + side * width / 2))
-        found.append((arc, Course(lane=lane, side=side)))
+        found.append((arc, RibbonRoute(lane=lane, side=side)))
     return found

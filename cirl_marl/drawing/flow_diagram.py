@@ -8,19 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cirl_marl.drawing.weave import Weave, woven
+from cirl_marl.drawing.layered import LayeredLayout, layered_layout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Role
 
-LYING, STANDING = "lying", "standing"
-WIDEST = {LYING: 110.0, STANDING: 96.0}
-CROWDED = {LYING: 84.0, STANDING: 60.0}
+HORIZONTAL, VERTICAL = "lying", "standing"
+WIDEST = {HORIZONTAL: 110.0, VERTICAL: 96.0}
+WIDEST_OF_MANY = {HORIZONTAL: 84.0, VERTICAL: 60.0}
 CROWD = 16
 """Breadth of the most that passes through a box, pixels, and with more boxes than ``CROWD``."""
-LEAST = {LYING: 20.0, STANDING: 72.0}
+LEAST = {HORIZONTAL: 20.0, VERTICAL: 72.0}
 """Least breadth of a box; a standing one holds its label."""
-CLEARANCE = {LYING: 14.0, STANDING: 10.0}
-LETTERS = {LYING: 13, STANDING: 10}
+CLEARANCE = {HORIZONTAL: 14.0, VERTICAL: 10.0}
+LETTERS = {HORIZONTAL: 13, VERTICAL: 10}
 """Of a line of a label."""
 LINE = 12.5
 """Height of a line, pixels."""
@@ -50,7 +50,7 @@ class Ribbon:
 
 
 @dataclass(frozen=True, slots=True)
-class Sketch:
+class FlowDiagram:
     """A flow diagram without its numbers.
 
     Attributes:
@@ -66,35 +66,37 @@ class Sketch:
     group: str
     boxes: tuple[Box, ...]
     ribbons: tuple[Ribbon, ...]
-    weaves: Mapping[str, Weave]
+    layouts: Mapping[str, LayeredLayout]
     breadths: Mapping[str, Floats]
     scales: Mapping[str, float]
     caption: float
 
 
-def sketch(network: Network, peaks: Floats) -> Sketch:
+def flow_diagram(network: Network, peaks: Floats) -> FlowDiagram:
     """Return the diagram of a whole network of which arcs carry at most ``peaks``, shape (arcs,), mass/time."""
     boxes = [Box(node.label, (i,), node.role, node.stores) for i, node in enumerate(network.nodes)]
     ends = zip(network.donors.tolist(), network.recipients.tolist(), strict=True)
-    return placed("", boxes, [Ribbon((k,), donor, recipient) for k, (donor, recipient) in enumerate(ends)], peaks)
+    return arrange_boxes(
+        "", boxes, [Ribbon((k,), donor, recipient) for k, (donor, recipient) in enumerate(ends)], peaks
+    )
 
 
-def placed(
+def arrange_boxes(
     group: str, boxes: list[Box], ribbons: list[Ribbon], peaks: Floats, layers: Integers | None = None
-) -> Sketch:
+) -> FlowDiagram:
     """Find the places of boxes and ribbons whose arcs carry at most ``peaks``; in ``layers``, if they are given."""
     most = np.array([peaks[list(each.members)].sum() for each in ribbons])
     donors, recipients = (np.array([getattr(r, end) for r in ribbons], dtype=np.intp) for end in ("donor", "recipient"))
-    caption = LINE * (1 + max((len(lines(box.label, LYING)) for box in boxes), default=0))
+    caption = LINE * (1 + max((len(lines(box.label, HORIZONTAL)) for box in boxes), default=0))
     weaves, breadths, scales = {}, {}, {}
-    for way in (LYING, STANDING):
+    for way in (HORIZONTAL, VERTICAL):
         through = _through(len(boxes), donors, recipients, most)
-        widest = (WIDEST if len(boxes) <= CROWD else CROWDED)[way]
+        widest = (WIDEST if len(boxes) <= CROWD else WIDEST_OF_MANY)[way]
         scales[way] = widest / max(float(through.max(initial=0.0)), 1e-300)
         breadths[way] = np.maximum(scales[way] * through, LEAST[way])
-        whole = breadths[way] + (caption if way == LYING else 0.0)
-        weaves[way] = woven(donors, recipients, scales[way] * most, whole, CLEARANCE[way], layers)
-    return Sketch(group, tuple(boxes), tuple(ribbons), weaves, breadths, scales, caption)
+        whole = breadths[way] + (caption if way == HORIZONTAL else 0.0)
+        weaves[way] = layered_layout(donors, recipients, scales[way] * most, whole, CLEARANCE[way], layers)
+    return FlowDiagram(group, tuple(boxes), tuple(ribbons), weaves, breadths, scales, caption)
 
 
 def lines(label: str, way: str) -> tuple[str, ...]:

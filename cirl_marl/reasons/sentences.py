@@ -8,16 +8,16 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from cirl_marl.controllers.rollout import interval_ends
-from cirl_marl.drawing.style import number, spoken
+from cirl_marl.drawing.style import number, readable
 from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.network import Network
 from cirl_marl.network.calendar import labels
 from cirl_marl.network.elements import Arc, ControlKind
-from cirl_marl.reasons.explaining import Explanation
-from cirl_marl.reasons.inputs import AgentInputs, Consequence
+from cirl_marl.reasons.attribution import AgentInputs, PairedDifference
+from cirl_marl.reasons.explanation import Explanation
+from cirl_marl.reasons.observations import TIME, Signal
 from cirl_marl.reasons.prices import ShadowPrices
 from cirl_marl.reasons.rules import Condition, Leaf, Rule
-from cirl_marl.reasons.signals import TIME, Signal
 
 SHOWN = 5
 """Most stocks and agents of which prices are told in sentences."""
@@ -31,22 +31,22 @@ def sentences(found: Explanation) -> list[str]:
     """Return what an explanation says, a sentence or two each."""
     said: list[str] = []
     if found.prices is not None:
-        said += of_prices(found.prices)
+        said += price_sentences(found.prices)
     if found.no_prices:
         said.append(f"There are no shadow prices: {found.no_prices}.")
     for each in found.inputs:
-        said.append(of_inputs(found.network, each))
+        said.append(input_sentence(found.network, each))
     if found.rules is not None:
         for rule in found.rules.rules:
-            said += of_rule(found.network, rule)
-        said.append(f"If all agents act by their rules, {changed(found.network, found.rules.together)}.")
+            said += rule_sentences(found.network, rule)
+        said.append(f"If all agents act by their rules, {difference_text(found.network, found.rules.together)}.")
     return said
 
 
-def of_prices(found: ShadowPrices) -> list[str]:
+def price_sentences(found: ShadowPrices) -> list[str]:
     """Say what is worth most."""
     network, bound = found.network, found.bound
-    mass, when = network.mass_unit, moments(network)
+    mass, when = network.mass_unit, interval_names(network)
     said = [f"At the best, λ̄ is {number(bound.objective)} {mass}."]
     largest = np.abs(found.stock).max(axis=0)
     for i in np.argsort(-largest, kind="stable")[:SHOWN].tolist():
@@ -58,12 +58,12 @@ def of_prices(found: ShadowPrices) -> list[str]:
         at = f"{abs(prices[step]):.3g} {mass} {_when(when[step])}"
         if abs(prices[0]) < abs(prices[step]):
             at += f", by {number(float(abs(prices[0])))} {mass} at the start"
-        said.append(f"One more {mass} in {name(network, node.id)} {way} λ̄ by up to {at}.")
+        said.append(f"One more {mass} in {compartment_label(network, node.id)} {way} λ̄ by up to {at}.")
     demand = found.demand.sum(axis=0)
     for s, service in enumerate(network.services):
         if found.demand.any() and abs(demand[s]) > SMALL * np.abs(demand).max():
             unit = mass if service.quantity == "stock" else f"{mass}/{network.time_unit}"
-            title = service.title or spoken(service.id)
+            title = service.title or readable(service.id)
             said.append(
                 f"One more {unit} of demand for {title} in every interval costs {number(float(-demand[s]))} {mass} of"
                 f" λ̄; one per cent more of its level {number(float(-found.level[s] / 100))} {mass}."
@@ -74,40 +74,42 @@ def of_prices(found: ShadowPrices) -> list[str]:
         if abs(room[side, a]) > SMALL * abs(bound.objective):
             what, way = (("lower", "lower"), ("upper", "higher"))[side]
             said.append(
-                f"If the {what} bound of {name(network, bound.agents[a])} were one per cent {way}, λ̄ could be"
-                f" {number(float(room[side, a]))} {mass} higher."
+                f"If the {what} bound of {compartment_label(network, bound.agents[a])} were one per cent {way}, λ̄"
+                f" could be {number(float(room[side, a]))} {mass} higher."
             )
     return said
 
 
-def of_inputs(network: Network, found: AgentInputs) -> str:
+def input_sentence(network: Network, found: AgentInputs) -> str:
     """Say what an agent looks at, and what becomes of λ̄ when it does not."""
     if not found.share.any():
-        return f"*{name(network, found.agent)}* always does the same, whatever it sees."
+        return f"*{compartment_label(network, found.agent)}* always does the same, whatever it sees."
     parts = []
     for i in range(found.top):
         ways = {bool(slope > 0) for slope in found.slope[:, i]}
         way = "" if len(ways) > 1 else f", acts {'more' if ways == {True} else 'less'} as it rises"
-        parts.append(f"{of_signal(network, found.signals[i])} ({100 * found.share[i]:.0f} %{way})")
-    hidden = f"If it is shown their mean{'s' if len(parts) > 1 else ''} instead, {changed(network, found.top_held)}."
-    return f"*{name(network, found.agent)}* looks at {listed(parts)}. {hidden}"
+        parts.append(f"{signal_text(network, found.signals[i])} ({100 * found.share[i]:.0f} %{way})")
+    hidden = (
+        f"If it is shown their mean{'s' if len(parts) > 1 else ''} instead, {difference_text(network, found.top_held)}."
+    )
+    return f"*{compartment_label(network, found.agent)}* looks at {joined_text(parts)}. {hidden}"
 
 
-def of_rule(network: Network, rule: Rule) -> list[str]:
+def rule_sentences(network: Network, rule: Rule) -> list[str]:
     """Say what an agent does when, leaf after leaf, and what it costs if it does just that."""
-    who, said = name(network, rule.agent), []
+    who, said = compartment_label(network, rule.agent), []
     for leaf in sorted(_merged(network, rule), key=lambda each: (_since(each), -each.share)):
-        when = conditions(network, leaf.conditions)
-        deed = f"*{who}* {does(network, rule.agent, leaf)}"
+        when = condition_text(network, leaf.conditions)
+        deed = f"*{who}* {action_text(network, rule.agent, leaf)}"
         often = "" if len(rule.leaves) == 1 else f" ({100 * leaf.share:.0f} % of decisions)"
         said.append(f"{when[:1].upper() + when[1:]} {deed}{often}." if when else f"Always {deed}.")
-    said.append(f"Acting by this rule, {changed(network, rule.cost)}.")
+    said.append(f"Acting by this rule, {difference_text(network, rule.cost)}.")
     return said
 
 
 def _merged(network: Network, rule: Rule) -> list[Leaf]:
     """Join the leaves of a tree of two that say the same; others keep what sets them apart."""
-    said = {does(network, rule.agent, leaf) for leaf in rule.leaves}
+    said = {action_text(network, rule.agent, leaf) for leaf in rule.leaves}
     if len(said) > 1:
         return [*rule.leaves]
     first = rule.leaves[0]
@@ -118,12 +120,12 @@ def _since(leaf: Leaf) -> float:
     return max((each.low for each in leaf.conditions if each.signal.name == TIME), default=-math.inf)
 
 
-def conditions(network: Network, found: Sequence[Condition]) -> str:
+def condition_text(network: Network, found: Sequence[Condition]) -> str:
     """Say when: first the calendar, then what is seen.
 
     A condition on time is one on the beginning of intervals.
     """
-    when, seen, labelled = "", [], moments(network)
+    when, seen, labelled = "", [], interval_names(network)
     for each in found:
         if each.signal.name == TIME:
             steps = len(labelled)
@@ -139,18 +141,18 @@ def conditions(network: Network, found: Sequence[Condition]) -> str:
             continue
         low, high = each.low * each.signal.scale, each.high * each.signal.scale
         unit = "" if each.signal.unit == "1" else f" {each.signal.unit}"
-        what = of_signal(network, each.signal)
+        what = signal_text(network, each.signal)
         if math.isfinite(low) and math.isfinite(high):
             seen.append(f"{what} is between {number(low)} and {number(high)}{unit}")
         elif math.isfinite(low):
             seen.append(f"{what} is above {number(low)}{unit}")
         else:
             seen.append(f"{what} is at most {number(high)}{unit}")
-    where = f"while {listed(seen)}," if seen else ""
+    where = f"while {joined_text(seen)}," if seen else ""
     return f"{when}{', ' if when and where else ',' if when else ''}{where}".replace(",,", ",")
 
 
-def does(network: Network, agent: str, leaf: Leaf) -> str:
+def action_text(network: Network, agent: str, leaf: Leaf) -> str:
     """Say what an agent does in a leaf."""
     compartment = network.compartments[agent]
     control, rows = compartment.control, network.control_rows[agent]
@@ -159,7 +161,7 @@ def does(network: Network, agent: str, leaf: Leaf) -> str:
     value, action = float(leaf.control[0]), float(leaf.action[0])
     if control.kind is ControlKind.INPUT:
         names = compartment.model.input_names if compartment.model is not None else ()
-        return "sets " + listed(
+        return "sets " + joined_text(
             [f"{each} to {number(at)}" for each, at in zip(names, leaf.control.tolist(), strict=True)]
         )
     shown = {
@@ -182,7 +184,7 @@ def _of_donor(network: Network, agent: str) -> str:
     return f" of {network.compartments[compartment.donor].label}" if isinstance(compartment, Arc) else ""
 
 
-def changed(network: Network, found: Consequence) -> str:
+def difference_text(network: Network, found: PairedDifference) -> str:
     """Say how λ̄ and service differ, with 95 % intervals."""
     if found.usual == 0:
         by = _ranged(found.circularity, 1.0, network.mass_unit)
@@ -196,20 +198,20 @@ def _ranged(found: Aggregate, factor: float, unit: str) -> str:
     return f"{value} {unit} [{low}, {high}]"
 
 
-def of_signal(network: Network, found: Signal) -> str:
+def signal_text(network: Network, found: Signal) -> str:
     """Name a signal."""
     if not found.about:
-        return "the time" if found.name == TIME else spoken(found.name)
+        return "the time" if found.name == TIME else readable(found.name)
     kind = found.name[: -len(found.about)].rstrip()
-    return f"{kind} {name(network, found.about)}"
+    return f"{kind} {compartment_label(network, found.about)}"
 
 
-def name(network: Network, compartment: str) -> str:
+def compartment_label(network: Network, compartment: str) -> str:
     """Name a compartment as pictures do."""
     return network.compartments[compartment].label
 
 
-def moments(network: Network) -> list[str]:
+def interval_names(network: Network) -> list[str]:
     """Return what the beginning of each interval is called: a year or date, or the time since the start."""
     begins = interval_ends(network) - network.episode.control_interval
     _, dates = labels(network, begins)
@@ -220,7 +222,7 @@ def _when(moment: str) -> str:
     return f"in {moment}" if moment.isdigit() else f"at {moment}"
 
 
-def listed(parts: Sequence[str]) -> str:
+def joined_text(parts: Sequence[str]) -> str:
     """Join parts with commas and an ``and``."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
@@ -233,11 +235,11 @@ def paragraphs(found: Explanation) -> Iterator[tuple[str, list[str]]]:
     rules = {} if found.rules is None else {rule.agent: rule for rule in found.rules.rules}
     looked = {each.agent: each for each in found.inputs}
     for agent in dict.fromkeys([*looked, *rules]):
-        said = [of_inputs(found.network, looked[agent])] if agent in looked else []
-        said += of_rule(found.network, rules[agent]) if agent in rules else []
-        yield name(found.network, agent), said
+        said = [input_sentence(found.network, looked[agent])] if agent in looked else []
+        said += rule_sentences(found.network, rules[agent]) if agent in rules else []
+        yield compartment_label(found.network, agent), said
     if found.rules is not None:
         yield (
             "All rules together",
-            [f"If all agents act by their rules, {changed(found.network, found.rules.together)}."],
+            [f"If all agents act by their rules, {difference_text(found.network, found.rules.together)}."],
         )

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class SeenEpisodes:
+class RecordedEpisodes:
     """What agents saw, and what a teacher did there.
 
     Attributes:
@@ -35,7 +35,7 @@ class SeenEpisodes:
 
 
 @dataclass
-class Watching(Controller):
+class Recorder(Controller):
     """Lets a pupil act, or the teacher itself, and keeps what the teacher would have done."""
 
     teacher: Policies
@@ -67,10 +67,10 @@ class Watching(Controller):
         return actions if self.pupil is None else self.pupil.act(observations)
 
     @property
-    def seen(self) -> SeenEpisodes:
+    def seen(self) -> RecordedEpisodes:
         """What was seen and done in the last episodes."""
         agents = self._seen[0]
-        return SeenEpisodes(
+        return RecordedEpisodes(
             {agent: np.stack([each[agent] for each in self._seen]) for agent in agents},
             {agent: np.stack([each[agent] for each in self._done]) for agent in self._done[0]},
             {name: [each[name] for each in self._memories] for name in self.teacher.policies},
@@ -78,7 +78,7 @@ class Watching(Controller):
 
 
 @dataclass
-class Holding(Controller):
+class FixedInputs(Controller):
     """A controller to whom some entries of what agents see are shown at fixed values."""
 
     controller: Controller
@@ -98,7 +98,7 @@ class Holding(Controller):
 
 
 @dataclass
-class Instead(Controller):
+class Substitution(Controller):
     """A controller in whose place others act for some agents."""
 
     everyone: Controller
@@ -117,7 +117,7 @@ class Instead(Controller):
         return actions | {agent: acted[id(other)][agent] for agent, other in self.others.items()}
 
 
-def played(
+def play_episodes(
     env: MultiAgentVectorEnv, controller: Controller, seed: int, progress: Callable[[float], None] = lambda share: None
 ) -> Rollout:
     """Return the episodes of a controller from the starts of a seed."""

@@ -18,10 +18,10 @@ from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.reasons import extras
-from cirl_marl.reasons.inputs import AgentInputs, inputs
+from cirl_marl.reasons.attribution import AgentInputs, attribute_inputs
+from cirl_marl.reasons.interventions import Recorder, play_episodes
 from cirl_marl.reasons.prices import ShadowPrices, shadow_prices
-from cirl_marl.reasons.rules import LEAVES, TeamRules, rules
-from cirl_marl.reasons.watching import Watching, played
+from cirl_marl.reasons.rules import LEAVES, TeamRules, distil_rules
 
 PARTS = ("prices", "inputs", "rules")
 """What can be explained: of a network the first alone."""
@@ -130,9 +130,9 @@ def _of_run(
 
     policies, env, first = Trained(run), run.make_env(episodes, uncertain=False), first_seed(seed)
     starts = starting_stocks(env, first)
-    watching = Watching(policies)
+    watching = Recorder(policies)
     share = 1.0 / (1 + len(asked))
-    usual = played(env, watching, first, part_of(progress, "episodes", 0.0, share))
+    usual = play_episodes(env, watching, first, part_of(progress, "episodes", 0.0, share))
     prices: ShadowPrices | None = None
     looked: tuple[AgentInputs, ...] = ()
     ruled: TeamRules | None = None
@@ -146,11 +146,11 @@ def _of_run(
         done += share
     if "inputs" in asked:
         told = part_of(progress, "what agents look at", done, share)
-        looked = inputs(env, policies, Trained(run), watching.seen, usual, first, top=top, progress=told)
+        looked = attribute_inputs(env, policies, Trained(run), watching.seen, usual, first, top=top, progress=told)
         done += share
     if "rules" in asked:
         told = part_of(progress, "rules", done, share)
-        ruled = rules(env, policies, usual, first, leaves=leaves, progress=told)
+        ruled = distil_rules(env, policies, usual, first, leaves=leaves, progress=told)
     return Explanation(
         network=env.network,
         about=str(run.path),

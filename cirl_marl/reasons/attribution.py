@@ -20,8 +20,8 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
 from cirl_marl.network import Floats, Integers
 from cirl_marl.reasons.extras import captum
-from cirl_marl.reasons.signals import Signal, columns, entries_of, signal
-from cirl_marl.reasons.watching import Holding, Instead, SeenEpisodes, played
+from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution, play_episodes
+from cirl_marl.reasons.observations import Signal, observation_entries, policy_columns, signal_of
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies, Policy
@@ -33,7 +33,7 @@ POINTS = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Consequence:
+class PairedDifference:
     """How episodes differ from those of the policies from the same starts: means with 95 % intervals over episodes.
 
     Attributes:
@@ -69,24 +69,24 @@ class AgentInputs:
     slope: Floats
     missed: float
     top: int
-    top_held: Consequence
-    least_held: Consequence | None
+    top_held: PairedDifference
+    least_held: PairedDifference | None
 
 
-def compared(run: Rollout, usual: Rollout) -> Consequence:
+def paired_difference(run: Rollout, usual: Rollout) -> PairedDifference:
     """Return how episodes differ from those to which they are compared, start by start."""
-    return Consequence(
+    return PairedDifference(
         circularity=over_episodes(run.episode_circularity - usual.episode_circularity),
         service=over_episodes(run.episode_service - usual.episode_service),
         usual=float(usual.episode_circularity.mean()),
     )
 
 
-def inputs(
+def attribute_inputs(
     env: MultiAgentVectorEnv,
     policies: Policies,
     again: Policies,
-    seen: SeenEpisodes,
+    seen: RecordedEpisodes,
     usual: Rollout,
     seed: int,
     *,
@@ -111,7 +111,7 @@ def inputs(
     found = []
     for place, agent in enumerate(env.agents):
         name, policy = next(each for each in policies.policies.items() if agent in each[1].view.agents)
-        where = columns(env, policy.view, agent)
+        where = policy_columns(env, policy.view, agent)
         share, slope, missed = _attributed(env, name, policy, agent, seen)
         order = np.argsort(-share, kind="stable")
         count = min(top, len(order))
@@ -119,14 +119,14 @@ def inputs(
         for which in (order[:count], order[count:][-count:]):
             names = [where.names[i] for i in which]
             held = {each: _means(env, each, names, seen) for each in policy.view.agents}
-            other = Holding(again, held)
-            run = played(env, Instead(policies, {agent: other}), seed) if names else usual
-            outcomes.append(compared(run, usual) if names else None)
+            other = FixedInputs(again, held)
+            run = play_episodes(env, Substitution(policies, {agent: other}), seed) if names else usual
+            outcomes.append(paired_difference(run, usual) if names else None)
         assert outcomes[0] is not None
         found.append(
             AgentInputs(
                 agent=agent,
-                signals=tuple(signal(env.network, where.names[i]) for i in order),
+                signals=tuple(signal_of(env.network, where.names[i]) for i in order),
                 share=share[order],
                 slope=slope[:, order],
                 missed=missed,
@@ -139,20 +139,20 @@ def inputs(
     return tuple(found)
 
 
-def _means(env: MultiAgentVectorEnv, agent: str, names: list[str], seen: SeenEpisodes) -> tuple[Integers, Floats]:
-    entries = entries_of(env, agent, names)
+def _means(env: MultiAgentVectorEnv, agent: str, names: list[str], seen: RecordedEpisodes) -> tuple[Integers, Floats]:
+    entries = observation_entries(env, agent, names)
     return entries, seen.observations[agent].mean(axis=(0, 1))[entries]
 
 
 def _attributed(
-    env: MultiAgentVectorEnv, name: str, policy: Policy, agent: str, seen: SeenEpisodes
+    env: MultiAgentVectorEnv, name: str, policy: Policy, agent: str, seen: RecordedEpisodes
 ) -> tuple[Floats, Floats, float]:
     """Return shares, slopes and what is missed, for the signals of ``columns``."""
     import torch
 
     from cirl_marl.learners.policies import DifferentiablePolicy
 
-    acting, view, where = DifferentiablePolicy(policy), policy.view, columns(env, policy.view, agent)
+    acting, view, where = DifferentiablePolicy(policy), policy.view, policy_columns(env, policy.view, agent)
     flat: Mapping[str, Floats] = {
         each: seen.observations[each].reshape(-1, seen.observations[each].shape[2]) for each in view.agents
     }

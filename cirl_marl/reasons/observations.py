@@ -32,7 +32,7 @@ class Signal:
     unit: str
 
 
-def signal(network: Network, name: str) -> Signal:
+def signal_of(network: Network, name: str) -> Signal:
     """Return what an entry of an observation stands for.
 
     Observations are divided by the scale of their compartment; time is a share of the episode.
@@ -52,7 +52,7 @@ def signal(network: Network, name: str) -> Signal:
 
 
 @dataclass(frozen=True, slots=True)
-class Columns:
+class PolicyColumns:
     """What stands in the row that a policy sees when it acts for one agent.
 
     Attributes:
@@ -68,7 +68,7 @@ class Columns:
     entries: Integers
 
 
-def columns(env: MultiAgentVectorEnv, view: View, agent: str) -> Columns:
+def policy_columns(env: MultiAgentVectorEnv, view: View, agent: str) -> PolicyColumns:
     """Return what stands where in the row in which a policy sees an agent.
 
     Views are asked: they are shown numbers that no indicator and no padding has.
@@ -92,10 +92,10 @@ def columns(env: MultiAgentVectorEnv, view: View, agent: str) -> Columns:
     outputs = int(view.action_space.shape[0])  # type: ignore[index]
     acted = view.act(np.tile(np.arange(outputs, dtype=np.float64), (max(1, len(view.row_agents)), 1)))
     places = tuple(np.array(each, dtype=np.intp) for each in found.values())
-    return Columns(tuple(found), places, tuple(seen.values()), np.asarray(acted[agent][0], dtype=np.intp))
+    return PolicyColumns(tuple(found), places, tuple(seen.values()), np.asarray(acted[agent][0], dtype=np.intp))
 
 
-def entries_of(env: MultiAgentVectorEnv, agent: str, names: Sequence[str]) -> Integers:
+def observation_entries(env: MultiAgentVectorEnv, agent: str, names: Sequence[str]) -> Integers:
     """Return which entries of an agent's observation have these names."""
     shown = env.observation_names[agent]
     return np.array([i for i, name in enumerate(shown) if name in names], dtype=np.intp)

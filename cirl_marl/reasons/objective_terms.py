@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cirl_marl.drawing.style import spoken
+from cirl_marl.drawing.style import readable
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Arc, Node, Role
@@ -20,7 +20,7 @@ from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
 KINDS = ("circularity", "services", "set-points")
-LOST = {
+CIRCULARITY_PARTS = {
     Role.NONRENEWABLE_RESERVOIR: "taken from reservoirs",
     Role.LANDFILL: "put into landfills",
     Role.INCINERATOR: "burnt",
@@ -47,7 +47,7 @@ class PlannedEpisode:
 
 
 @dataclass(frozen=True, slots=True)
-class Functional:
+class LinearFunctional:
     """Weights of what is measured in an episode; None where nothing of a kind counts.
 
     Attributes:
@@ -67,7 +67,13 @@ class Functional:
     def of(self, network: Network, course: PlannedEpisode) -> float:
         """Return what it is in an episode."""
         net = np.abs(course.flow @ network.circularity_weights[1])
-        measured = (course.flow, course.stock, network.throughput(course.flow.T).T, levels(network, course), net)
+        measured = (
+            course.flow,
+            course.stock,
+            network.throughput(course.flow.T).T,
+            service_levels(network, course),
+            net,
+        )
         weights = (self.flow, self.stock, self.through, self.level, self.imbalance)
         return float(sum((w * m).sum() for w, m in zip(weights, measured, strict=True) if w is not None))
 
@@ -90,7 +96,7 @@ class Functional:
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class ObjectiveTerm:
     """One thing that a plan may be meant to do.
 
     Attributes:
@@ -107,17 +113,17 @@ class Term:
     about: str = ""
     roles: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def tangent(self, network: Network, course: PlannedEpisode) -> Functional:
+    def tangent(self, network: Network, course: PlannedEpisode) -> LinearFunctional:
         """Return the term, or its tangent at an episode."""
         steps = network.episode.horizon
         if self.kind == "services":
             level = np.zeros((steps, len(network.services)))
             level[:, [each.id for each in network.services].index(self.about)] = 1.0 / steps
-            return Functional(level=level)
+            return LinearFunctional(level=level)
         if self.kind == "circularity":
             if not self.roles.any():
-                return Functional(imbalance=np.full(steps, -1.0 / steps))
-            return Functional(flow=np.tile(self.roles / steps, (steps, 1)))
+                return LinearFunctional(imbalance=np.full(steps, -1.0 / steps))
+            return LinearFunctional(flow=np.tile(self.roles / steps, (steps, 1)))
         compartment = network.compartments[self.about]
         assert compartment.set_point is not None
         slope = -2.0 / (compartment.scale**2 * steps)
@@ -125,19 +131,19 @@ class Term:
             place, values = network.arc_index[self.about], course.flow
             weights = np.zeros_like(course.flow)
             weights[:, place] = slope * (values[:, place] - compartment.set_point)
-            return Functional(flow=weights)
+            return LinearFunctional(flow=weights)
         place, stores = network.node_index[self.about], len(network.stores)
         if isinstance(compartment, Node) and compartment.stores:
             weights = np.zeros_like(course.stock)
             weights[:, place] = slope * (course.stock[:, place] - compartment.set_point)
-            return Functional(stock=weights)
+            return LinearFunctional(stock=weights)
         through = network.throughput(course.flow.T).T
         weights = np.zeros_like(through)
         weights[:, place - stores] = slope * (through[:, place - stores] - compartment.set_point)
-        return Functional(through=weights)
+        return LinearFunctional(through=weights)
 
 
-def terms(network: Network, kinds: Sequence[str] = KINDS) -> list[Term]:
+def objective_terms(network: Network, kinds: Sequence[str] = KINDS) -> list[ObjectiveTerm]:
     """Return what a plan of a network may be meant to do.
 
     - *circularity*: each part of λ, −Δ times what it counts, mass: taken from reservoirs, put into landfills, …
@@ -150,7 +156,7 @@ def terms(network: Network, kinds: Sequence[str] = KINDS) -> list[Term]:
     for kind in kinds:
         if kind not in KINDS:
             raise CirlError(f"terms: {unknown('kind', kind, KINDS)}")
-    found: list[Term] = []
+    found: list[ObjectiveTerm] = []
     if "circularity" in kinds:
         parts: dict[str, Floats] = {}
         signed = network.circularity_weights.sum(axis=0)
@@ -158,17 +164,18 @@ def terms(network: Network, kinds: Sequence[str] = KINDS) -> list[Term]:
             signed = network.circularity_weights[0]
         for k in np.flatnonzero(signed):
             parts.setdefault(_part(network, int(k)), np.zeros(len(network.arcs)))[k] = signed[k]
-        found += [Term(name, "circularity", network.mass_unit, roles=roles) for name, roles in parts.items()]
+        found += [ObjectiveTerm(name, "circularity", network.mass_unit, roles=roles) for name, roles in parts.items()]
         if network.objective.net_zero == "abs" and network.circularity_weights[1].any():
-            found.append(Term("net flow through the environment", "circularity", network.mass_unit))
+            found.append(ObjectiveTerm("net flow through the environment", "circularity", network.mass_unit))
     if "services" in kinds:
-        found += [Term(s.title or spoken(s.id), "services", "1", about=s.id) for s in network.services]
+        found += [ObjectiveTerm(s.title or readable(s.id), "services", "1", about=s.id) for s in network.services]
     if "set-points" in kinds:
         tracked = network.objective.tracked or tuple(
             each.id for each in network.compartments.values() if each.set_point is not None
         )
         found += [
-            Term(f"set-point of {network.compartments[each].label}", "set-points", "1", about=each) for each in tracked
+            ObjectiveTerm(f"set-point of {network.compartments[each].label}", "set-points", "1", about=each)
+            for each in tracked
         ]
     if len(found) < 2:
         raise CirlError(
@@ -180,10 +187,12 @@ def terms(network: Network, kinds: Sequence[str] = KINDS) -> list[Term]:
 def _part(network: Network, arc: int) -> str:
     ends = (network.arcs[arc].donor, network.arcs[arc].recipient)
     roles = [network.nodes[network.node_index[end]].role for end in ends]
-    return LOST[next(role for role in LOST if role in (roles if network.sustainability[arc] > 0 else roles[::-1]))]
+    return CIRCULARITY_PARTS[
+        next(role for role in CIRCULARITY_PARTS if role in (roles if network.sustainability[arc] > 0 else roles[::-1]))
+    ]
 
 
-def levels(network: Network, course: PlannedEpisode) -> Floats:
+def service_levels(network: Network, course: PlannedEpisode) -> Floats:
     """Return the level min(1, q/low) of each service in each interval, shape (steps, services)."""
     found = np.ones((len(course.flow), len(network.services)))
     for s, service in enumerate(network.services):

@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from cirl_marl.controllers.basic import Watched
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.controllers.schedule import Schedule
-from cirl_marl.drawing.style import spoken
+from cirl_marl.drawing.style import readable
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import FIGURES, Comparison
@@ -42,7 +42,7 @@ class Band:
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class Scene:
+class PageEpisode:
     """One course of a network: who acts, and what became of it."""
 
     name: Annotated[str, "who acts, or under which scenario"]
@@ -73,12 +73,14 @@ class PlanePoint:
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class Story:
+class ReportPage:
     """All that one page shows."""
 
     title: Annotated[str, "heading"]
     network: Annotated[Network, "the network that it is about"]
-    scenes: Annotated[tuple[Scene, ...], "the first is what the others are compared with; none for points alone"] = ()
+    scenes: Annotated[
+        tuple[PageEpisode, ...], "the first is what the others are compared with; none for points alone"
+    ] = ()
     points: Annotated[tuple[PlanePoint, ...], "what is drawn in the plane of service and circularity"] = ()
     front: Annotated[Floats, "levels of every service and the bound on λ̄ there, shape (levels, 2)"] = field(
         default_factory=lambda: np.empty((0, 2))
@@ -87,21 +89,21 @@ class Story:
     reasons: Annotated[tuple[tuple[str, tuple[str, ...]], ...], "headings with sentences that say why"] = ()
 
 
-def of_alternatives(found: Sequence[Simulation]) -> Story:
+def page_of_alternatives(found: Sequence[Simulation]) -> ReportPage:
     """Return the page of ``cirl simulate``."""
     scenes = [
-        _scene(each.name or spoken(each.control), each.network, each.env.agents, each.start, each.rollout)
+        _scene(each.name or readable(each.control), each.network, each.env.agents, each.start, each.rollout)
         for each in found
     ]
     network = found[0].network
-    return Story(_title(network), network, tuple(scenes), notes=(f"Start: {found[0].begun.said}.",))
+    return ReportPage(_title(network), network, tuple(scenes), notes=(f"Start: {found[0].begun.said}.",))
 
 
-def of_samples(found: SampledEpisodes, control: str) -> Story:
+def page_of_samples(found: SampledEpisodes, control: str) -> ReportPage:
     """Return the page of ``cirl simulate --samples``: flows and stocks are means, which balance as medians do not."""
     network, count = found.network, len(found.circularity)
-    scene = Scene(
-        spoken(control),
+    scene = PageEpisode(
+        readable(control),
         network,
         network.agents,
         None,
@@ -113,10 +115,10 @@ def of_samples(found: SampledEpisodes, control: str) -> Story:
         SAMPLES.format(count),
     )
     note = f"Flows and stocks are means of {count} samples of the uncertain numbers."
-    return Story(_title(network), network, (scene,), notes=(note,))
+    return ReportPage(_title(network), network, (scene,), notes=(note,))
 
 
-def of_schedule(found: Schedule, name: str, *, note: str = "") -> Story:
+def page_of_schedule(found: Schedule, name: str, *, note: str = "") -> ReportPage:
     """Return the page of ``cirl plan``: business as usual, and what is planned."""
     network, start = found.network, found.start
     scenes = (
@@ -124,10 +126,10 @@ def of_schedule(found: Schedule, name: str, *, note: str = "") -> Story:
         _scene(name, network, found.agents, start, found.rollout),
     )
     notes = [f"Start: {found.begun.said}.", *([note] if note else [])]
-    return Story(_title(network), network, scenes, notes=tuple(notes))
+    return ReportPage(_title(network), network, scenes, notes=tuple(notes))
 
 
-def of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> Story:
+def page_of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> ReportPage:
     """Return the page of ``cirl compare``, neutral control first, but for the rows ``without`` whom it shall be."""
     start = _first_start(found)
     scenes, points = [], []
@@ -135,7 +137,9 @@ def of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> Story:
         if row.name in without:
             continue
         figures = {which: row.figure(which) for which in FIGURES}
-        shown = USUAL if row.name == "neutral" else f"trained, {spoken(row.name)}" if row.seeds else spoken(row.name)
+        shown = (
+            USUAL if row.name == "neutral" else f"trained, {readable(row.name)}" if row.seeds else readable(row.name)
+        )
         for entry in row.entries:
             name = shown if len(row.entries) == 1 else f"{shown}, seed {entry.seed}"
             scenes.append(_scene(name, found.network, found.agents, start, entry.rollout, figures))
@@ -143,12 +147,17 @@ def of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> Story:
             points.append(PlanePoint(shown, service, circularity, "" if entry.seed is None else f"seed {entry.seed}"))
     notes = [f"Flows, stocks and actions are those of the first of {found.episodes} episodes."]
     notes += [f"No bound: {found.baseline.reason}."] if found.baseline.reason else []
-    return Story(_title(found.network), found.network, tuple(scenes), tuple(points), found.baseline.front, tuple(notes))
+    return ReportPage(
+        _title(found.network), found.network, tuple(scenes), tuple(points), found.baseline.front, tuple(notes)
+    )
 
 
-def with_plan(
-    story: Story, found: Comparison, env: MultiAgentVectorEnv, progress: Callable[[float], None] = lambda share: None
-) -> Story:
+def add_plan(
+    story: ReportPage,
+    found: Comparison,
+    env: MultiAgentVectorEnv,
+    progress: Callable[[float], None] = lambda share: None,
+) -> ReportPage:
     """Return the page with the best plan for the first episode.
 
     It serves as well as the first policy did there; where numbers are drawn, of which a plan knows nothing, as well as
@@ -169,7 +178,7 @@ def with_plan(
     return replace(story, scenes=(*story.scenes, scene), points=(*story.points, point), notes=tuple(notes))
 
 
-def of_sweep(found: ParetoFront) -> Story:
+def page_of_front(found: ParetoFront) -> ReportPage:
     """Return the page of ``cirl pareto``: points alone, as nothing else of its episodes is kept."""
     names = {"plan": "plans", "trained": "trained", "neutral": USUAL}
     points = [
@@ -178,7 +187,7 @@ def of_sweep(found: ParetoFront) -> Story:
         if each.kind in names
     ]
     notes = [f"No bound: {found.reason}."] if found.reason else []
-    return Story(_title(found.network), found.network, points=tuple(points), front=found.front, notes=tuple(notes))
+    return ReportPage(_title(found.network), found.network, points=tuple(points), front=found.front, notes=tuple(notes))
 
 
 def _weighed(weight: float | None, seed: int | None) -> str:
@@ -200,13 +209,13 @@ def _scene(
     start: Floats,
     run: Rollout,
     figures: Mapping[str, Aggregate | None] | None = None,
-) -> Scene:
+) -> PageEpisode:
     episodes = len(run.circularity_mean)
     figures = figures or {
         "circularity": over_episodes(run.episode_circularity),
         "service": over_episodes(run.episode_service, SHARE),
     }
-    return Scene(
+    return PageEpisode(
         name,
         network,
         agents,
@@ -236,4 +245,4 @@ def _quantiles(values: Floats) -> Band:
 
 
 def _title(network: Network) -> str:
-    return network.title or spoken(network.name)
+    return network.title or readable(network.name)

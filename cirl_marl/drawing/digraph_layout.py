@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from cirl_marl.drawing.places import place
+from cirl_marl.drawing.placement import place_nodes
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Role
 
@@ -37,7 +37,7 @@ class Routes:
 
 
 @dataclass(frozen=True, slots=True)
-class Arrangement:
+class DigraphLayout:
     """Where everything of one network goes, in em: ``positions`` are the centres of the nodes, shape (nodes, 2).
 
     ``routes`` are None for networks too large to label; ``names`` are the labels of the nodes, in lines.
@@ -60,7 +60,7 @@ class Arrangement:
         return points.min(axis=0), points.max(axis=0)
 
 
-def arrangement_of(network: Network, aspect: float) -> Arrangement:
+def digraph_layout(network: Network, aspect: float) -> DigraphLayout:
     """Return the layout of ``network`` for pictures of about this width over height."""
     nodes = tuple((node.label, node.role) for node in network.nodes)
     arcs = tuple((arc.donor, arc.recipient) for arc in network.arcs)
@@ -77,15 +77,15 @@ class _Structure:
 
 
 @lru_cache(maxsize=16)
-def _layout(structure: _Structure, aspect: float) -> Arrangement:
+def _layout(structure: _Structure, aspect: float) -> DigraphLayout:
     network = structure.network
     names = tuple(_lines(node.label) for node in network.nodes)
     letters = max(len(line) for name in names for line in name)
     box = np.array([max(5.5, 0.62 * letters + 1.0), 1.2 * (max(map(len, names)) + 1) + 0.6])
-    positions = place(network, box + np.array([4.8, 3.7]), aspect)
+    positions = place_nodes(network, box + np.array([4.8, 3.7]), aspect)
     labelled = len(network.nodes) <= LABELLED_NODES and len(network.arcs) <= LABELLED_ARCS
     routes = route(positions, network.donors, network.recipients, box) if labelled else None
-    return Arrangement(positions, routes, box, names)
+    return DigraphLayout(positions, routes, box, names)
 
 
 def _lines(label: str) -> tuple[str, ...]:

@@ -29,8 +29,8 @@ from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.options import DEGREE
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Basis, solve
-from cirl_marl.reasons.courses import courses, setting
-from cirl_marl.reasons.terms import KINDS, PlannedEpisode, Term, terms
+from cirl_marl.reasons.objective_terms import KINDS, ObjectiveTerm, PlannedEpisode, objective_terms
+from cirl_marl.reasons.plans import episode_setting, episodes_of_plan
 
 WITHIN = 0.01
 ROUNDS = 200
@@ -43,7 +43,7 @@ NOTHING = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Aims:
+class ObjectiveWeights:
     """The weights under which plans are within a distance of the best.
 
     Weights are shares u_j = w_j S_j, Σ u = 1, S_j being how much of a term there is to be had: from the least to the
@@ -66,7 +66,7 @@ class Aims:
 
     network: Network
     plans: tuple[str, ...]
-    terms: tuple[Term, ...]
+    terms: tuple[ObjectiveTerm, ...]
     spread: Floats
     low: Floats
     high: Floats
@@ -94,7 +94,7 @@ class Aims:
         return found
 
     @property
-    def found(self) -> list[int]:
+    def identifiable(self) -> list[int]:
         """Terms whose weight the plans tell: the range is at most a tenth of its middle."""
         middle = (self.low + self.high) / 2
         return [j for j in range(len(self.terms)) if self.high[j] - self.low[j] <= NARROW * middle[j]]
@@ -103,7 +103,7 @@ class Aims:
 class _WeighedPlan:
     """One plan, with the program of what could have been done from its start."""
 
-    def __init__(self, programs: Programs, weighed: Sequence[Term], course: PlannedEpisode) -> None:
+    def __init__(self, programs: Programs, weighed: Sequence[ObjectiveTerm], course: PlannedEpisode) -> None:
         admissible = programs.admissible
         network, lifetimes = admissible.lifetimes.network, admissible.lifetimes
         steps = network.episode.horizon
@@ -132,7 +132,7 @@ def infer(
     seed: int | None = None,
     episodes: int = 4,
     progress: Callable[[float], None] = lambda share: None,
-) -> Aims:
+) -> ObjectiveWeights:
     """Return the weights under which plans are (close to) optimal.
 
     Args:
@@ -159,12 +159,14 @@ def infer(
     given = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
     if not given:
         raise CirlError("infer: no plans were given")
-    known, agents = setting(known, given)
-    weighed = tuple(terms(known, kinds))
+    known, agents = episode_setting(known, given)
+    weighed = tuple(objective_terms(known, kinds))
     programs = Programs(Admissible.of(known, agents), DEGREE, None)
     every: list[PlannedEpisode] = []
     for each in given:
-        every += [each] if isinstance(each, PlannedEpisode) else courses(known, each, seed=seed, episodes=episodes)
+        every += (
+            [each] if isinstance(each, PlannedEpisode) else episodes_of_plan(known, each, seed=seed, episodes=episodes)
+        )
     for course in every:
         _check_shape(known, course)
     cone = _Cone([_WeighedPlan(programs, weighed, course) for course in every], len(weighed), progress)
@@ -173,7 +175,7 @@ def infer(
     allowed = distance + within
     low, high, corners = cone.ends(allowed)
     progress(1.0)
-    return Aims(
+    return ObjectiveWeights(
         network=known,
         plans=tuple(course.name for course in every),
         terms=weighed,

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
-from cirl_marl.drawing.style import DASHES, SERIES, dated, dressed, save, spoken, time_axis
+from cirl_marl.drawing.style import DASHES, SERIES, axis_time, readable, save, style_axes, time_axis
 from cirl_marl.evaluation.simulations import ComparedQuantity, Simulation
 from cirl_marl.evaluation.statistics import defined
 from cirl_marl.network import Floats, Network
@@ -97,10 +97,10 @@ def save_alternatives(
             time, values = _trajectory(found[i], quantity)
             dash = DASHES[(i + i // len(SERIES)) % len(DASHES)]  # colours come round before pairs do
             mark = "o" if len(time) == 1 else ""
-            axes.plot(dated(time, network), values, color=SERIES[i % len(SERIES)], linestyle=dash, marker=mark)
+            axes.plot(axis_time(time, network), values, color=SERIES[i % len(SERIES)], linestyle=dash, marker=mark)
         heading, unit = _labels(network, quantity)
-        dressed(axes, title=heading, ylabel=unit, size=8.0)
-        time_axis(axes, dated(np.array([0.0, ends[-1]]), network), network)
+        style_axes(axes, title=heading, ylabel=unit, size=8.0)
+        time_axis(axes, axis_time(np.array([0.0, ends[-1]]), network), network)
         if quantity.kind == "service":
             axes.set_ylim(-0.03, 1.06)
     for axes in grid[len(panels) :]:
@@ -136,7 +136,7 @@ def _trajectory(alternative: Simulation, quantity: ComparedQuantity) -> tuple[Fl
 
 def _labels(network: Network, quantity: ComparedQuantity) -> tuple[str, str]:
     """Return the heading of a panel and the name of its vertical axis, with the unit."""
-    mass, of = network.mass_unit, spoken(quantity.of)
+    mass, of = network.mass_unit, readable(quantity.of)
     return {
         "circularity": ("Mean circularity", f"λ / {mass}"),
         "service": (f"Service: {of}", "service level"),

@@ -11,8 +11,8 @@ import numpy as np
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.definitions.sources import Stated, stated
 from cirl_marl.definitions.writing import fingerprint
-from cirl_marl.drawing.grouping import sketches
-from cirl_marl.drawing.sketch import Sketch, lines
+from cirl_marl.drawing.flow_diagram import FlowDiagram, lines
+from cirl_marl.drawing.grouping import flow_diagrams
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.network import Floats, Network
@@ -21,15 +21,15 @@ from cirl_marl.network.elements import Arc, Service
 from cirl_marl.network.series import extremes
 from cirl_marl.records.machine import versions
 from cirl_marl.report.decisions import settings
-from cirl_marl.report.scenes import PLAN, Band, Scene, Story
-from cirl_marl.report.tables import law_text
+from cirl_marl.report.report_page import PLAN, Band, PageEpisode, ReportPage
+from cirl_marl.report.terminal import law_text
 
 DIGITS = 6
 """Significant digits of every number on the page."""
 SHOWN_VERSIONS = ("cirl-marl", "python", "numpy", "torch")
 
 
-def document(story: Story) -> dict[str, Any]:
+def page_data(story: ReportPage) -> dict[str, Any]:
     """Return everything that the page of ``story`` shows.
 
     Raises:
@@ -74,7 +74,7 @@ def document(story: Story) -> dict[str, Any]:
     }
 
 
-def _clock(scenes: Sequence[Scene]) -> dict[str, Any]:
+def _clock(scenes: Sequence[PageEpisode]) -> dict[str, Any]:
     """Return when each interval begins and ends, and what it is called; the same for all scenes."""
     if not scenes:
         return {"from": [], "to": [], "labels": [], "calendar": ""}
@@ -94,7 +94,7 @@ def _clock(scenes: Sequence[Scene]) -> dict[str, Any]:
     return {"from": _list(begins), "to": _list(ends), "labels": named, "calendar": calendar[0] if calendar else ""}
 
 
-def _network(network: Network, story: Story) -> dict[str, Any]:
+def _network(network: Network, story: ReportPage) -> dict[str, Any]:
     scenes = [each for each in story.scenes if each.network == network]
     peaks = np.max([np.abs(np.nan_to_num(each.flow)).max(axis=0) for each in scenes], axis=0)
     told = stated(network)
@@ -138,7 +138,7 @@ def _network(network: Network, story: Story) -> dict[str, Any]:
         }
         for each in settings(network, agents)
     ]
-    drawn = [_sketch(each) for each in sketches(network, peaks)]
+    drawn = [_sketch(each) for each in flow_diagrams(network, peaks)]
     return {"nodes": nodes, "arcs": arcs, "services": services, "settings": controls, "sketches": drawn}
 
 
@@ -161,7 +161,7 @@ def _told(found: Iterable[Stated]) -> list[list[str]]:
     return [[each.key, each.value, each.source] for each in found]
 
 
-def _scene(scene: Scene, network: int) -> dict[str, Any]:
+def _scene(scene: PageEpisode, network: int) -> dict[str, Any]:
     found = scene.network
     start = np.full(len(found.stores), np.nan) if scene.start is None else scene.start
     stock = np.concatenate([start[None], scene.stock])
@@ -181,7 +181,7 @@ def _scene(scene: Scene, network: int) -> dict[str, Any]:
     }
 
 
-def _sketch(drawn: Sketch) -> dict[str, Any]:
+def _sketch(drawn: FlowDiagram) -> dict[str, Any]:
     ways = {
         way: {
             "scale": drawn.scales[way],
@@ -195,10 +195,10 @@ def _sketch(drawn: Sketch) -> dict[str, Any]:
                 {"lane": _pixels(each.lane), "side": each.side}
                 if each.side
                 else {"via": [_pixels(at) for at in each.via]} | ({"back": True} if each.back else {})
-                for each in weave.courses
+                for each in weave.routes
             ],
         }
-        for way, weave in drawn.weaves.items()
+        for way, weave in drawn.layouts.items()
     }
     boxes = [
         {"label": box.label, "members": list(box.members), "role": box.role.value, "stores": box.stores,

@@ -16,8 +16,8 @@ from importlib.resources import files
 from pathlib import Path
 
 from cirl_marl.records.files import write_atomically
-from cirl_marl.report.document import document
-from cirl_marl.report.scenes import Story
+from cirl_marl.report.page_data import page_data
+from cirl_marl.report.report_page import ReportPage
 
 SCRIPTS = (
     "elements", "figures", "clock", "ribbons", "diagram", "curves", "plane", "details", "agents", "reasons", "tables",
@@ -26,20 +26,20 @@ SCRIPTS = (
 """Modules of the page, each behind those from which it imports."""
 
 
-def write_page(path: Path, story: Story) -> Path:
+def write_page(path: Path, story: ReportPage) -> Path:
     """Write the page of ``story``, whole or not at all, and return its path; missing folders are made.
 
     Raises:
         CirlError: for what ``document`` refuses.
         OSError: if the file cannot be written.
     """
-    text = page(story)
+    text = page_html(story)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda partial: partial.write_text(text, "utf-8", "xmlcharrefreplace"))
     return path
 
 
-def page(story: Story) -> str:
+def page_html(story: ReportPage) -> str:
     """Return the text of the page."""
     script, style = _script(), _read("page.css")
     parts = {
@@ -47,7 +47,7 @@ def page(story: Story) -> str:
         "script_hash": _hash(script),
         "style_hash": _hash(style),
         "style": style,
-        "data": _harmless(document(story)),
+        "data": _harmless(page_data(story)),
         "script": script,
     }
     return re.sub(r"{{(\w+)}}", lambda found: parts[found[1]], _read("page.html"))
