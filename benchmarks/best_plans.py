@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, Network, load_network, networks
-from cirl_marl.controllers.rollout import beginning
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.controllers.schedule import Schedule, schedule
 from cirl_marl.definitions.writing import fingerprint
 from cirl_marl.network import Floats
@@ -113,7 +113,7 @@ def replayed(kept: BestPlan) -> Schedule:
 
 def _episode(network: Network, actions: Mapping[str, list[list[float]]]) -> Schedule:
     env = MultiAgentVectorEnv(network, num_envs=1)
-    beginning(env, None).reset(env)
+    episode_start(env, None).reset(env)
     rows = np.concatenate([np.array(actions[agent]) for agent in env.agents], axis=1)
     return schedule(env, Plan(KeptActions(env.network, env.agents, starting_states(env)[0], rows)))
 
@@ -126,7 +126,7 @@ def best_plan(name: str) -> BestPlan:
     """
     network = load_network(name)
     env = MultiAgentVectorEnv(network, num_envs=1)
-    begun = beginning(env, None)
+    begun = episode_start(env, None)
     begun.reset(env)
     start = env.physical.stock[env.rows.nodes, 0]
     proved, reason, level = None, "", SEARCHED
@@ -144,7 +144,7 @@ def best_plan(name: str) -> BestPlan:
     except NoCertificate as missing:
         reason, level = str(missing), SEARCHED
         iterations = ITERATIONS.get(name, USUAL_ITERATIONS)
-        plan = search(network, begun.given, min_service=level, iterations=iterations).actions
+        plan = search(network, begun.initial_state, min_service=level, iterations=iterations).actions
     actions = {agent: np.round(plan[:, rows], DIGITS).tolist() for agent, rows in _entries(env).items()}
     run = _episode(network, actions).rollout
     served = float(run.least_service[0])

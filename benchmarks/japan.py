@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.document import write_sections
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Constant, Neutral
-from cirl_marl.controllers.rollout import Rollout, beginning, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.evaluation import Comparison, compare
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.learners.run_directory import RunDirectory
@@ -41,7 +41,7 @@ class Levers:
         named = {self.network.compartments[agent].label: (agent,) for agent in env.agents}
         together = {agent for agents in TOGETHER.values() for agent in agents}
         self.agents = {name: agents for name, agents in named.items() if not together & {*agents}} | TOGETHER
-        beginning(env).reset(env)
+        episode_start(env).reset(env)
         usual = np.empty_like(plan.actions)
         for step in range(len(plan.actions)):
             usual[step] = env.stack(env.neutral_action)[:, 0]
@@ -98,14 +98,16 @@ def lives() -> Iterator[str]:
     """Yield what longer lives are worth, by themselves and on top of what agents do until then."""
     network = load_network(NAME, scenario="longer_lives")
     env = MultiAgentVectorEnv(network, num_envs=1)
-    begun = beginning(env)
+    begun = episode_start(env)
     neutral = {agent: float(action[0, 0]) for agent, action in env.neutral_action.items()}
-    usual = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    usual = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
     yield "| a quarter longer by 2050 | λ̄, Mt/a | from as usual | lowest service |"
     yield "|-|-|-|-|"
     sectors = ("vehicles", "machinery", "construction", "other_products")
     for name, held in {**{each: (each,) for each in sectors}, "all four": sectors}.items():
-        run = rollout(env, Constant({**neutral, **dict.fromkeys(held, 1.0)}), seed=begun.seed, start=begun.given)
+        run = rollout(
+            env, Constant({**neutral, **dict.fromkeys(held, 1.0)}), seed=begun.seed, start=begun.initial_state
+        )
         label = name if name not in network.compartments else network.compartments[name].label.lower()
         change = _value(run, usual.episode_circularity[0])
         least = run.levels[0].mean(axis=1).min()

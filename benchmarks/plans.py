@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.document import write_sections
 from cirl_marl import CirlError, MultiAgentVectorEnv, Network, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.optimum import achieved, bound, gap, improved
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "data.md"
@@ -24,8 +24,8 @@ def plan_lines(what: str, networks: Mapping[str, Network], *, unit: float = 1.0)
     yield f"| {what} | as usual, Mt | bound, Mt | plan, Mt | gap | bound, s | plan, s |"
     yield "|-|-|-|-|-|-|-|"
     for name, network in networks.items():
-        begun = beginning(MultiAgentVectorEnv(network, num_envs=1))
-        usual = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral(), seed=begun.seed, start=begun.given)
+        begun = episode_start(MultiAgentVectorEnv(network, num_envs=1))
+        usual = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral(), seed=begun.seed, start=begun.initial_state)
         usual_said = f"{usual.episode_circularity[0] / unit:.2f}"
         begin = time.process_time()
         try:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.controllers.rollout import first_seed
-from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import over_episodes, over_seeds
 from cirl_marl.learners.learner import Learner, load_acting_learner
@@ -83,7 +83,7 @@ def main(
 
 def played(act: Act) -> Episodes:
     """Play episodes by script, but for what ``act`` gives."""
-    env, script = MultiAgentVectorEnv("solids_net", num_envs=EPISODES), Scripted()
+    env, script = MultiAgentVectorEnv("solids_net", num_envs=EPISODES), ScriptController()
     seen = env.reset(seed=first_seed(0))
     script.start(env, 0)
     place = {name: env.state_names.index(name) for name in ("sorter.sorted_now", "sorter.missed_now")}

@@ -19,7 +19,7 @@ from benchmarks.document import write_sections
 from benchmarks.plans import plan_lines
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import FlowTable, read_flows
 from cirl_marl.network import Floats
@@ -322,8 +322,8 @@ def simulated(region: str, scenario: str) -> tuple[dict[str, Floats], dict[str, 
     """Return flows by arc and stocks by node of a scenario in which nobody acts."""
     network = load_network(f"{ENVS / 'steel.toml'}:{region}", scenario=scenario)
     env = MultiAgentVectorEnv(network, num_envs=1)
-    begun = beginning(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    begun = episode_start(env)
+    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
     flows = {arc.id: run.flow[:, k] for k, arc in enumerate(network.arcs)}
     return flows, {node.id: run.stock[:, i] for i, node in enumerate(network.stores)}
 

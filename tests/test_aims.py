@@ -30,7 +30,7 @@ from cirl_marl import (
     load_network,
 )
 from cirl_marl.controllers.basic import Random
-from cirl_marl.controllers.rollout import beginning
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.controllers.schedule import schedule
 from cirl_marl.optimum import Bound, NoCertificate, bound
 from cirl_marl.reasons.inverse import ObjectiveWeights, infer
@@ -171,7 +171,7 @@ def test_tables_of_plan_and_simulate_are_the_same_course(tmp_path: Path) -> None
     env = MultiAgentVectorEnv(network, num_envs=1)
     planned = schedule(env, Random(), seed=3)
     planned.write(tmp_path / "plan.csv")
-    begun = beginning(env, 3)
+    begun = episode_start(env, 3)
     write_trajectory(tmp_path, "simulated", env, begun, planned.rollout, "title")
     (one,) = episodes_of_plan(network, tmp_path / "plan.csv", seed=3)
     (two,) = episodes_of_plan(network, tmp_path / "simulated.csv")

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from cirl_marl import CirlError, MultiAgentVectorEnv, cli
-from cirl_marl.controllers.rollout import Rollout, beginning, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.evaluation.simulations import ComparedQuantity, Simulation, rank_quantities, simulate_alternatives
 from cirl_marl.optimum.registry import named_controller
 from cirl_marl.report import differences as report
@@ -86,8 +86,8 @@ def alone(
 ) -> tuple[MultiAgentVectorEnv, Rollout]:
     """Return what a single simulation finds."""
     env = MultiAgentVectorEnv(network, num_envs=1, scenario=scenario)
-    begun = beginning(env, seed)
-    return env, rollout(env, named_controller(control), seed=begun.seed, start=begun.given)
+    begun = episode_start(env, seed)
+    return env, rollout(env, named_controller(control), seed=begun.seed, start=begun.initial_state)
 
 
 def figures(network: str | Path, scenario: str | None, control: str, seed: int | None) -> dict[str, float]:
@@ -134,7 +134,7 @@ def test_each_alternative_is_what_it_is_alone(definition: Path, seed: int | None
         assert (each.network.scenario_name, each.control) == (scenario or "default", control)
         for array in ("circularity", "levels", "stock", "flow"):
             np.testing.assert_array_equal(getattr(each.rollout, array), getattr(run, array))
-        beginning(env, seed).reset(env)
+        episode_start(env, seed).reset(env)
         np.testing.assert_array_equal(each.start, env.physical.stock[env.rows.nodes, 0])
     assert (found[0].start != found[0].rollout.stock[-1]).any()
 

@@ -23,7 +23,7 @@ from small_networks import ONE_OF_EACH
 import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, Law, MultiAgentVectorEnv, Network, Node, cli, learners
 from cirl_marl.cli import demonstration
-from cirl_marl.controllers.rollout import beginning, first_seed
+from cirl_marl.controllers.rollout import episode_start, first_seed
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.learners import RunDirectory, train
@@ -769,7 +769,7 @@ def test_show_simulate_and_plan_start_alike(
         (("--seed", "2"), "start: the first episode of evaluation 2"),
     ):
         env = MultiAgentVectorEnv(found, num_envs=1)
-        beginning(env, 2 if seed else None).reset(env)
+        episode_start(env, 2 if seed else None).reset(env)
         started = env.state()[0, : len(found.nodes)]
         if seed:
             env.reset(seed=first_seed(2))

@@ -18,7 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from cirl_marl import ControlError, DefinitionError, MultiAgentVectorEnv, RecipeError
-from cirl_marl.controllers import Controller, Scripted
+from cirl_marl.controllers import Controller, ScriptController
 from cirl_marl.environments.goal import GoalEnv
 from cirl_marl.learners import Recipe, Training, load_recipe, resume, train
 from cirl_marl.learners.demonstrations import demonstrate, in_copies
@@ -259,7 +259,7 @@ def test_goal_task_in_copies(normalise: bool) -> None:
     assert (model.num_timesteps, buffer.pos, model._n_updates) == (20, 10, 0)
     for copy in range(COPIES):
         own = GoalEnv("solids_net", "sorter", scenario="paper_fetch", horizon=4)
-        flat, script = own.flat, Scripted()
+        flat, script = own.flat, ScriptController()
         observation, _ = own.reset(seed=1 + copy)
         script.start(flat.parallel.batch, 0)
         for t in range(10):

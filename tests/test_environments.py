@@ -28,7 +28,7 @@ from cirl_marl import (
     single_agent_env,
     vector_env,
 )
-from cirl_marl.controllers import Constant, Random, Scripted
+from cirl_marl.controllers import Constant, Random, ScriptController
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.motion import Dynamics
 from cirl_marl.environments import rewards as credit
@@ -260,7 +260,7 @@ def test_zero_throughput_is_not_best(name: str) -> None:
     """
     env = vector_env(name, num_envs=2)
     stopped = rollout(env, Constant(dict.fromkeys(env.agents, -1.0)), seed=0)
-    usual = rollout(env, Scripted(), seed=0)
+    usual = rollout(env, ScriptController(), seed=0)
     assert (stopped.returns.sum(axis=0) < usual.returns.sum(axis=0)).all()
     assert (stopped.episode_service < usual.episode_service).all()
 

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from cirl_marl import CirlError, MultiAgentVectorEnv, load_network
 from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import beginning, rollout
-from cirl_marl.importing.assembly import Imported, imported
+from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.importing.assembly import ImportReport, import_flows
 from cirl_marl.importing.balances import Processes, ProcessKind, _closest
 from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import Connection, read_flows
@@ -62,8 +62,8 @@ def simulated(path: Path | str) -> dict[tuple[str, int], float]:
     """Return the flows of a network without agents, by arc and year."""
     network = load_network(path)
     env = MultiAgentVectorEnv(network, num_envs=1)
-    begun = beginning(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    begun = episode_start(env)
+    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
     start = network.episode.start
     assert isinstance(start, int | float)
     return {
@@ -76,9 +76,9 @@ def simulated(path: Path | str) -> dict[tuple[str, int], float]:
 def test_a_table_becomes_the_network_that_an_engineer_would_write(tmp_path: Path) -> None:
     """Sources, sinks, stores and what passes; roles, titles, shares, series; flows come back."""
     flows = table(tmp_path / "flows.csv", [row for row in cycle() if row[5]])
-    found = imported(flows, tmp_path / "metal.toml", roles=ROLES, title="A metal", source="made up, CC0")
-    assert found.processes.of(ProcessKind.STORE) == ("Use",) == found.processes.assumed
-    assert found.processes.of(ProcessKind.PASSING) == ("Smelter", "Old scrap", "Works")
+    found = import_flows(flows, tmp_path / "metal.toml", roles=ROLES, title="A metal", source="made up, CC0")
+    assert found.processes.of(ProcessKind.STORE) == ("Use",) == found.processes.inferred_stores
+    assert found.processes.of(ProcessKind.TRANSIT) == ("Smelter", "Old scrap", "Works")
     assert found.largest_error < 1e-9
     network = load_network(tmp_path / "metal.toml")
     nodes = {node.id: node for node in network.nodes}
@@ -125,7 +125,7 @@ def tables(draw: st.DrawFn) -> list[list[object]]:
 def test_every_flow_comes_back(tmp_path_factory: pytest.TempPathFactory, rows: list[list[object]]) -> None:
     """Of any table that balances, in every region and year."""
     folder = tmp_path_factory.mktemp("import")
-    found = imported(table(folder / "flows.csv", rows), folder / "net.toml", roles=ROLES)
+    found = import_flows(table(folder / "flows.csv", rows), folder / "net.toml", roles=ROLES)
     largest = max(float(str(row[5])) for row in rows)
     assert found.largest_error <= 1e-9 * largest
     ids = identifiers(found.processes.names)
@@ -191,15 +191,15 @@ def test_stocks_are_where_a_store_begins(tmp_path: Path) -> None:
     rows = [["Use", 1999 + y, level, "kt"] for y, level in enumerate(levels)]
     rows[2][2] = float(str(rows[2][2])) + 0.5
     stocks = table(tmp_path / "stocks.csv", rows, ["process", "year", "value", "unit"])
-    found = imported(flows, tmp_path / "metal.toml", stocks, roles=ROLES)
-    assert found.stock_mistakes == {"Use": pytest.approx(0.5)} and not found.processes.assumed
+    found = import_flows(flows, tmp_path / "metal.toml", stocks, roles=ROLES)
+    assert found.stock_mistakes == {"Use": pytest.approx(0.5)} and not found.processes.inferred_stores
     network = load_network(tmp_path / "metal.toml")
     assert network.initial[:, network.node_index["use"]] == pytest.approx([50.0, 50.0])
     rows[0][2] = 0.5
     stocks = table(tmp_path / "few.csv", rows, ["process", "year", "value", "unit"])
     message = r"does not give back 'Old scrap' to 'Smelter' in 2000: .* a store may run empty"
     with pytest.raises(CirlError, match=message):
-        imported(flows, tmp_path / "few.toml", stocks, roles=ROLES)
+        import_flows(flows, tmp_path / "few.toml", stocks, roles=ROLES)
 
 
 def noisy(rows: Sequence[Row], seed: int) -> list[list[object]]:
@@ -219,9 +219,9 @@ def test_reconciled_flows_are_the_closest_that_balance(seed: int, tmp_path: Path
     rows = noisy([row for row in cycle(years=2) if row[5]], seed)
     path = table(tmp_path / "flows.csv", rows, [*HEADER, "uncertainty"])
     with pytest.raises(CirlError, match=r"3 processes do not balance .*\n  '.*enter.*leave\n(.*\n)+.*--reconcile"):
-        imported(path, tmp_path / "metal.toml", roles=ROLES, stores=["Use"])
+        import_flows(path, tmp_path / "metal.toml", roles=ROLES, stores=["Use"])
     assert [each.name for each in tmp_path.iterdir()] == ["flows.csv"]
-    found = imported(path, tmp_path / "metal.toml", roles=ROLES, stores=["Use"], reconcile=True)
+    found = import_flows(path, tmp_path / "metal.toml", roles=ROLES, stores=["Use"], reconcile=True)
     assert not Processes(found.table, ["Use"]).residuals
     given = read_flows(path)
     for row in rows:
@@ -234,7 +234,7 @@ def test_reconciled_flows_are_the_closest_that_balance(seed: int, tmp_path: Path
         deviation = np.array([given.deviations["", year, pair] for pair in pairs])
         after = np.array([found.table.flows["", year, pair] for pair in pairs])
         balances = [
-            {"type": "eq", "fun": balance_of(process, pairs)} for process in found.processes.of(ProcessKind.PASSING)
+            {"type": "eq", "fun": balance_of(process, pairs)} for process in found.processes.of(ProcessKind.TRANSIT)
         ]
 
         def distance(x: Any, measured: Any = measured, deviation: Any = deviation) -> float:
@@ -250,7 +250,7 @@ def test_reconciled_flows_are_the_closest_that_balance(seed: int, tmp_path: Path
     listed = (tmp_path / "metal_changes.csv").read_text(encoding="utf-8").splitlines()[1:]
     assert len(listed) == len(changed)
     exact = table(tmp_path / "exact.csv", cycle())
-    assert imported(exact, tmp_path / "exact.toml", roles=ROLES, reconcile=True).changes == ()
+    assert import_flows(exact, tmp_path / "exact.toml", roles=ROLES, reconcile=True).changes == ()
 
 
 def balance_of(process: str, pairs: Sequence[Connection]) -> Callable[[Any], float]:
@@ -283,7 +283,7 @@ def test_no_flow_is_reconciled_below_none(tmp_path: Path) -> None:
     rows = [["Ore", "Works", 10.0, "1"], ["Works", "Dump", 1.0, "5"], ["Works", "Use", 30.0, "0.1"]]
     rows = [[a, b, 2000, v, "t/year", d] for a, b, v, d in rows]
     path = table(tmp_path / "flows.csv", rows, ["source", "target", "year", "value", "unit", "uncertainty"])
-    found = imported(path, tmp_path / "net.toml", roles=ROLES | {"technosphere": ["Use"]}, reconcile=True)
+    found = import_flows(path, tmp_path / "net.toml", roles=ROLES | {"technosphere": ["Use"]}, reconcile=True)
     flows = {pair.target: value for (_, _, pair), value in found.table.flows.items()}
     assert flows["Dump"] == 0.0
     # of 20 that lack, each takes a part in proportion to its variance
@@ -345,7 +345,7 @@ def test_bad_tables_are_refused(rows: list[list[object]], options: dict[str, Any
     """With file, line, value and what to do; nothing is written."""
     path = table(tmp_path / "flows.csv", rows)
     with pytest.raises(CirlError) as refused:
-        imported(path, tmp_path / "metal.toml", **{"roles": ROLES, **options})
+        import_flows(path, tmp_path / "metal.toml", **{"roles": ROLES, **options})
     assert said in str(refused.value)
     assert [each.name for each in tmp_path.iterdir()] == ["flows.csv"]
 
@@ -373,7 +373,7 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
     flows = table(tmp_path / "flows.csv", cycle())
     (tmp_path / "metal.toml").write_text("mine")
     with pytest.raises(CirlError, match=r"exists, and may have been changed by hand"):
-        imported(flows, tmp_path / "metal.toml", roles=ROLES)
+        import_flows(flows, tmp_path / "metal.toml", roles=ROLES)
     assert (tmp_path / "metal.toml").read_text() == "mine"
 
 
@@ -403,6 +403,6 @@ def test_roles_can_be_asked_for(tmp_path: Path) -> None:
         asked.append((name, kind))
         return Role.LANDFILL if kind is ProcessKind.SINK else Role.NONRENEWABLE_RESERVOIR
 
-    found: Imported = imported(table(tmp_path / "f.csv", cycle()), tmp_path / "m.toml", roles={}, ask=ask)
+    found: ImportReport = import_flows(table(tmp_path / "f.csv", cycle()), tmp_path / "m.toml", roles={}, ask=ask)
     assert asked == [("Ore body", ProcessKind.SOURCE), ("Dumps", ProcessKind.SINK)]
     assert found.roles == {"Ore body": Role.NONRENEWABLE_RESERVOIR, "Dumps": Role.LANDFILL}

@@ -248,7 +248,7 @@ def test_trained_actors_need_no_state(tmp_path: Path) -> None:
     assert np.isfinite(rollout(env, controller).episode_circularity).all()
 
 
-class Beginning(BaseCallback):
+class EpisodeStart(BaseCallback):
     """Remembers the parameters with which learning begins."""
 
     def parameters_now(self) -> dict[str, torch.Tensor]:
@@ -266,7 +266,7 @@ class Beginning(BaseCallback):
 def learnt(name: str, recipe: Recipe, **options: Any) -> Training:
     """Train, and require of every policy that learning moves each of its parameters and keeps them finite."""
     network = cirl_marl.load_network(name)
-    began = {group.name: Beginning() for group in recipe.groups(network, network.agents)}
+    began = {group.name: EpisodeStart() for group in recipe.groups(network, network.agents)}
     training = train(name, recipe, callbacks=began, **options)
     assert set(training.learners) == set(began)
     for learner, callback in began.items():

@@ -33,7 +33,7 @@ from cirl_marl import (
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.pyramids import pyramids
-from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.dynamics.stages import staged
 from cirl_marl.network import Network
@@ -361,8 +361,8 @@ def test_a_stretch_that_agents_set_makes_stocks_older() -> None:
 def test_an_episode_is_written_with_its_ages(tmp_path: Path) -> None:
     """Mean ages in the table, masses by age in a second one, and a picture."""
     env = MultiAgentVectorEnv(town(LIVES[0], INFLOW[:5], initial=30.0), num_envs=1)
-    begun = beginning(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    begun = episode_start(env)
+    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
     files = write_trajectory(tmp_path, "town", env, begun, run, "a town")
     assert [path.name for path in files] == ["town.csv", "town.png", "town_ages.csv", "town_ages.png"]
     with files[0].open(newline="") as file:

@@ -186,7 +186,7 @@ def test_a_source_without_a_known_reserve_starts_with_what_may_be_asked() -> Non
     asked = 1.5 * (3 + 5 + 5 + 5 + 2 + 2 + 4 + 4)
     np.testing.assert_allclose(network.initial[:, 0], asked, rtol=2e-6)
     run = rollout(MultiAgentVectorEnv(network, num_envs=1), Constant({"mine": 1.0, "asked": 1.0}))
-    np.testing.assert_allclose(run.unmet, 0.0)
+    np.testing.assert_allclose(run.shortage, 0.0)
     np.testing.assert_allclose(run.stock[-1], [1e-6 * asked, asked], rtol=1e-3)
     longer = network.with_options(episode={"horizon": 6})
     assert longer.initial[1, 0] == pytest.approx(asked + 2 * 1.5 * (5 + 4), rel=2e-6)

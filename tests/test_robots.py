@@ -21,7 +21,7 @@ from cirl_marl.compartments.robots import sorting_station
 from cirl_marl.compartments.robots.fetch import BIN, Fetch, WasteSorting
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.compartments.robots.sorting_station import BOOKS, SortingStation
-from cirl_marl.controllers.scripted import Seen, fetch, reacher
+from cirl_marl.controllers.scripted import ModelStates, fetch, reacher
 from cirl_marl.errors import CirlError
 from cirl_marl.network.rowsum import Floats
 
@@ -229,7 +229,7 @@ class TestTasks:
     @pytest.mark.medium
     @pytest.mark.sample(1)
     @pytest.mark.parametrize(("robot", "script", "copies"), [(Fetch(), fetch, 100), (Reacher(), reacher, 100)])
-    def test_scripts_do_the_task(self, robot: Robot, script: Callable[[Seen], Floats], copies: int) -> None:
+    def test_scripts_do_the_task(self, robot: Robot, script: Callable[[ModelStates], Floats], copies: int) -> None:
         """Within 50 steps, in at least 95 of 100 attempts."""
         state, done = starts(robot, copies, 1000), np.zeros(copies, dtype=bool)
         for _ in range(50):
@@ -249,7 +249,7 @@ class TestTasks:
         assert -12.5 < earned.mean() < -10.0
 
 
-def act(robot: Robot, script: Callable[[Seen], Floats], state: Floats) -> Floats:
+def act(robot: Robot, script: Callable[[ModelStates], Floats], state: Floats) -> Floats:
     """Return the script's inputs, from what the robot's agent sees."""
     rows = [robot.state_names.index(name) for name in robot.observed]
     inputs: Floats = np.clip(script(dict(zip(robot.observed, state[rows], strict=True))), -1.0, 1.0)

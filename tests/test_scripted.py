@@ -14,7 +14,7 @@ from small_networks import PLAYED
 from cirl_marl import CirlError, ControlError, MultiAgentVectorEnv, load_network
 from cirl_marl.compartments import model_class, models
 from cirl_marl.compartments.incinerator import Incinerator
-from cirl_marl.controllers import Neutral, Scripted
+from cirl_marl.controllers import Neutral, ScriptController
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.controllers.scripted import LOWER_M, SCRIPTS, UPPER_M, _joint_angles, incinerator, truck
 from cirl_marl.network import Floats
@@ -32,7 +32,7 @@ def test_agents_without_a_script_are_neutral(name: str, scenario: str) -> None:
     """The others act, if not at once then somewhere in the observation space."""
     env = MultiAgentVectorEnv(name, num_envs=3, scenario=scenario)
     observations = env.reset(0)
-    controller, neutral = Scripted(), Neutral()
+    controller, neutral = ScriptController(), Neutral()
     controller.start(env, 0)
     neutral.start(env, 0)
     rng = np.random.default_rng(0)
@@ -41,7 +41,7 @@ def test_agents_without_a_script_are_neutral(name: str, scenario: str) -> None:
     assert list(found) == list(env.agents)
     for agent, action in neutral.act(observations).items():
         model = env.network.compartments[agent].model
-        assert (found[agent] != action).any() == (agent in controller.scripted) == script_of(model), agent
+        assert (found[agent] != action).any() == (agent in controller.script_agents) == script_of(model), agent
         assert found[agent].shape == action.shape
 
 
@@ -58,7 +58,7 @@ finite = st.floats(-1e6, 1e6, width=32)
 def test_actions_are_bounded(data: st.DataObject, scenario: str) -> None:
     """Whatever is seen: in [−1, 1], no NaN, and accepted by the environment."""
     env = ENVS[scenario]
-    controller = Scripted()
+    controller = ScriptController()
     controller.start(env, 0)
     seen = {
         agent: np.array(data.draw(st.lists(finite, min_size=2 * n, max_size=2 * n)), np.float32).reshape(2, n)
@@ -80,7 +80,7 @@ def test_copies_do_not_notice_each_other(scenario: str) -> None:
     """The action of a copy is a function of what that copy sees, and the script keeps no memory."""
     env = MultiAgentVectorEnv("solids_net", num_envs=3, scenario=scenario)
     alone = MultiAgentVectorEnv("solids_net", num_envs=1, scenario=scenario)
-    many, one = Scripted(), Scripted()
+    many, one = ScriptController(), ScriptController()
     many.start(env, 0)
     one.start(alone, 0)
     observations = env.reset(4)
@@ -99,21 +99,21 @@ def test_held_agents_do_not_listen() -> None:
     """A constant is held for an agent with a script and for one without; unknown agents and values are errors."""
     env = MultiAgentVectorEnv("solids_net", num_envs=2)
     observations = env.reset(0)
-    controller = Scripted({"truck": 0.25})
+    controller = ScriptController({"truck": 0.25})
     controller.start(env, 0)
     np.testing.assert_array_equal(controller.act(observations)["truck"], 0.25)
-    free = Scripted()
+    free = ScriptController()
     free.start(env, 0)
     np.testing.assert_array_equal(controller.act(observations)["sorter"], free.act(observations)["sorter"])
     with pytest.raises(ControlError, match="Did you mean 'truck'"):
-        Scripted({"truk": 0.0}).start(env, 0)
+        ScriptController({"truk": 0.0}).start(env, 0)
     with pytest.raises(ControlError, match=r"'truck' is 1\.5"):
-        Scripted({"truck": 1.5}).start(env, 0)
+        ScriptController({"truck": 1.5}).start(env, 0)
 
 
 def test_started_again_it_serves_another_network() -> None:
     """Nothing of the first network is left."""
-    controller = Scripted()
+    controller = ScriptController()
     controller.start(ENVS["default"], 0)
     env = MultiAgentVectorEnv("copper_net", num_envs=2)
     controller.start(env, 0)
@@ -124,7 +124,7 @@ def test_what_is_not_seen_is_named() -> None:
     """An agent that observes stocks alone cannot follow its script, and the error says what is missing."""
     network = load_network("solids_net").with_options(observation={"nodes": ("reservoir", "sorter"), "mode": "stocks"})
     env = MultiAgentVectorEnv(network, num_envs=1)
-    controller = Scripted()
+    controller = ScriptController()
     controller.start(env, 0)
     with pytest.raises(ControlError, match="scripted control of 'sorter' needs to see its state 'grip_x'"):
         controller.act(env.reset(0))
@@ -139,7 +139,7 @@ def test_wider_observations_change_nothing(observe: str) -> None:
     )
     actions = []
     for env in (usual, wide):
-        controller = Scripted()
+        controller = ScriptController()
         controller.start(env, 0)
         actions.append(controller.act(env.reset(3)))
     for agent, action in actions[0].items():
@@ -178,7 +178,7 @@ def test_the_incinerator_s_script_knows_its_set_point() -> None:
         model = Incinerator(target_degc=target)
         nodes = tuple(replace(each, model=model) if each.id == "incinerator" else each for each in base.nodes)
         env = MultiAgentVectorEnv(replace(base, nodes=nodes), num_envs=1, horizon=2000)
-        run = rollout(env, Scripted({"sorter": 0.0}), seed=6)
+        run = rollout(env, ScriptController({"sorter": 0.0}), seed=6)
         assert inside(env, "incinerator.freeboard_degc", run)[-1] == pytest.approx(target, abs=30.0)
 
 
@@ -193,7 +193,9 @@ def inside(run_of: MultiAgentVectorEnv, name: str, run: Any) -> Floats:
 def test_scripts_are_worth_having() -> None:
     """The truck brings 3 items in 4 s and rests at home; from half-way the freeboard is nearer to 1000 °C."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")
-    scripted, neutral = (rollout(env, controller, seed=6) for controller in (Scripted({"sorter": 0.0}), Neutral()))
+    scripted, neutral = (
+        rollout(env, controller, seed=6) for controller in (ScriptController({"sorter": 0.0}), Neutral())
+    )
     aboard = inside(env, "truck.destination_m", scripted) > 0.0
     trips = np.diff(np.flatnonzero(np.diff(aboard.astype(int))))[::2] * 0.02
     assert len(trips) == 2

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 from cirl_marl import MultiAgentVectorEnv, Network, SingleAgentEnv, load_network, parallel_env
 from cirl_marl.compartments.delivery_truck import DeliveryTruck
-from cirl_marl.controllers import Constant, Neutral, Random, Scripted
+from cirl_marl.controllers import Constant, Neutral, Random, ScriptController
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation.figures import summary
@@ -37,7 +37,7 @@ class Mixed(Controller):
     def __init__(self, erratic: int) -> None:
         """Let truck and incinerator act at random for the first ``erratic`` intervals."""
         self._erratic = erratic
-        self._scripted, self._random = Scripted(), Random()
+        self._scripted, self._random = ScriptController(), Random()
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Start both."""
@@ -57,11 +57,11 @@ class Mixed(Controller):
 
 
 CONTROLLERS: dict[str, tuple[Controller, bool]] = {
-    "scripted": (Scripted(), True),
+    "scripted": (ScriptController(), True),
     "random": (Random(), False),
     "mixed": (Mixed(1), True),
     "late": (Mixed(350), True),
-    "idle": (Scripted({"sorter": 0.0}), True),
+    "idle": (ScriptController({"sorter": 0.0}), True),
 }
 """Controllers, and whether all the mass arrives under them."""
 controlled = pytest.mark.parametrize("name", CONTROLLERS)
@@ -326,7 +326,7 @@ def test_reward_mode_does_not_touch_the_physics(scenario: str, reward: str) -> N
 def test_truck_moves_by_its_mass() -> None:
     """Every interval of a trip is m v̇ = F − rolling − drag with m = 3 t and what is aboard, integrated by SciPy."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")
-    controller: Controller = Scripted({"sorter": 0.0})
+    controller: Controller = ScriptController({"sorter": 0.0})
     observations = env.reset(0)
     controller.start(env, 0)
     loads: list[float] = []
@@ -358,7 +358,7 @@ def test_truck_moves_by_its_mass() -> None:
 def test_a_loaded_truck_takes_no_more() -> None:
     """While it stands at the sorter with a batch aboard, the next one waits, packed; nothing is lost or mixed."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario="reacher")
-    held: Controller = Scripted({"sorter": 0.0, "truck": 0.0})
+    held: Controller = ScriptController({"sorter": 0.0, "truck": 0.0})
     run = record(env, held, 0)
     assert run.rows["truck.aboard"][-1, 0] == run.rows["truck.packed"][-1, 0] == BATCH_KG
     assert column(env, "truck.destination_m")[0] == 10.0
@@ -403,7 +403,7 @@ def test_delivery_cools_and_feeds_the_incinerator(scenario: str) -> None:
     """What the truck brings is added to the waste at 20 °C: the bed keeps its heat, so its temperature falls."""
     env = MultiAgentVectorEnv(quick(scenario, horizon=250), num_envs=1)
     twin = MultiAgentVectorEnv(env.network, num_envs=1)
-    controller: Controller = Scripted({"sorter": 0.0})
+    controller: Controller = ScriptController({"sorter": 0.0})
     observations = env.reset(0)
     controller.start(env, 0)
     while column(env, "truck.destination_m")[0] == 0.0 or column(env, "truck.position_m")[0] < 9.0:
@@ -432,7 +432,9 @@ def test_delivery_cools_and_feeds_the_incinerator(scenario: str) -> None:
 @pytest.mark.parametrize(("scenario", "copies"), [("default", 8), ("reacher", 20)])
 def test_scripted_sorter_succeeds(scenario: str, copies: int) -> None:
     """At least 95 % of the items are sorted: of 48 by Fetch, of 120 by Reacher, from what an agent sees."""
-    run = record(MultiAgentVectorEnv("solids_net", num_envs=copies, scenario=scenario), Scripted({"truck": 0.0}), 100)
+    run = record(
+        MultiAgentVectorEnv("solids_net", num_envs=copies, scenario=scenario), ScriptController({"truck": 0.0}), 100
+    )
     good, missed = (run.rows[f"sorter.{name}"].sum() for name in ("sorted_now", "missed_now"))
     assert good + missed == 2 * ITEMS * copies
     assert good / (good + missed) >= 0.95
@@ -448,7 +450,7 @@ def one_batch(window: int) -> Network:
 
 @pytest.mark.sample(2)
 @pytest.mark.parametrize(
-    ("controller", "sorted_items"), [(Scripted({"sorter": 0.0}), 0), (Mixed(0), 1), (Scripted(), 3)]
+    ("controller", "sorted_items"), [(ScriptController({"sorter": 0.0}), 0), (Mixed(0), 1), (ScriptController(), 3)]
 )
 def test_summary_reports_the_time_window(controller: Controller, sorted_items: int) -> None:
     """It is 2·c·λ̄, and for one batch and a window of its stages the closed form of CIRO7.2."""
@@ -493,7 +495,7 @@ def test_networks_without_criticality_have_no_time_window() -> None:
 def test_robots_failures_decide_the_coupling() -> None:
     """A robot that stands still loads the truck with everything, leaves nothing in second use, and lowers λ̄."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1)
-    controllers = (Scripted(), Scripted({"sorter": 0.0}), Constant())
+    controllers = (ScriptController(), ScriptController({"sorter": 0.0}), Constant())
     good, bad, stopped = (rollout(env, controller, seed=0) for controller in controllers)
     truck = [line.id for line in env.dynamics.batches.lines].index("truck")
     assert bad.load[:, truck].max() == BATCH_KG
@@ -508,8 +510,8 @@ def test_robots_failures_decide_the_coupling() -> None:
 def test_staying_away_does_not_pay(scenario: str) -> None:
     """A truck that never loads is good for λ, but it owes that nothing piles up, and earns less than one at work."""
     env = MultiAgentVectorEnv("solids_net", num_envs=1, scenario=scenario)
-    drives = rollout(env, Scripted({"sorter": 0.0}), seed=0)
-    stays = rollout(env, Scripted({"sorter": 0.0, "truck": -0.05}), seed=0)
+    drives = rollout(env, ScriptController({"sorter": 0.0}), seed=0)
+    stays = rollout(env, ScriptController({"sorter": 0.0, "truck": -0.05}), seed=0)
     truck = env.agents.index("truck")
     assert stays.load[-1, 2] > drives.load[-1, 2] == 0.0
     assert stays.episode_circularity[0] > drives.episode_circularity[0]

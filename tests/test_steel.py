@@ -14,7 +14,7 @@ from benchmarks import steel
 from benchmarks.steel import PRIMARY, RAW_EXPORTS, SECTORS, SPLITS, TABLE, YEARS, Country, countries, pasts, simulated
 from cirl_marl import MultiAgentVectorEnv, NetworkError, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.importing.definition import identifiers
 from cirl_marl.importing.flow_table import read_flows
@@ -123,8 +123,8 @@ def test_business_as_usual_is_served(network: str, everyone: list[Country]) -> N
     """Primary iron makes up for what the stock in use lacks, and λ counts all of it, imports too."""
     found = load_network(network)
     env = MultiAgentVectorEnv(found, num_envs=1)
-    begun = beginning(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    begun = episode_start(env)
+    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
     flow = {arc.id: run.flow[:, k] for k, arc in enumerate(found.arcs)}
     short = (run.levels[0] < 1 - 1e-6).any(axis=0)
     for arc in PRIMARY:  # something lacks only where all that is ever drawn on gives its most, as in Spain and Thailand
@@ -141,7 +141,7 @@ def test_business_as_usual_is_served(network: str, everyone: list[Country]) -> N
     later = rollout(
         MultiAgentVectorEnv(load_network(network, scenario="high_circularity"), num_envs=1),
         Neutral(),
-        start=begun.given,
+        start=begun.initial_state,
     )
     assert later.episode_circularity[0] > run.episode_circularity[0]
 

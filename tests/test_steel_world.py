@@ -14,7 +14,7 @@ from benchmarks.steel import PRIMARY, TABLE, Country, countries
 from benchmarks.steel_world import GOODS, RAW, STEEL, markets, write_trade
 from cirl_marl import MultiAgentVectorEnv, Network, load_network, parallel_env
 from cirl_marl.controllers import Constant, Neutral
-from cirl_marl.controllers.rollout import Rollout, beginning, rollout
+from cirl_marl.controllers.rollout import Rollout, episode_start, rollout
 from cirl_marl.importing.definition import identifiers
 from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network import Floats
@@ -38,8 +38,8 @@ def world() -> Network:
 def usual(world: Network) -> Rollout:
     """Return the episode in which nobody acts."""
     env = MultiAgentVectorEnv(world, num_envs=1)
-    begun = beginning(env)
-    return rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+    begun = episode_start(env)
+    return rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
 
 
 def of(network: Network, run: Rollout, arcs: Sequence[str]) -> Floats:
@@ -129,9 +129,9 @@ def test_mass_is_conserved(world: Network) -> None:
 def test_what_stays_at_home_saves_ore_there_and_is_missed_elsewhere(world: Network, usual: Rollout) -> None:
     """Scrap that Japan does not export is melted in Japan; those who bought it take more ore."""
     env = MultiAgentVectorEnv(world, num_envs=1, agents=["japan_scrap_exports"])
-    begun = beginning(env)
+    begun = episode_start(env)
 
-    run = rollout(env, Constant({"japan_scrap_exports": -1.0}), seed=begun.seed, start=begun.given)
+    run = rollout(env, Constant({"japan_scrap_exports": -1.0}), seed=begun.seed, start=begun.initial_state)
     own = [f"japan_{arc}" for arc in PRIMARY]
     everyone_ = [arc.id for arc in world.arcs if arc.makes_up_for]
     saved = {
@@ -169,7 +169,7 @@ def test_conformance(scenario: str) -> None:
 def test_all_that_can_be_had_is_had(world: Network, usual: Rollout) -> None:
     """Where nobody acts and all improves by 2050, λ is better."""
     env = MultiAgentVectorEnv(load_network("steel_world", scenario="high_circularity"), num_envs=1)
-    begun = beginning(MultiAgentVectorEnv(world, num_envs=1))
-    later = rollout(env, Neutral(), start=begun.given)
+    begun = episode_start(MultiAgentVectorEnv(world, num_envs=1))
+    later = rollout(env, Neutral(), start=begun.initial_state)
     assert later.episode_circularity[0] > 0.9 * usual.episode_circularity[0]
     assert len(load_network("steel_world", scenario="longer_lives").acting) == 17 * 30

@@ -30,7 +30,7 @@ from cirl_marl import (
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.controllers.shortages import unsupplied
+from cirl_marl.controllers.shortages import service_shortages
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
@@ -67,7 +67,7 @@ def test_supply_is_what_lacks(scenario: str) -> None:
     met = np.zeros(3, dtype=int)
     for year, demand in enumerate(demanded(network)):
         env.advance(rng.uniform(-1, 1, (1, 3)))
-        mined, use = env.held[0], env.rows.stocks(env.physical.stock)[network.node_index["use"]]
+        mined, use = env.controls[0], env.rows.stocks(env.physical.stock)[network.node_index["use"]]
         exact = (mined > 0) & (mined < 400.0)
         np.testing.assert_allclose(use[exact], demand, rtol=1e-9, err_msg=str(year))
         assert (use[mined == 0.0] >= demand * (1 - 1e-9)).all() and (mined < 400.0).all()
@@ -96,12 +96,12 @@ def test_a_chain_falls_short_as_far_as_its_bounds_say() -> None:
     stock = run.stock[:, network.node_index["use"]]
     np.testing.assert_allclose(run.levels[0, 0], np.minimum(1.0, stock / demanded(network)), rtol=1e-9)
 
-    (said,) = unsupplied(run, network)
+    (said,) = service_shortages(run, network)
     first = int(np.argmax(short))
     assert f"'supply' falls to {run.levels.min():.4f}, short first at {first} year ({2020 + first})" in said
     assert "'smelting' 60 Mt/year" in said
     assert any(said in remark for remark in lint_warnings(network)) and not list(lint_warnings(cycle()))
-    assert not list(unsupplied(rollout(MultiAgentVectorEnv(cycle(), num_envs=1), Neutral()), cycle()))
+    assert not list(service_shortages(rollout(MultiAgentVectorEnv(cycle(), num_envs=1), Neutral()), cycle()))
 
 
 def test_an_agent_that_acts_overrides_it() -> None:

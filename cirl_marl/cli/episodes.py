@@ -25,9 +25,9 @@ from cirl_marl.cli.common import (
     stem,
 )
 from cirl_marl.controllers import Controller
-from cirl_marl.controllers.basic import Watched
-from cirl_marl.controllers.rollout import Beginning, Rollout
-from cirl_marl.controllers.shortages import shortages, unsupplied
+from cirl_marl.controllers.basic import ProgressController
+from cirl_marl.controllers.rollout import EpisodeStart, Rollout
+from cirl_marl.controllers.shortages import service_shortages, shortages
 from cirl_marl.definitions.catalogue import file_and_region, load_network, networks
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
@@ -205,7 +205,7 @@ def plan(
     who = Path(source).resolve().name if control is None else stem(env.network, control)
     path = Path(f"plan_{who}.csv") if out is None else out
     with bar("planning") as progress:
-        watched = Watched(controller, progress)
+        watched = ProgressController(controller, progress)
         found = schedule(env, watched, seed=seed, progress=watched.acted)
     path.parent.mkdir(parents=True, exist_ok=True)
     found.write(path)
@@ -219,7 +219,7 @@ def plan(
         beside.append(write_page(page, page_of_schedule(found, name, note=controller.note)))
     console.print(decisions_table(found))
     console.print(savings_table(found))
-    _say_figures(found.rollout, env.network, found.begun)
+    _say_figures(found.rollout, env.network, found.episode_start)
     usual = float(found.usual.episode_circularity[0])
     say(f"as usual: λ̄ = {usual:.5g} {env.network.mass_unit}, service level {float(found.usual.episode_service[0]):.4f}")
     if controller.note:
@@ -247,9 +247,9 @@ def _actor(
     return run.make_env(1), Trained(run)
 
 
-def _say_figures(run: Rollout, network: Network, begun: Beginning, who: str = "") -> None:
+def _say_figures(run: Rollout, network: Network, begun: EpisodeStart, who: str = "") -> None:
     """Say where an episode began, what came of it, and which flows were less than was asked for; ``who`` goes first."""
-    say(f"{who}start: {begun.said}")
+    say(f"{who}start: {begun.description}")
     figures = [
         f"λ̄ = {float(run.episode_circularity[0]):.5g} {network.mass_unit}",
         f"service level {float(run.episode_service[0]):.4f}",
@@ -260,7 +260,7 @@ def _say_figures(run: Rollout, network: Network, begun: Beginning, who: str = ""
     if len(network.services) > 1:
         each = zip(network.services, run.episode_levels[0].tolist(), strict=True)
         say(f"{who}service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in each)}")
-    for said in (*(short.said for short in shortages(run, network)), *unsupplied(run, network)):
+    for said in (*(short.description for short in shortages(run, network)), *service_shortages(run, network)):
         say(f"{who}{said}")
 
 

@@ -44,7 +44,7 @@ def import_(
     A long table has the columns source, target, year, value, unit, and may have type, region and uncertainty.
     What sources and sinks are is asked for, or given. The neutral simulation of the network gives back the table.
     """
-    from cirl_marl.importing.assembly import imported
+    from cirl_marl.importing.assembly import import_flows
     from cirl_marl.importing.balances import ProcessKind
 
     given = {
@@ -55,7 +55,7 @@ def import_(
         Role.TECHNOSPHERE: outside,
     }
     with bar("checking") as progress:
-        found = imported(
+        found = import_flows(
             flows,
             out,
             stocks,
@@ -75,7 +75,7 @@ def import_(
     for kind in ProcessKind:
         if names := found.processes.of(kind):
             say(f"{KINDS[kind.value]}: {', '.join(names)}")
-    for name in found.processes.assumed:
+    for name in found.processes.inferred_stores:
         say(f"'{name}' takes more than it gives, so that it became a store; without --store it was not said to be one")
     if found.changes:
         say(f"{len(found.changes)} flows were adjusted; the largest changes are")

@@ -25,7 +25,7 @@ from cirl_marl.cli.common import (
     training_bar,
 )
 from cirl_marl.controllers.rollout import Rollout
-from cirl_marl.controllers.shortages import shortages, unsupplied
+from cirl_marl.controllers.shortages import service_shortages, shortages
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES, Standing, run_jobs
@@ -265,7 +265,7 @@ def what_is_kept(directory: Path) -> str:
 def _say_shortages(rollouts: Mapping[str, Rollout], network: Network) -> None:
     """Say under which control flows and services were less than was asked for, as means over the episodes."""
     for name, run in rollouts.items():
-        for said in (*(short.said for short in shortages(run, network)), *unsupplied(run, network)):
+        for said in (*(short.description for short in shortages(run, network)), *service_shortages(run, network)):
             say(f"{name}: {said}")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from cirl_marl.cli.common import NETWORKS, NetworkName, Scenario, StartSeed, app, bar, console, errors, plain, say, stem
-from cirl_marl.controllers.rollout import beginning
+from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.definitions.catalogue import families, load_network, recipes
 from cirl_marl.definitions.reading import Definition
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -82,7 +82,7 @@ def show(
 
     found = load_network(network, scenario=scenario)
     env = MultiAgentVectorEnv(found, num_envs=1)
-    begun = beginning(env, seed)
+    begun = episode_start(env, seed)
     begun.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0], env.physical.flow[:, 0]
     shown = fold_copies(found, stock, flow, unfold or ())
@@ -96,7 +96,7 @@ def show(
         console.print(f"service '{service.id}': {measured} {' and '.join(ends)}{changing}")
     circularity = float(found.circularity(flow))
     console.print(f"λ of the start state: {circularity:.5g} {found.mass_unit}")
-    say(f"start: {begun.said}")
+    say(f"start: {begun.description}")
     path = picture or Path(f"{stem(found)}.png")
     if path.suffix != ".png":
         raise CirlError(f"--picture {path}: needs the name of a .png file")

@@ -2,6 +2,6 @@
 
 from cirl_marl.controllers.basic import Constant, Controller, Neutral, Planner, Random
 from cirl_marl.controllers.lqr import LQR, LinearSystem
-from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.controllers.scripted import ScriptController
 
-__all__ = ["LQR", "Constant", "Controller", "LinearSystem", "Neutral", "Planner", "Random", "Scripted"]
+__all__ = ["LQR", "Constant", "Controller", "LinearSystem", "Neutral", "Planner", "Random", "ScriptController"]

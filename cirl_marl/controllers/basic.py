@@ -93,7 +93,7 @@ class Random(Controller):
         return {agent: self._random.uniform(-1.0, 1.0, shape) for agent, shape in self._shapes.items()}
 
 
-class Watched(Controller):
+class ProgressController(Controller):
     """A controller that tells how far its episode is: its plans, if it is a planner, and what it has carried out.
 
     >>> from cirl_marl.controllers import Neutral

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from cirl_marl.controllers.basic import Constant, Neutral
-from cirl_marl.controllers.rollout import beginning, rollout
-from cirl_marl.controllers.shortages import shortages, unsupplied
+from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.shortages import service_shortages, shortages
 from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
@@ -188,10 +188,10 @@ def _starved(network: Network) -> Iterator[str]:
     sources = {id_ for arc, donor in scheduled.items() if donor not in fed for id_ in (arc, donor)}
     highest = Constant({agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)})
     env, said = MultiAgentVectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS)), set[str]()
-    begun = beginning(env)
+    begun = episode_start(env)
     for control, controller, looked_at in (("neutral", Neutral(), set(scheduled)), ("the highest", highest, sources)):
         try:
-            run = rollout(env, controller, seed=begun.seed, start=begun.given)
+            run = rollout(env, controller, seed=begun.seed, start=begun.initial_state)
         except CirlError as error:
             yield str(error)
             return
@@ -208,8 +208,8 @@ def _unsupplied(network: Network) -> Iterator[str]:
     if not any(arc.makes_up_for for arc in network.arcs):
         return
     env = MultiAgentVectorEnv(network, num_envs=1)
-    begun = beginning(env)
-    for said in unsupplied(rollout(env, Neutral(), seed=begun.seed, start=begun.given), network):
+    begun = episode_start(env)
+    for said in service_shortages(rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state), network):
         yield f"under neutral control {said}; widen the bounds of its control, or ask for less"
 
 

@@ -230,7 +230,7 @@ class LQR(Controller):
     def act(self, observations: Arrays) -> Arrays:
         """Return the actions that set the demanded flows, clipped to the bounds of the controls."""
         demand = zip(self.system.inputs, self.demand(), strict=True)
-        return self._env.neutral_action | {agent: self._env.normalised(agent, flow[None]) for agent, flow in demand}
+        return self._env.neutral_action | {agent: self._env.normalise(agent, flow[None]) for agent, flow in demand}
 
 
 def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:

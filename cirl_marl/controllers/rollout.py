@@ -26,16 +26,16 @@ SEED_SPACING = 1_000_000
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class Beginning:
+class EpisodeStart:
     """Where a single episode begins."""
 
     seed: Annotated[int, "seed of what is drawn"]
-    given: Annotated[Mapping[str, float], "stocks and inner states that are not drawn"]
-    said: Annotated[str, "both in words"]
+    initial_state: Annotated[Mapping[str, float], "stocks and inner states that are not drawn"]
+    description: Annotated[str, "both in words"]
 
     def reset(self, env: MultiAgentVectorEnv) -> Arrays:
         """Begin an episode in ``env`` here, and return the observations."""
-        return env.reset(seed=self.seed, options={"initial_state": self.given})
+        return env.reset(seed=self.seed, options={"initial_state": self.initial_state})
 
 
 @itemised
@@ -54,7 +54,7 @@ class Rollout:
     load: Annotated[Floats, "masses that batch arcs hold, likewise, shape (steps, batch arcs), mass"]
     inner: Annotated[Floats, "inner states that an agent may see, likewise, shape (steps, states)"]
     controls: Annotated[Floats, "values of all controls, in the rows of ``network.control_rows``, (steps, controls)"]
-    unmet: Annotated[Floats, "what scheduled flows lacked, mean over copies, shape (steps, scheduled arcs), mass"]
+    shortage: Annotated[Floats, "what scheduled flows lacked, mean over copies, shape (steps, scheduled arcs), mass"]
     final_stock: Annotated[Floats, "mean over copies of the last stocks, shape (stores,), mass"]
     mean_flow: Annotated[Floats, "mean over copies and time of the flows, shape (arcs,), mass/time"]
 
@@ -110,9 +110,9 @@ def rollout(
     unmet = np.zeros((steps, len(orders)))
     for t in range(steps):
         outcome = env.advance(env.stack(controller.act(observations)))
-        controls[t] = env.held[:, 0]
+        controls[t] = env.controls[:, 0]
         if len(orders):
-            asked = env.dynamics.rate(env.held, np.full(env.num_envs, t), env.physical.drawn)[orders]
+            asked = env.dynamics.rate(env.controls, np.full(env.num_envs, t), env.physical.drawn)[orders]
             short = asked - outcome.flow[orders]
             unmet[t] = np.where(short > ROUNDING * np.abs(asked), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
@@ -132,21 +132,21 @@ def rollout(
     return Rollout(circularity, mean, service, levels, local, returns, *seen, unmet, final, flows)
 
 
-def beginning(env: MultiAgentVectorEnv, seed: int | None = None) -> Beginning:
+def episode_start(env: MultiAgentVectorEnv, seed: int | None = None) -> EpisodeStart:
     """Return where the single episode begins that ``cirl show``, ``simulate`` and ``plan`` are about.
 
     That is the middle of all initial ranges, with inner states that models draw themselves as the first evaluation
     draws them; or, with a ``seed``, the first start of the evaluation of that seed.
     """
     if seed is not None:
-        return Beginning(first_seed(seed), {}, f"the first episode of evaluation {seed}")
+        return EpisodeStart(first_seed(seed), {}, f"the first episode of evaluation {seed}")
     nodes = (node.id for node in env.network.stores)
     middle = dict(zip(nodes, env.network.initial.mean(axis=0).tolist(), strict=True))
     inner = env.dynamics.inner
     rows = zip(inner.ranged.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
     middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}
     drawn = "" if len(inner.ranged) == len(inner.names) else "; what models draw themselves as in evaluation 0"
-    return Beginning(first_seed(0), middle, f"the middle of all initial ranges{drawn}")
+    return EpisodeStart(first_seed(0), middle, f"the middle of all initial ranges{drawn}")
 
 
 def interval_ends(network: Network) -> Floats:

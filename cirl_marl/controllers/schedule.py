@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller, Neutral
-from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, interval_ends, rollout
+from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
@@ -30,7 +30,7 @@ class Schedule:
     network: Network
     header: tuple[str, ...]
     columns: Floats
-    begun: Beginning
+    episode_start: EpisodeStart
     rollout: Rollout
     usual: Rollout
     agents: tuple[str, ...]
@@ -79,7 +79,7 @@ def schedule(
     Columns are when the interval begins and ends, the value of every control in it, the mass that an agent with a valve
     lets through, λ at its end and its mean over it, and the service level.
 
-    It begins at ``beginning(env, seed)``. ``progress`` is called with the number of intervals done.
+    It begins at ``episode_start(env, seed)``. ``progress`` is called with the number of intervals done.
 
     Raises:
         CirlError: if the controller does not fit the network, nobody acts, or there are several copies.
@@ -87,11 +87,11 @@ def schedule(
     network = env.network
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
-    recorded, begun = _Recorded(controller, env), beginning(env, seed)
+    recorded, begun = _Recorded(controller, env), episode_start(env, seed)
     begun.reset(env)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
-    usual = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
-    run = rollout(env, recorded, seed=begun.seed, start=begun.given, progress=progress)
+    usual = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
+    run = rollout(env, recorded, seed=begun.seed, start=begun.initial_state, progress=progress)
     actuators = Actuators(env.dynamics, env.agents, len(recorded.actions))
     values = actuators.controls(np.array(recorded.actions).T, np.arange(len(recorded.actions)))[actuators.acting]
     ends = interval_ends(network)

@@ -15,13 +15,13 @@ from cirl_marl.network import Floats
 from cirl_marl.network.elements import ControlKind
 from cirl_marl.network.model import CompartmentModel
 
-Seen = dict[str, Floats]
+ModelStates = dict[str, Floats]
 """Observed states of an agent's own model by name, shape (B,) each, in physical units."""
 
-Script = Callable[[Seen, Any], Floats]
+Script = Callable[[ModelStates, Any], Floats]
 """Physical inputs, shape (inputs, B), from what is seen and the agent's model, whose parameters the engineer knows."""
 
-OPEN, CLOSED = 1.0, -1.0
+OPEN_FINGERS, SHUT_FINGERS = 1.0, -1.0
 """Input of the fingers."""
 MOVE_M = 0.05
 """Displacement of the gripper that an input of 1 asks for."""
@@ -35,7 +35,7 @@ HOLDING_M = 0.03
 """Opening of each finger below which the gripper holds something; an object of 5 cm leaves them at 0.025."""
 
 
-def fetch(seen: Seen, model: Any = None) -> Floats:
+def fetch(seen: ModelStates, model: Any = None) -> Floats:
     """Return the inputs of the Fetch robot that reach, grasp, lift, carry and place, shape (4, B).
 
     A function of the observation alone. Away from the object the gripper is open and comes down to it on a slope, or at
@@ -56,11 +56,11 @@ def fetch(seen: Seen, model: Any = None) -> Floats:
     towards = np.where(held, carry, np.where(around, item, reach))
     towards = np.where(placed, np.stack([grip[0], grip[1], target[2] + HOVER_M]), towards)
     move = np.clip(1.5 * (towards - grip) / MOVE_M, -1.0, 1.0)
-    fingers = np.where(around & ~placed, CLOSED, OPEN)
+    fingers = np.where(around & ~placed, SHUT_FINGERS, OPEN_FINGERS)
     return np.concatenate([move, fingers[None]])
 
 
-def reacher(seen: Seen, model: Any = None) -> Floats:
+def reacher(seen: ModelStates, model: Any = None) -> Floats:
     """Return the torques of the Reacher that move its tip to the target and let it rest, shape (2, B).
 
     Inverse kinematics give the joint angles, a damped spring the torques.
@@ -71,14 +71,14 @@ def reacher(seen: Seen, model: Any = None) -> Floats:
     wanted = _joint_angles(seen["target_x_m"], seen["target_y_m"], second)
     turn = np.stack([wanted[0] - first, wanted[1] - second])
     turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-    return np.clip(STIFFNESS * turn - DAMPING * speed, -1.0, 1.0)
+    return np.clip(STIFFNESS * turn - DAMPER * speed, -1.0, 1.0)
 
 
 UPPER_M, LOWER_M = 0.1, 0.11
 """Lengths of the Reacher's arms, from its model file."""
 ELBOW_RAD = 2.95
 """Most that the script bends the elbow; at the joint's end, 3.0, the torque would never fall to zero."""
-STIFFNESS, DAMPING = 0.4, 0.05
+STIFFNESS, DAMPER = 0.4, 0.05
 """Torque per rad and per rad/s. [chosen: fast and hardly overshooting]"""
 
 
@@ -91,7 +91,7 @@ def _joint_angles(x_m: Floats, y_m: Floats, second: Floats) -> tuple[Floats, Flo
     return shoulder, elbow
 
 
-def truck(seen: Seen, model: Any = None) -> Floats:
+def truck(seen: ModelStates, model: Any = None) -> Floats:
     """Return the force that drives a truck to its destination and stops it there, shape (1, B), N: a damped spring."""
     return SPRING_N_M * (seen["destination_m"] - seen["position_m"])[None] - BRAKE_N_S_M * seen["speed_m_s"][None]
 
@@ -100,7 +100,7 @@ SPRING_N_M, BRAKE_N_S_M = 4e3, 6e3
 """[chosen: about critical for 3.2 t]"""
 
 
-def incinerator(seen: Seen, model: Incinerator) -> Floats:
+def incinerator(seen: ModelStates, model: Incinerator) -> Floats:
     """Return the heat to take from the freeboard, shape (1, B), kJ/min: more where it is hotter than its set-point."""
     return HOLD_KJ_MIN + GAIN_KJ_MIN_K * (seen["freeboard_degc"] - model.target_degc)[None]
 
@@ -112,7 +112,7 @@ SCRIPTS: dict[str, Script] = {"fetch": fetch, "reacher": reacher, "delivery_truc
 """Script of each kind of model; that of a sorting station is its robot's."""
 
 
-class Scripted(Controller):
+class ScriptController(Controller):
     """Acts by the script for the agent's kind of model; agents without one, and those held constant, do not listen."""
 
     def __init__(self, constant: Mapping[str, float] | None = None) -> None:
@@ -136,7 +136,7 @@ class Scripted(Controller):
                 self._scripts[agent] = script, model, columns
 
     @property
-    def scripted(self) -> tuple[str, ...]:
+    def script_agents(self) -> tuple[str, ...]:
         """Agents for whom a script acts; none before ``start``."""
         return tuple(self._scripts)
 
@@ -149,5 +149,5 @@ class Scripted(Controller):
                 inputs = script(seen, model)
             except KeyError as missing:
                 raise ControlError(f"scripted control of '{agent}' needs to see its state {missing}") from None
-            actions[agent] = self._env.normalised(agent, inputs)
+            actions[agent] = self._env.normalise(agent, inputs)
         return actions

@@ -24,14 +24,14 @@ class Shortage:
     arc: Arc
     begins: float
     mass: float
-    said: str
+    description: str
 
 
 def shortages(run: Rollout, network: Network) -> Iterator[Shortage]:
     """Yield the scheduled flows that were cut in a rollout of ``network``; masses are means over its copies."""
     interval = network.episode.control_interval
     scheduled = [k for k, arc in enumerate(network.arcs) if LAWS[arc.law].scheduled]
-    for k, unmet in zip(scheduled, run.unmet.T, strict=True):
+    for k, unmet in zip(scheduled, run.shortage.T, strict=True):
         mass = float(unmet.sum())
         asked = mass + float(run.mean_flow[k]) * interval * len(unmet)
         if mass > NOTABLE * asked:
@@ -41,7 +41,7 @@ def shortages(run: Rollout, network: Network) -> Iterator[Shortage]:
             yield Shortage(arc, begins, mass, f"arc '{arc.id}' moved {less}, {first}: '{arc.donor}' held too little")
 
 
-def unsupplied(run: Rollout, network: Network) -> Iterator[str]:
+def service_shortages(run: Rollout, network: Network) -> Iterator[str]:
     """Yield the services that fell short in a rollout of ``network`` though arcs make up for them."""
     interval = network.episode.control_interval
     for s, service in enumerate(network.services):

@@ -57,7 +57,7 @@ class Actuators:
         np.clip(neutral, -1.0, 1.0, out=neutral)  # rounding may lead beyond a bound
         return self.unstack(neutral)
 
-    def normalised(self, agent: str, values: Floats, step: Integers) -> Floats:
+    def normalise(self, agent: str, values: Floats, step: Integers) -> Floats:
         """Return the actions that come closest to physical values of an agent's control, shape (its entries, B)."""
         _, middle, half, _ = (each[self.entries[agent]] for each in self._held(step))
         actions = np.divide(values - middle, half, out=np.zeros_like(values), where=half > 0)

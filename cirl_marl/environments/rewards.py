@@ -14,7 +14,7 @@ from cirl_marl.environments.state import State
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 
-WEIGHED = ("mixed", "mixed_difference", "team")
+CIRCULARITY_REWARDS = ("mixed", "mixed_difference", "team")
 """Rewards in which λ has a weight, and so services a price."""
 
 CELLS = 4_000_000

@@ -48,7 +48,7 @@ class MultiAgentVectorEnv:
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
         rows: which row of the physical state is what.
         supply: the arcs that make up for services.
-        held: controls that were held in the last interval, in the rows of ``network.control_rows``, shape
+        controls: controls that were held in the last interval, in the rows of ``network.control_rows``, shape
             (controls, num_envs).
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
             order of ``state()``.
@@ -122,7 +122,7 @@ class MultiAgentVectorEnv:
         self.rows = self.dynamics.rows
         self.state_names = (*self.rows.start_names, *self.rows.batch_names)
         self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
-        self.held: Floats = np.empty((len(self.dynamics.neutral), num_envs))
+        self.controls: Floats = np.empty((len(self.dynamics.neutral), num_envs))
         self._state: State | None = None
         _keep_freed_memory()
 
@@ -158,15 +158,15 @@ class MultiAgentVectorEnv:
             state = self._state
             found = self.supply(state.stock, state.inner, controls, step, idle, state.drawn)
             for arc in waiting:
-                every[arc] = self.normalised(arc, found[self.network.control_rows[arc]])
+                every[arc] = self.normalise(arc, found[self.network.control_rows[arc]])
         return every
 
-    def normalised(self, agent: str, values: Floats) -> Floats:
+    def normalise(self, agent: str, values: Floats) -> Floats:
         """Return the action that comes closest to physical values of an agent's control in the coming interval.
 
         Values have shape (entries of its action, num_envs), actions (num_envs, entries).
         """
-        return self._actuators.normalised(agent, values, self._coming()).T
+        return self._actuators.normalise(agent, values, self._coming()).T
 
     @property
     def physical(self) -> State:
@@ -250,7 +250,7 @@ class MultiAgentVectorEnv:
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         controls = self._actuators.controls(actions, state.step)
         drawn = state.drawn
-        controls = self.held = self.supply(state.stock, state.inner, controls, state.step, self._idle, drawn)
+        controls = self.controls = self.supply(state.stock, state.inner, controls, state.step, self._idle, drawn)
         transition = dynamics.advance(state.stock, state.inner, controls, state.step, drawn)
         quantities, flow = self._measured(transition, controls)
         levels = self.scoring.levels(quantities, state.step, drawn)

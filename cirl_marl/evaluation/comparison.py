@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.controllers.basic import Watched
+from cirl_marl.controllers.basic import ProgressController
 from cirl_marl.controllers.rollout import Rollout, first_seed, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -174,7 +174,7 @@ def compare(
     for place, contender in enumerate(entered):
         controller = contender.controller()
         checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
-        watched = Watched(controller, part_of(progress, contender.name, place * share, share))
+        watched = ProgressController(controller, part_of(progress, contender.name, place * share, share))
         rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.acted))
     measure, proved = _unproved(len(entered), "")
     if bounds:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.controllers.rollout import beginning, first_seed, rollout
+from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
@@ -71,7 +71,7 @@ def sample_episodes(
     if samples < 2:
         raise CirlError(f"samples must be at least 2, got {samples}")
     env = MultiAgentVectorEnv(network, num_envs=samples, uncertain=True)
-    begun, horizon = beginning(env), network.episode.horizon
+    begun, horizon = episode_start(env), network.episode.horizon
     stock = np.empty((samples, horizon, len(network.stores)))
     flow = np.empty((samples, horizon, len(network.arcs)))
 
@@ -80,7 +80,7 @@ def sample_episodes(
         flow[:, steps - 1] = env.physical.flow.T
         progress(steps / horizon)
 
-    run = rollout(env, named_controller(control), seed=first_seed(seed), start=begun.given, progress=keep)
+    run = rollout(env, named_controller(control), seed=first_seed(seed), start=begun.initial_state, progress=keep)
     factors = env.physical.factors.T.copy()
     return SampledEpisodes(network, tuple(network.uncertain), factors, run.circularity_mean, run.levels, stock, flow)
 

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Watched
-from cirl_marl.controllers.rollout import Beginning, Rollout, beginning, rollout
+from cirl_marl.controllers.basic import ProgressController
+from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
@@ -42,7 +42,7 @@ class Simulation:
     name: Annotated[str, "scenario, controller or both, whichever there are several of; empty if it is alone"]
     control: Annotated[str, "name of the controller"]
     env: Annotated[MultiAgentVectorEnv, "one copy, in which it was simulated; alternatives of one scenario share it"]
-    begun: Annotated[Beginning, "where the episode began"]
+    begun: Annotated[EpisodeStart, "where the episode began"]
     start: Annotated[Floats, "stocks there, shape (stores,), mass"]
     rollout: Annotated[Rollout, "what came of it"]
 
@@ -102,8 +102,8 @@ def simulate_alternatives(
 ) -> list[Simulation]:
     """Simulate every scenario under every controller, each from the same seed.
 
-    Each begins at ``beginning(env, seed)``. Scenarios with the same nodes and initial ranges thus begin with the same
-    stocks.
+    Each begins at ``episode_start(env, seed)``. Scenarios with the same nodes and initial ranges thus begin with the
+    same stocks.
 
     Args:
         network: catalogue name, path of a definition file, or a network.
@@ -130,7 +130,7 @@ def simulate_alternatives(
     for i, ((env, control), controller) in enumerate(zip(cases, controllers, strict=True)):
         choices = ((env.network.scenario_name, envs), (control, controls))
         name = ", ".join(chosen for chosen, among in choices if len(among) > 1)
-        watched = Watched(controller, partial(_tell, progress, i, len(cases)))
+        watched = ProgressController(controller, partial(_tell, progress, i, len(cases)))
         try:
             simulated.append(_simulated(name, control, env, watched, seed))
         except CirlError as error:
@@ -156,11 +156,13 @@ def _refuse(envs: Sequence[MultiAgentVectorEnv], controls: Sequence[str], held: 
             raise CirlError(f"network '{env.network.name}': scenarios {both} cannot be compared: {'; '.join(found)}")
 
 
-def _simulated(name: str, control: str, env: MultiAgentVectorEnv, watched: Watched, seed: int | None) -> Simulation:
-    begun = beginning(env, seed)
+def _simulated(
+    name: str, control: str, env: MultiAgentVectorEnv, watched: ProgressController, seed: int | None
+) -> Simulation:
+    begun = episode_start(env, seed)
     begun.reset(env)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
-    run = rollout(env, watched, seed=begun.seed, start=begun.given, progress=watched.acted)
+    run = rollout(env, watched, seed=begun.seed, start=begun.initial_state, progress=watched.acted)
     return Simulation(name, control, env, begun, start, run)
 
 

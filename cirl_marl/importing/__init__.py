@@ -1,5 +1,5 @@
 """From tables of measured flows to a definition file: reading, balances, reconciliation, writing."""
 
-from cirl_marl.importing.assembly import Imported, imported
+from cirl_marl.importing.assembly import ImportReport, import_flows
 
-__all__ = ["Imported", "imported"]
+__all__ = ["ImportReport", "import_flows"]

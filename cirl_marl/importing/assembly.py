@@ -11,18 +11,18 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.controllers.basic import Neutral
-from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Residual
-from cirl_marl.importing.definition import ImportedFiles, identifiers, written
+from cirl_marl.importing.definition import ImportedFiles, definition_files, identifiers
 from cirl_marl.importing.flow_table import FlowTable, read_flows, read_stocks
 from cirl_marl.network.declared import itemised
 from cirl_marl.network.elements import Role
 from cirl_marl.records.files import published, write_table
 
-SHOWN = 10
+MOST_LINES = 10
 """Most residuals that a message lists."""
 WRONG = 1e-5
 """Part of the largest flow of a region by which a simulated flow may miss the table."""
@@ -33,7 +33,7 @@ Ask = Callable[[str, ProcessKind], Role]
 
 @itemised
 @dataclass(frozen=True, slots=True)
-class Imported:
+class ImportReport:
     """What an import found and wrote."""
 
     table: Annotated[FlowTable, "the flows, as they were reconciled"]
@@ -45,7 +45,7 @@ class Imported:
     files: Annotated[tuple[Path, ...], "what was written, the definition first"]
 
 
-def imported(
+def import_flows(
     flows: Path,
     out: Path,
     stocks: Path | None = None,
@@ -61,7 +61,7 @@ def imported(
     title: str = "",
     source: str = "",
     progress: Callable[[float], None] = lambda share: None,
-) -> Imported:
+) -> ImportReport:
     """Write the definition of the network that a table of flows describes, and its data beside it; all or nothing.
 
     Args:
@@ -91,18 +91,18 @@ def imported(
     if regions:
         table = table.of(regions)
     known_stocks = {} if stocks is None else read_stocks(stocks, table.unit.rpartition("/")[0])
-    processes = Processes(table, _named(table, [*stores, *_stocked(table, known_stocks)], "store"))
+    processes = Processes(table, _matching_processes(table, [*stores, *_stock_processes(table, known_stocks)], "store"))
     changes: list[Change] = []
     if residuals := processes.residuals:
         if not reconcile:
-            raise CirlError(_unbalanced(table, residuals))
-        table, changes = processes.reconciled()
+            raise CirlError(_imbalance_message(table, residuals))
+        table, changes = processes.reconcile()
         processes = Processes(table, processes.of(ProcessKind.STORE))
     told = _roles(table, processes, roles, ask)
     name = identifiers([out.stem])[out.stem]
     if name != out.stem:
         raise CirlError(f"--out {out}: the name of a network has lower case letters, digits and _, as {name}.toml")
-    made = written(
+    made = definition_files(
         table,
         processes,
         told,
@@ -115,10 +115,12 @@ def imported(
         files = _write(partial, out.name, name, made, changes)
         error = _largest_error(partial / out.name, table, made, progress)
     mistakes = processes.stock_mistakes(known_stocks)
-    return Imported(table, processes, told, tuple(changes), mistakes, error, tuple(out.parent / file for file in files))
+    return ImportReport(
+        table, processes, told, tuple(changes), mistakes, error, tuple(out.parent / file for file in files)
+    )
 
 
-def _named(table: FlowTable, patterns: Sequence[str], what: str) -> list[str]:
+def _matching_processes(table: FlowTable, patterns: Sequence[str], what: str) -> list[str]:
     """Return the processes that names or patterns stand for; a ``CirlError`` for one that stands for none."""
     names = list(dict.fromkeys(end for pair in table.pairs for end in (pair.source, pair.target)))
     found: list[str] = []
@@ -130,7 +132,7 @@ def _named(table: FlowTable, patterns: Sequence[str], what: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _stocked(table: FlowTable, stocks: Mapping[tuple[str, str, int], float]) -> list[str]:
+def _stock_processes(table: FlowTable, stocks: Mapping[tuple[str, str, int], float]) -> list[str]:
     regions = {region for region, _, _ in stocks}
     for region in regions:
         if region not in table.regions:
@@ -144,10 +146,10 @@ def _roles(
     """Return the roles of processes; sources and sinks all have one."""
     told: dict[str, Role] = {}
     for role, patterns in roles.items():
-        for name in _named(table, patterns, role):
+        for name in _matching_processes(table, patterns, role):
             if told.setdefault(name, Role(role)) is not Role(role):
                 raise CirlError(f"'{name}' is given two roles, {told[name].value} and {role}; leave one out")
-            if processes.kinds[name] is ProcessKind.PASSING and Role(role) is not Role.TECHNOSPHERE:
+            if processes.kinds[name] is ProcessKind.TRANSIT and Role(role) is not Role.TECHNOSPHERE:
                 raise CirlError(f"'{name}' is given the role {role}, but what enters it leaves it; it has none")
     missing = [name for name in processes.of(ProcessKind.SOURCE, ProcessKind.SINK) if name not in told]
     if missing and ask is None:
@@ -160,11 +162,11 @@ def _roles(
     return told
 
 
-def _unbalanced(table: FlowTable, residuals: Sequence[Residual]) -> str:
+def _imbalance_message(table: FlowTable, residuals: Sequence[Residual]) -> str:
     """Say what does not balance."""
     names = dict.fromkeys(each.process for each in residuals)
-    lines = [f"  {each}" for each in residuals[:SHOWN]]
-    more = [f"  and {len(residuals) - SHOWN} more"] if len(residuals) > SHOWN else []
+    lines = [f"  {each}" for each in residuals[:MOST_LINES]]
+    more = [f"  and {len(residuals) - MOST_LINES} more"] if len(residuals) > MOST_LINES else []
     remedy = "Name those that hold a stock with --store, or adjust the flows with --reconcile"
     said = f"{table.name}: {len(names)} processes do not balance ({table.unit}); the largest residuals are"
     return "\n".join([said, *lines, *more, f"{remedy}; nothing was written."])
@@ -182,7 +184,17 @@ def _write(folder: Path, file: str, name: str, made: ImportedFiles, changes: Seq
         files.append(f"{name}_changes.csv")
         header = ["region", "year", "source", "target", "type", "before", "after", "deviation", "in deviations"]
         rows = [
-            (c.region, c.year, c.pair.source, c.pair.target, c.pair.type, c.before, c.after, c.deviation, c.weighed)
+            (
+                c.region,
+                c.year,
+                c.pair.source,
+                c.pair.target,
+                c.pair.type,
+                c.before,
+                c.after,
+                c.deviation,
+                c.in_deviations,
+            )
             for c in sorted(changes, key=lambda each: -abs(each.after - each.before))
         ]
         write_table(folder / files[-1], header, rows)
@@ -200,8 +212,8 @@ def _largest_error(path: Path, table: FlowTable, made: ImportedFiles, progress: 
     for done, (region, id_) in enumerate(ids.items()):
         network = load_network(f"{path}:{id_}" if id_ else path)
         env = MultiAgentVectorEnv(network, num_envs=1)
-        begun = beginning(env)
-        run = rollout(env, Neutral(), seed=begun.seed, start=begun.given)
+        begun = episode_start(env)
+        run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
         expected = np.array(
             [[table.flows.get((region, year, pair), 0.0) for pair in made.arcs] for year in table.years]
         )

@@ -28,7 +28,7 @@ class ProcessKind(StrEnum):
 
     SOURCE = "source"
     SINK = "sink"
-    PASSING = "passing"
+    TRANSIT = "passing"
     STORE = "store"
 
 
@@ -62,7 +62,7 @@ class Change:
     deviation: Annotated[float, "standard deviation that it was weighted by"]
 
     @property
-    def weighed(self) -> float:
+    def in_deviations(self) -> float:
         """The change in standard deviations."""
         return (self.after - self.before) / self.deviation
 
@@ -111,9 +111,9 @@ class Processes:
                 kind = ProcessKind.STORE
                 assumed.append(name)
             else:
-                kind = ProcessKind.PASSING
+                kind = ProcessKind.TRANSIT
             self.kinds[name] = kind
-        self.assumed = tuple(assumed)
+        self.inferred_stores = tuple(assumed)
 
     def of(self, *kinds: ProcessKind) -> tuple[str, ...]:
         """Return the processes of some kinds."""
@@ -123,7 +123,7 @@ class Processes:
     def residuals(self) -> list[Residual]:
         """What does not balance beyond rounding, the largest first."""
         entered, left = self._sums(1.0), self._sums(-1.0)
-        passing = np.array([kind is ProcessKind.PASSING for kind in self.kinds.values()])
+        passing = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
         wrong = (np.abs(entered - left) > self._tolerance()[:, None, None]) & passing
         found = [
             Residual(self.names[i], self._table.regions[r], self._table.years[y], entered[r, y, i], left[r, y, i])
@@ -131,7 +131,7 @@ class Processes:
         ]
         return sorted(found, key=lambda each: -abs(each.entered - each.left))
 
-    def reconciled(self) -> tuple[FlowTable, list[Change]]:
+    def reconcile(self) -> tuple[FlowTable, list[Change]]:
         """Return flows that balance and are closest to those of the table, and what was changed.
 
         In each region and year they minimise Σ ((x − m)/σ)² for x ≥ 0 and inflow = outflow of every process that
@@ -139,7 +139,7 @@ class Processes:
         (Cencic and Rechberger 2008). A flow of 0 stays 0.
         """
         table, flows = self._table, dict(self._table.flows)
-        rows = np.array([kind is ProcessKind.PASSING for kind in self.kinds.values()])
+        rows = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
         balances, changes = self._incidence[rows], []
         for r, region in enumerate(table.regions):
             for y, year in enumerate(table.years):

@@ -31,7 +31,7 @@ class ImportedFiles:
     arcs: Annotated[Mapping[Connection, str], "id of the arc of each pair"]
 
 
-def written(
+def definition_files(
     table: FlowTable,
     processes: Processes,
     roles: Mapping[str, Role],
@@ -160,7 +160,9 @@ class _Writer:
     def _references(self) -> list[tuple[float, float]]:
         """Return reference flow and stock of each region, to two digits."""
         largest = self._processes.flows.max(axis=(1, 2))
-        return [(_rounded(each), _rounded(each * len(self._table.years))) for each in largest.tolist()]
+        return [
+            (_round_significant(each), _round_significant(each * len(self._table.years))) for each in largest.tolist()
+        ]
 
     def _of_regions(self) -> list[list[object]]:
         """Return what differs from region to region and not from year to year, a row for each."""
@@ -187,7 +189,7 @@ class _Writer:
             if id_ != process:
                 yield f"title = {_text(process)}"
             yield f'role = "{self._roles.get(process, Role.TECHNOSPHERE).value}"'
-            if kind is ProcessKind.PASSING:
+            if kind is ProcessKind.TRANSIT:
                 yield "stores = false"
             elif kind is ProcessKind.SINK:
                 since = _text(f"counted from {self._table.years[0]}")
@@ -222,7 +224,7 @@ class _Writer:
             if pair.type:
                 yield f"title = {_text(pair.type)}"
             yield from (f'from = "{self._nodes[pair.source]}"', f'to = "{self._nodes[pair.target]}"')
-            if self._processes.kinds[pair.source] is not ProcessKind.PASSING:
+            if self._processes.kinds[pair.source] is not ProcessKind.TRANSIT:
                 yield from ('law = "exogenous"', f"flow = {self._column(id_, self._table.unit)}")
             elif self._rest(pair):
                 yield from ('law = "share"', 'share = "rest"')
@@ -244,7 +246,7 @@ class _Writer:
         """Return header and rows of the data file, in the order of regions and years."""
         table, flows = self._table, self._processes.flows
         values = flows.copy()
-        for process in self._processes.of(ProcessKind.PASSING):
+        for process in self._processes.of(ProcessKind.TRANSIT):
             own = [k for k, pair in enumerate(table.pairs) if pair.source == process]
             values[:, :, own] = shares_of(flows[:, :, own])
         rows: list[list[object]] = [[*(["region"] if self._regional else []), "year", *self._arcs.values()]]
@@ -263,5 +265,5 @@ def _short(value: float) -> str:
     return repr(float(value)).removesuffix(".0")
 
 
-def _rounded(value: float) -> float:
+def _round_significant(value: float) -> float:
     return float(f"{value:.2g}") or 1.0

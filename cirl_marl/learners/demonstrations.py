@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import Tensor
 
 from cirl_marl.controllers.basic import Arrays
-from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.environments.goal import GoalEnv
 from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.environments.state import State
@@ -177,7 +177,9 @@ class Demonstrator:
             self.act()
         except CirlError as error:
             raise RecipeError(f"{title}: demonstrations by {self.name} control: {error}") from error
-        if isinstance(self._controller, Scripted) and not set(agents) & set(known := self._controller.scripted):
+        if isinstance(self._controller, ScriptController) and not set(agents) & set(
+            known := self._controller.script_agents
+        ):
             raise RecipeError(
                 f"{title}: demonstrations by scripted control: there is no script for it; "
                 f"there are scripts for {', '.join(known) or 'no agent of this network'}"

@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
-from cirl_marl.environments.rewards import WEIGHED
+from cirl_marl.environments.rewards import CIRCULARITY_REWARDS
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.checkpoint import read_tree, write_tree
@@ -135,10 +135,10 @@ class Training:
         asked = self.config.recipe.run
         if not asked.price_rate or asked.min_service is None or not self.env.network.services:
             return None
-        if self.env.reward_mode not in WEIGHED:
+        if self.env.reward_mode not in CIRCULARITY_REWARDS:
             raise RecipeError(
                 f"recipe '{self.config.recipe.name}': run.price_rate: reward '{self.env.reward_mode}' has no price of "
-                f"service that could move; choose {', '.join(WEIGHED)}, or a price_rate of 0"
+                f"service that could move; choose {', '.join(CIRCULARITY_REWARDS)}, or a price_rate of 0"
             )
         price = ServiceMultiplier(self.env, asked.min_service, asked.price_rate, asked.price_damping)
         if checkpoint is not None:

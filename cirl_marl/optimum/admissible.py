@@ -285,7 +285,7 @@ def _entries(admissible: Admissible, valve: Floats, own: Floats, during: slice) 
             node = network.node_index[agent]
             sets = next(k for k in np.flatnonzero(network.donors == node) if network.arcs[k].law is Law.CONTROLLED)
             values = own[:, sets]
-        actions[:, entries] = actuators.normalised(agent, values[None], steps).T
+        actions[:, entries] = actuators.normalise(agent, values[None], steps).T
     return actions
 
 

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Constant, Controller, Neutral
 from cirl_marl.controllers.rollout import EVALUATION_SEEDS
-from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
@@ -227,7 +227,7 @@ def standard_candidates(agents: Sequence[str]) -> dict[str, Controller]:
     """Return neutral control, scripts (neutral for agents without one), and all agents at either end of their range."""
     ends = {"lowest": -1.0, "highest": 1.0}
     held = {name: Constant(dict.fromkeys(agents, value)) for name, value in ends.items()}
-    return {"neutral": Neutral(), "scripted": Scripted(), **held}
+    return {"neutral": Neutral(), "scripted": ScriptController(), **held}
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from cirl_marl.controllers.basic import Constant, Controller, Neutral, Random
 from cirl_marl.controllers.lqr import LQR
-from cirl_marl.controllers.scripted import Scripted
+from cirl_marl.controllers.scripted import ScriptController
 from cirl_marl.errors import CirlError, unknown
 
 SETTABLE = ("constant", "scripted")
@@ -40,7 +40,7 @@ def named_controller(
         "neutral": Neutral,
         "constant": lambda: Constant(constants),
         "random": Random,
-        "scripted": lambda: Scripted(constants),
+        "scripted": lambda: ScriptController(constants),
         "lqr": LQR,
         "mpc": lambda: _mpc(min_service),
         "optimum": lambda: _optimum(min_service),

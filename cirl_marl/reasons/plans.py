@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller
-from cirl_marl.controllers.rollout import beginning, first_seed, rollout
+from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.controllers.schedule import control_names
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -140,7 +140,7 @@ class _Given(Controller):
     def act(self, observations: Arrays) -> Arrays:
         step = np.array([self._step])
         found: Mapping[str, Floats] = {
-            agent: self._actuators.normalised(agent, self._values[entries, self._step][:, None], step).T
+            agent: self._actuators.normalise(agent, self._values[entries, self._step][:, None], step).T
             for agent, entries in self._actuators.entries.items()
         }
         self._step += 1
@@ -155,16 +155,17 @@ def _of_controls(
     if len(rows) != steps:
         raise CirlError(f"{path}: has {len(rows)} intervals, an episode of '{network.name}' has {steps}")
     values = np.array([_column(path, header, rows, name) for name in control_names(network, env.agents)])
-    begun = beginning(env, seed)
+    begun = episode_start(env, seed)
     begun.reset(env)
     initial = _stocks(env)
-    run = rollout(env, _Given(values), seed=begun.seed, start=begun.given)
+    run = rollout(env, _Given(values), seed=begun.seed, start=begun.initial_state)
     told = _column(path, header, rows, f"mean circularity ({network.mass_unit})")
     found = run.circularity_mean[0]
     if not np.allclose(found, told, rtol=ALIKE, atol=ALIKE * float(np.abs(found).max(initial=0.0))):
         raise CirlError(
-            f"{path}: carried out from {begun.said} its mean circularity is {found.mean():.6g} {network.mass_unit}, but"
-            f" the file says {told.mean():.6g}: it is of another start (--seed), scenario or definition"
+            f"{path}: carried out from {begun.description} its mean circularity is {found.mean():.6g} "
+            f"{network.mass_unit}, but the file says {told.mean():.6g}: "
+            "it is of another start (--seed), scenario or definition"
         )
     return PlannedEpisode(str(path), initial, run.stock, run.flow)
 

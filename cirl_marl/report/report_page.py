@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from scipy.special import stdtrit
 
-from cirl_marl.controllers.basic import Watched
+from cirl_marl.controllers.basic import ProgressController
 from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.style import readable
@@ -96,7 +96,7 @@ def page_of_alternatives(found: Sequence[Simulation]) -> ReportPage:
         for each in found
     ]
     network = found[0].network
-    return ReportPage(_title(network), network, tuple(scenes), notes=(f"Start: {found[0].begun.said}.",))
+    return ReportPage(_title(network), network, tuple(scenes), notes=(f"Start: {found[0].begun.description}.",))
 
 
 def page_of_samples(found: SampledEpisodes, control: str) -> ReportPage:
@@ -125,7 +125,7 @@ def page_of_schedule(found: Schedule, name: str, *, note: str = "") -> ReportPag
         _scene(USUAL, network, found.agents, start, found.usual),
         _scene(name, network, found.agents, start, found.rollout),
     )
-    notes = [f"Start: {found.begun.said}.", *([note] if note else [])]
+    notes = [f"Start: {found.episode_start.description}.", *([note] if note else [])]
     return ReportPage(_title(network), network, scenes, notes=tuple(notes))
 
 
@@ -168,7 +168,7 @@ def add_plan(
     """
     level = None if env.uncertain else levels_to_demand(found.entries[0].rollout.episode_levels[0])
     controller = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
-    watched = Watched(controller, progress)
+    watched = ProgressController(controller, progress)
     run = rollout(env, watched, seed=found.first_seed, progress=watched.acted)
     scene = _scene(PLAN, found.network, found.agents, _first_start(found), run)
     point = PlanePoint(PLAN, float(run.least_service[0]), float(run.episode_circularity[0]), "of the first episode")

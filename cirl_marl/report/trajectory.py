@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cirl_marl.controllers.pyramids import Pyramid, pyramids
-from cirl_marl.controllers.rollout import Beginning, Rollout, interval_ends
+from cirl_marl.controllers.rollout import EpisodeStart, Rollout, interval_ends
 from cirl_marl.drawing.style import SERIES, readable, save, style_axes
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Network
@@ -23,7 +23,7 @@ PYRAMID_COLUMNS, PYRAMIDS = 3, 12
 
 
 def write_trajectory(
-    folder: Path, name: str, env: MultiAgentVectorEnv, begun: Beginning, run: Rollout, title: str
+    folder: Path, name: str, env: MultiAgentVectorEnv, begun: EpisodeStart, run: Rollout, title: str
 ) -> list[Path]:
     """Write ``name.csv`` and ``name.png`` of what ``run`` did in ``env`` from where it began; return their paths.
 
@@ -96,7 +96,9 @@ def save_pyramids(path: str | Path, network: Network, found: Sequence[Pyramid], 
     return save(figure, path)
 
 
-def trajectory_table(env: MultiAgentVectorEnv, begun: Beginning, run: Rollout) -> tuple[list[str], list[list[object]]]:
+def trajectory_table(
+    env: MultiAgentVectorEnv, begun: EpisodeStart, run: Rollout
+) -> tuple[list[str], list[list[object]]]:
     """Return header and rows of what ``run`` did in ``env`` from where it began.
 
     There is a row for the start and one for the end of each interval: year or date at the end, if the network has a

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.best_plans import LEFT_OUT, read_plan, replayed
 from cirl_marl import MultiAgentVectorEnv, Network, load_network
 from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import beginning, rollout
+from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.definitions.sources import stated, stated_settings
 from cirl_marl.drawing.digraph import save_network
@@ -44,7 +44,7 @@ def network_page(name: str) -> GeneratedPage:
     """
     network = load_network(name)
     env = MultiAgentVectorEnv(network, num_envs=1)
-    begun = beginning(env, None)
+    begun = episode_start(env, None)
     begun.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0].copy(), env.physical.flow[:, 0].copy()
     circularity = float(network.circularity(flow))
@@ -55,7 +55,7 @@ def network_page(name: str) -> GeneratedPage:
         f"{network.title}. {_size(network)}",
         _more(name, network),
         f"![{name} at the start of an episode]({name}.png)",
-        f"Stocks and flows at the start of an episode: {begun.said}. λ = {circularity:.5g} {network.mass_unit}.",
+        f"Stocks and flows at the start of an episode: {begun.description}. λ = {circularity:.5g} {network.mass_unit}.",
         "## Circularity",
         _formula(network),
         "## Services",

@@ -18,7 +18,7 @@ from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.controllers.schedule import schedule
 from cirl_marl.definitions.catalogue import CHECKOUT
-from cirl_marl.importing import imported
+from cirl_marl.importing import import_flows
 from cirl_marl.optimum import Plan, achieved, bound, gap, improved
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table
 
@@ -32,7 +32,7 @@ print(*flows.read_text().splitlines()[:4], sep="\n")
 # have to say. The network is simulated, and its flows are held against the table.
 
 # %%
-found = imported(
+found = import_flows(
     flows,
     Path("steel.toml"),
     regions=["Japan"],
