@@ -6,92 +6,158 @@ reward is the circularity λ(N;t) of the network.
 >>> import cirl_marl
 >>> cirl_marl.networks()[:3]
 ['aluminium_world', 'carbo_net', 'copper_net']
+
+Every name here is loaded when it is first asked for (PEP 562), so that importing the library is cheap.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from cirl_marl.definitions.catalogue import load_network, networks, recipes
-from cirl_marl.environments.parallel import NetworkParallelEnv, aec_env, parallel_env, vector_env
 from cirl_marl.environments.registration import register
-from cirl_marl.environments.single import SingleAgentEnv, single_agent_env
-from cirl_marl.environments.state import Snapshot
-from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.errors import CirlError, ControlError, DefinitionError, LearnerError, NetworkError, RecipeError, RunError
-from cirl_marl.network import Network
-from cirl_marl.network.elements import (
-    Arc,
-    Control,
-    ControlKind,
-    Episode,
-    Law,
-    Node,
-    Objective,
-    Observation,
-    Role,
-    Service,
-)
-from cirl_marl.network.series import Series
 
 if TYPE_CHECKING:
-    from cirl_marl.learners.teams.team import Team, independent
-    from cirl_marl.reasons.explanation import explain
-    from cirl_marl.reasons.inverse import infer
+    from cirl_marl.controllers.basic import Constant as Constant
+    from cirl_marl.controllers.basic import Controller as Controller
+    from cirl_marl.controllers.basic import Neutral as Neutral
+    from cirl_marl.controllers.basic import Random as Random
+    from cirl_marl.controllers.lqr import LQR as LQR
+    from cirl_marl.controllers.rollout import Rollout as Rollout
+    from cirl_marl.controllers.rollout import interval_ends as interval_ends
+    from cirl_marl.controllers.rollout import rollout as rollout
+    from cirl_marl.controllers.schedule import Schedule as Schedule
+    from cirl_marl.controllers.scripted import ScriptController as ScriptController
+    from cirl_marl.definitions.catalogue import load_network as load_network
+    from cirl_marl.definitions.catalogue import networks as networks
+    from cirl_marl.definitions.catalogue import recipes as recipes
+    from cirl_marl.definitions.reading import write_network as write_network
+    from cirl_marl.environments.goal import GoalEnv as GoalEnv
+    from cirl_marl.environments.parallel import NetworkParallelEnv as NetworkParallelEnv
+    from cirl_marl.environments.parallel import aec_env as aec_env
+    from cirl_marl.environments.parallel import parallel_env as parallel_env
+    from cirl_marl.environments.parallel import vector_env as vector_env
+    from cirl_marl.environments.single import SingleAgentEnv as SingleAgentEnv
+    from cirl_marl.environments.single import single_agent_env as single_agent_env
+    from cirl_marl.environments.state import Snapshot as Snapshot
+    from cirl_marl.environments.vector import MultiAgentVectorEnv as MultiAgentVectorEnv
+    from cirl_marl.errors import CirlError as CirlError
+    from cirl_marl.errors import ControlError as ControlError
+    from cirl_marl.errors import DefinitionError as DefinitionError
+    from cirl_marl.errors import LearnerError as LearnerError
+    from cirl_marl.errors import NetworkError as NetworkError
+    from cirl_marl.errors import RecipeError as RecipeError
+    from cirl_marl.errors import RunError as RunError
+    from cirl_marl.evaluation.assessment import Evaluation as Evaluation
+    from cirl_marl.evaluation.assessment import evaluate as evaluate
+    from cirl_marl.evaluation.comparison import Comparison as Comparison
+    from cirl_marl.evaluation.comparison import compare as compare
+    from cirl_marl.evaluation.pareto import ParetoFront as ParetoFront
+    from cirl_marl.evaluation.pareto import pareto_front as pareto_front
+    from cirl_marl.evaluation.plans import plan as plan
+    from cirl_marl.evaluation.simulations import Simulation as Simulation
+    from cirl_marl.evaluation.simulations import simulate as simulate
+    from cirl_marl.evaluation.simulations import simulate_alternatives as simulate_alternatives
+    from cirl_marl.importing.assembly import import_flows as import_flows
+    from cirl_marl.learners.interface import Trained as Trained
+    from cirl_marl.learners.interface import export as export
+    from cirl_marl.learners.interface import resume as resume
+    from cirl_marl.learners.interface import train as train
+    from cirl_marl.learners.recipe import Recipe as Recipe
+    from cirl_marl.learners.recipe import load_recipe as load_recipe
+    from cirl_marl.learners.teams.team import Team as Team
+    from cirl_marl.learners.teams.team import independent as independent
+    from cirl_marl.learners.trainer import Training as Training
+    from cirl_marl.network.elements import Arc as Arc
+    from cirl_marl.network.elements import Control as Control
+    from cirl_marl.network.elements import ControlKind as ControlKind
+    from cirl_marl.network.elements import Episode as Episode
+    from cirl_marl.network.elements import Law as Law
+    from cirl_marl.network.elements import Node as Node
+    from cirl_marl.network.elements import Objective as Objective
+    from cirl_marl.network.elements import Observation as Observation
+    from cirl_marl.network.elements import Role as Role
+    from cirl_marl.network.elements import Service as Service
+    from cirl_marl.network.network import Network as Network
+    from cirl_marl.network.series import Series as Series
+    from cirl_marl.optimum.admissible import NoCertificate as NoCertificate
+    from cirl_marl.optimum.bounds import Bound as Bound
+    from cirl_marl.optimum.bounds import bound as bound
+    from cirl_marl.optimum.bounds import envelope as envelope
+    from cirl_marl.optimum.bounds import gap as gap
+    from cirl_marl.optimum.cross_entropy import search as search
+    from cirl_marl.optimum.improve import improved as improved
+    from cirl_marl.optimum.mpc import MPC as MPC
+    from cirl_marl.optimum.plans import Plan as Plan
+    from cirl_marl.optimum.plans import achieved as achieved
+    from cirl_marl.reasons.explanation import explain as explain
+    from cirl_marl.reasons.inverse import infer as infer
+    from cirl_marl.report.results import draw as draw
+    from cirl_marl.report.results import summarise as summarise
+    from cirl_marl.report.results import write_report as write_report
+    from cirl_marl.sweeps.running import sweep as sweep
+    from cirl_marl.testing.conformance import check_parallel_env as check_parallel_env
+    from cirl_marl.testing.conformance import check_vector_env as check_vector_env
+    from cirl_marl.testing.nested import ConformanceError as ConformanceError
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "Arc",
-    "CirlError",
-    "Control",
-    "ControlError",
-    "ControlKind",
-    "DefinitionError",
-    "Episode",
-    "Law",
-    "LearnerError",
-    "MultiAgentVectorEnv",
-    "Network",
-    "NetworkError",
-    "NetworkParallelEnv",
-    "Node",
-    "Objective",
-    "Observation",
-    "RecipeError",
-    "Role",
-    "RunError",
-    "Series",
-    "Service",
-    "SingleAgentEnv",
-    "Snapshot",
-    "Team",
-    "aec_env",
-    "explain",
-    "independent",
-    "infer",
-    "load_network",
-    "networks",
-    "parallel_env",
-    "recipes",
-    "register",
-    "single_agent_env",
-    "vector_env",
-]
+_MODULES = {
+    "controllers.basic": "Constant Controller Neutral Random",
+    "controllers.lqr": "LQR",
+    "controllers.rollout": "Rollout interval_ends rollout",
+    "controllers.schedule": "Schedule",
+    "controllers.scripted": "ScriptController",
+    "definitions.catalogue": "load_network networks recipes",
+    "definitions.reading": "write_network",
+    "environments.goal": "GoalEnv",
+    "environments.parallel": "NetworkParallelEnv aec_env parallel_env vector_env",
+    "environments.single": "SingleAgentEnv single_agent_env",
+    "environments.state": "Snapshot",
+    "environments.vector": "MultiAgentVectorEnv",
+    "errors": "CirlError ControlError DefinitionError LearnerError NetworkError RecipeError RunError",
+    "evaluation.assessment": "Evaluation evaluate",
+    "evaluation.comparison": "Comparison compare",
+    "evaluation.pareto": "ParetoFront pareto_front",
+    "evaluation.plans": "plan",
+    "evaluation.simulations": "Simulation simulate simulate_alternatives",
+    "importing.assembly": "import_flows",
+    "learners.interface": "Trained export resume train",
+    "learners.recipe": "Recipe load_recipe",
+    "learners.teams.team": "Team independent",
+    "learners.trainer": "Training",
+    "network.elements": "Arc Control ControlKind Episode Law Node Objective Observation Role Service",
+    "network.network": "Network",
+    "network.series": "Series",
+    "optimum.admissible": "NoCertificate",
+    "optimum.bounds": "Bound bound envelope gap",
+    "optimum.cross_entropy": "search",
+    "optimum.improve": "improved",
+    "optimum.mpc": "MPC",
+    "optimum.plans": "Plan achieved",
+    "reasons.explanation": "explain",
+    "reasons.inverse": "infer",
+    "report.results": "draw summarise write_report",
+    "sweeps.running": "sweep",
+    "testing.conformance": "check_parallel_env check_vector_env",
+    "testing.nested": "ConformanceError",
+}
+"""Public names by the module that defines them; the imports above are the same for type checkers and editors."""
+
+_HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names.split()}
+
+__all__ = sorted(_HOMES)
 
 register()
 
 
-LATE = {
-    "Team": "cirl_marl.learners.teams.team",
-    "explain": "cirl_marl.reasons.explanation",
-    "independent": "cirl_marl.learners.teams.team",
-    "infer": "cirl_marl.reasons.inverse",
-}
-"""Where names are that are loaded when they are first asked for: what trains loads torch."""
+if not TYPE_CHECKING:  # else a misspelt name would be no mistake to a type checker
+
+    def __getattr__(name: str) -> object:
+        """Load the module that defines a public name, and keep the name."""
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return globals().setdefault(name, getattr(import_module(_HOMES[name]), name))
 
 
-def __getattr__(name: str) -> Any:
-    """Return what is loaded late."""
-    if name not in LATE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(LATE[name]), name)
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return list(__all__)

@@ -30,15 +30,14 @@ from cirl_marl import (
     load_network,
 )
 from cirl_marl.controllers.basic import Random
-from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.controllers.schedule import schedule
+from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.optimum import Bound, NoCertificate, bound
 from cirl_marl.reasons.inverse import ObjectiveWeights, infer
 from cirl_marl.reasons.objective_terms import PlannedEpisode, objective_terms
 from cirl_marl.reasons.plans import episodes_of_plan
 from cirl_marl.reasons.prices import shadow_prices
 from cirl_marl.report.objective_weights import weights_sentences, write_weights
-from cirl_marl.report.trajectory import write_trajectory
 
 
 def ladder(steps: int = 24, growth: float = 1.03, start: float = 1000.0, **arc: Any) -> Network:
@@ -171,8 +170,8 @@ def test_tables_of_plan_and_simulate_are_the_same_course(tmp_path: Path) -> None
     env = MultiAgentVectorEnv(network, num_envs=1)
     planned = schedule(env, Random(), seed=3)
     planned.write(tmp_path / "plan.csv")
-    begun = episode_start(env, 3)
-    write_trajectory(tmp_path, "simulated", env, begun, planned.rollout, "title")
+    simulation = Simulation("", "random", env, planned.episode_start, planned.start, planned.rollout)
+    simulation.write(tmp_path / "simulated.csv")
     (one,) = episodes_of_plan(network, tmp_path / "plan.csv", seed=3)
     (two,) = episodes_of_plan(network, tmp_path / "simulated.csv")
     for which in ("initial", "stock", "flow"):

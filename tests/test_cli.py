@@ -26,6 +26,7 @@ from cirl_marl.cli import demonstration
 from cirl_marl.controllers.rollout import episode_start, first_seed
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reading import write_network
+from cirl_marl.evaluation.assessment import evaluate
 from cirl_marl.learners import RunDirectory, train
 from cirl_marl.optimum import search_each
 from cirl_marl.report import run as pictures
@@ -835,13 +836,12 @@ def test_pictures_of_a_run_show_mean_circularity(trained: Path, monkeypatch: pyt
 
         monkeypatch.setattr(pictures, name, record)
     shutil.copytree(trained, "run")
-    kept = RunDirectory("run")
-    figures, rollouts, env = pictures.evaluate_run(kept, episodes=2, bounds=False)
-    pictures.draw_run(kept, rollouts, env)
+    evaluation = evaluate("run", episodes=2, bounds=False)
+    pictures.draw_run(evaluation)
     network, before, after, _, shown = drawn["save_before_after"]
     assert shown == pytest.approx([float(network.circularity(flow)) for _, flow in (before, after)], rel=1e-9)
     for name, curve in drawn["save_circularity"][2].items():
-        assert curve.mean() == pytest.approx(figures["controllers"][name]["circularity"]["value"], rel=1e-12)
+        assert curve.mean() == pytest.approx(evaluation.figures["controllers"][name]["circularity"]["value"], rel=1e-12)
 
 
 @pytest.mark.medium

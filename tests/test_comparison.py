@@ -19,6 +19,7 @@ from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.assessment import evaluate
 from cirl_marl.evaluation.contenders import differences
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.pareto import pareto_front
@@ -28,7 +29,6 @@ from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
 from cirl_marl.records.files import published
 from cirl_marl.report.fronts import COMPARISON_FILES, write_comparison
-from cirl_marl.report.run import evaluate_run
 
 pytestmark = pytest.mark.medium
 
@@ -119,7 +119,7 @@ def test_plans_tell_how_far_they_are(bottles: Network, monkeypatch: pytest.Monke
 
 def test_evaluation_and_sweep_tell_how_far_they_are(bottles: Network, runs: list[Path], tmp_path: Path) -> None:
     """Bounds of an evaluation and plans of a sweep are several steps each."""
-    told = reported(lambda progress: evaluate_run(RunDirectory(runs[1]), episodes=2, progress=progress))
+    told = reported(lambda progress: evaluate(runs[1], episodes=2, progress=progress))
     assert len({share for what, share in told if what == "bounds"}) >= 3 * 2 + 3
     told = reported(lambda progress: pareto_front(bottles, directory=tmp_path, points=3, progress=progress))
     assert len(set(told)) > 3 * 2
@@ -230,14 +230,17 @@ def test_bad_input(bottles: Network, runs: list[Path]) -> None:
 
 
 def test_evaluation_has_the_gap(runs: list[Path]) -> None:
-    """``evaluate_run`` is the comparison of one run with neutral and random control."""
-    figures, rollouts, _ = evaluate_run(RunDirectory(runs[1]), episodes=3)
-    assert list(rollouts) == ["trained", "neutral", "random"]
+    """``evaluate`` is the comparison of one run with neutral and random control."""
+    evaluation = evaluate(runs[1], episodes=3)
+    figures = evaluation.figures
+    assert list(evaluation.rollouts) == ["trained", "neutral", "random"]
     same = compare([runs[1]], ["neutral", "random"], episodes=3)
     gap = same.entries[0].gap
     assert gap is not None
     assert figures["controllers"]["trained"]["gap"]["value"] == pytest.approx(float(gap.mean()))
+    assert evaluation.write() == runs[1] / "evaluation.json"
     assert json.loads((runs[1] / "evaluation.json").read_text()) == figures
+    assert f"gap to the bound {figures['controllers']['trained']['gap']['value']:.1%}" in str(evaluation)
 
 
 def test_figures_are_of_the_checkpoint_that_acted(tmp_path: Path, ppo_recipe: Recipe) -> None:
@@ -250,22 +253,23 @@ def test_figures_are_of_the_checkpoint_that_acted(tmp_path: Path, ppo_recipe: Re
         if not moved and what == "neutral":
             moved.append(resume(tmp_path, steps=160))
 
-    figures, _, _ = evaluate_run(run, episodes=2, bounds=False, progress=train_on)
-    assert (figures["checkpoint"], run.checkpoint.name) == ("000000040-complete", "000000080-complete")
-    again, _, _ = evaluate_run(run, episodes=2, bounds=False)
-    assert again["checkpoint"] == "000000080-complete"
-    assert json.loads((tmp_path / "evaluation.json").read_text()) == again
+    evaluation = evaluate(run, episodes=2, bounds=False, progress=train_on)
+    assert (evaluation.figures["checkpoint"], run.checkpoint.name) == ("000000040-complete", "000000080-complete")
+    evaluation.write()
+    again = evaluate(run, episodes=2, bounds=False)
+    assert again.figures["checkpoint"] == "000000080-complete"
+    assert json.loads(again.write().read_text()) == again.figures
 
 
 def test_reports_keep_the_gap(runs: list[Path]) -> None:
     """Drawing a run again does not throw away what its evaluation found; other episodes take its place."""
-    evaluate_run(RunDirectory(runs[0]), episodes=2)
+    evaluate(runs[0], episodes=2).write()
     kept = (runs[0] / "evaluation.json").read_text()
     assert '"gap"' in kept
-    evaluate_run(RunDirectory(runs[0]), episodes=2, bounds=False)
+    evaluate(runs[0], episodes=2, bounds=False).write()
     assert (runs[0] / "evaluation.json").read_text() == kept
-    figures, _, _ = evaluate_run(RunDirectory(runs[0]), episodes=3, bounds=False)
-    assert json.loads((runs[0] / "evaluation.json").read_text()) == figures
+    evaluation = evaluate(runs[0], episodes=3, bounds=False)
+    assert json.loads(evaluation.write().read_text()) == evaluation.figures
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ LAYERS = (
     ("learners",),
     ("evaluation", "paper"),
     ("reasons",),
-    ("__init__", "report", "sweeps"),
-    ("cli",),
+    ("report", "sweeps"),
+    ("__init__", "cli"),
 )
 """From the ground up; a room imports from layers below its own, and from itself."""
 

@@ -33,9 +33,10 @@ from cirl_marl import (
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.pyramids import pyramids
-from cirl_marl.controllers.rollout import episode_start, rollout
+from cirl_marl.controllers.rollout import rollout
 from cirl_marl.definitions.reading import write_network
 from cirl_marl.dynamics.stages import staged
+from cirl_marl.evaluation.simulations import simulate
 from cirl_marl.network import Network
 from cirl_marl.network.ages import remaining
 from cirl_marl.network.elements import Lifetime
@@ -361,9 +362,7 @@ def test_a_stretch_that_agents_set_makes_stocks_older() -> None:
 def test_an_episode_is_written_with_its_ages(tmp_path: Path) -> None:
     """Mean ages in the table, masses by age in a second one, and a picture."""
     env = MultiAgentVectorEnv(town(LIVES[0], INFLOW[:5], initial=30.0), num_envs=1)
-    begun = episode_start(env)
-    run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
-    files = write_trajectory(tmp_path, "town", env, begun, run, "a town")
+    files = write_trajectory(tmp_path, "town", simulate(env.network), "a town")
     assert [path.name for path in files] == ["town.csv", "town.png", "town_ages.csv", "town_ages.png"]
     with files[0].open(newline="") as file:
         rows = list(csv.DictReader(file))

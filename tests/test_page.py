@@ -38,7 +38,6 @@ from cirl_marl.report.report_page import (
     page_of_comparison,
     page_of_samples,
 )
-from cirl_marl.report.trajectory import trajectory_table
 
 PARTS = Path(html_module.__file__).parent / "page"
 
@@ -143,7 +142,7 @@ def test_the_page_shows_what_was_simulated(tmp_path: Path) -> None:
     """Stocks, flows, λ, service and controls are those of the CSV file, to six digits; start and units included."""
     (found,) = simulate_alternatives(bottles_at(tmp_path))
     told = page_data(page_of_alternatives([found]))
-    header, rows = trajectory_table(found.env, found.begun, found.rollout)
+    header, rows = found.table()
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
     (scene,), (network,) = told["scenes"], told["networks"]
     for node, values in zip(network["nodes"], scene["levels"], strict=True):

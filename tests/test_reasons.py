@@ -20,6 +20,7 @@ import cirl_marl
 from cirl_marl import CirlError, MultiAgentVectorEnv, Network, RunError, load_network
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.controllers.rollout import first_seed
+from cirl_marl.evaluation.assessment import evaluate
 from cirl_marl.learners import train
 from cirl_marl.learners.interface import Trained
 from cirl_marl.learners.policies import DifferentiablePolicy, Policies, Policy
@@ -34,7 +35,7 @@ from cirl_marl.reasons.rules import distil_rules
 from cirl_marl.reasons.sentences import input_sentence, rule_sentences
 from cirl_marl.report.explanations import read_reasons, write_reasons
 from cirl_marl.report.page_html import page_html
-from cirl_marl.report.run import evaluate_story
+from cirl_marl.report.run import page_of_evaluation
 
 Floats = NDArray[np.floating]
 FIRST = first_seed(0)
@@ -226,7 +227,7 @@ def test_a_run_is_explained_and_written(tmp_path: Path) -> None:
     shares = [float(row["share"]) for row in rows if row["agent"] == "use_to_collection"]
     assert sum(shares) == pytest.approx(1.0) and shares == sorted(shares, reverse=True)
     assert "another checkpoint" in read_reasons(run, "000000001-best")[1]
-    (_, _, _), story = evaluate_story(run, episodes=2, seed=0, progress=lambda what, share: None)
+    story = page_of_evaluation(evaluate(run, episodes=2))
     assert shown(page_html(story))["reasons"][1]["title"] == "Manufacture of products"
     told = json.loads((own_copper_run / "reasons" / "reasons.json").read_text())
     (own_copper_run / "reasons" / "reasons.json").write_text(json.dumps({**told, "sections": 3}))

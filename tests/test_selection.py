@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from cirl_marl import MultiAgentVectorEnv, RecipeError, RunError
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation import compare
+from cirl_marl.evaluation.assessment import acting_checkpoint
 from cirl_marl.learners import RunDirectory, resume, train
 from cirl_marl.learners.interface import Trained
 from cirl_marl.learners.recipe import LearnerSettings, Recipe, Run
 from cirl_marl.learners.validation import FIRST_SEED, LARGEST_MULTIPLIER, Score, ServiceMultiplier, ValidationEpisodes
-from cirl_marl.report.run import choice
 
 HORIZON, STEPS = 6, 96
 
@@ -66,7 +66,7 @@ def test_the_best_checkpoint_acts(tmp_path: Path, demanded: float | None) -> Non
     assert float(levels.mean(axis=0).min()) == pytest.approx(rows[best]["service"])
     spread = 1.645 * levels.std(axis=0, ddof=1) / np.sqrt(3)
     assert float((levels.mean(axis=0) - spread).min()) == pytest.approx(rows[best]["assured"])
-    said = choice(run)
+    said = acting_checkpoint(run)
     assert f"after {12 * (best + 1)} environment steps, the best of 8 evaluations" in said
     assert ("none assured the service of 1" in said) == (demanded == 1.0)
     assert compare([run], ("neutral",), episodes=2, bounds=False).entries[0].checkpoint == run.chosen.name
@@ -93,7 +93,7 @@ def test_without_evaluations_the_last_checkpoint_acts(tmp_path: Path) -> None:
     """And the same is learnt: evaluating changes nothing."""
     run, other = learnt(tmp_path / "a", recipe(evaluations=0)), learnt(tmp_path / "b", recipe())
     assert run.chosen == run.checkpoint
-    assert choice(run) == "who acts: the last checkpoint, after 96 environment steps"
+    assert acting_checkpoint(run) == "who acts: the last checkpoint, after 96 environment steps"
     assert not evaluations(run)
     kept = list(run.checkpoint.glob("*"))
     assert len(kept) > 3

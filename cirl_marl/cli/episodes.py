@@ -24,17 +24,11 @@ from cirl_marl.cli.common import (
     say,
     stem,
 )
-from cirl_marl.controllers import Controller
-from cirl_marl.controllers.basic import ProgressController
-from cirl_marl.controllers.rollout import EpisodeStart, Rollout
-from cirl_marl.controllers.shortages import service_shortages, shortages
-from cirl_marl.definitions.catalogue import file_and_region, load_network, networks
-from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluation.figures import time_window
-from cirl_marl.evaluation.simulations import Simulation, rank_quantities, simulate_alternatives
-from cirl_marl.network import Network
-from cirl_marl.optimum.registry import CONTROLLERS, SETTABLE, named_controller
+from cirl_marl.evaluation.quantities import rank_quantities
+from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
+from cirl_marl.optimum.registry import CONTROLLERS, SETTABLE
 
 
 @app.command(rich_help_panel=EPISODES)
@@ -146,8 +140,8 @@ def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
 
     ((name, only),) = files.items()
     title = f"{only.network.title or only.network.name}, {only.control} control"
-    written = write_trajectory(folder, name, only.env, only.begun, only.rollout, title)
-    _say_figures(only.rollout, only.network, only.begun)
+    written = write_trajectory(folder, name, only, title)
+    _say_lines(str(only))
     say(f"wrote {', '.join(map(str, written))}")
 
 
@@ -161,7 +155,7 @@ def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
     title = f"{network.name}, {controls[0]} control" if len(controls) == 1 else network.name
     written = write_alternatives(folder, f"{network.name}_differences", files, quantities, title=title)
     for each in found:
-        _say_figures(each.rollout, each.network, each.begun, f"{each.name}: ")
+        _say_lines(str(each), f"{each.name}: ")
     if differing := [each for each in quantities if each.rank > 0]:
         console.print(differences_table(found, differing))
     more = f", of which {ROWS} are shown" if len(differing) > ROWS else ""
@@ -195,73 +189,35 @@ def plan(
     level. The workbook beside it (.xlsx) has the decisions in words, with stocks and flows, as planned and as usual;
     the picture (.png) the levers that differ most.
     """
-    from cirl_marl.controllers.schedule import schedule
+    from cirl_marl.evaluation import plans
     from cirl_marl.report.decisions import decisions_table, savings_table, write_decisions
 
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     page = page_for(html)
-    env, controller = _actor(source, control, scenario, min_service)
-    who = Path(source).resolve().name if control is None else stem(env.network, control)
-    path = Path(f"plan_{who}.csv") if out is None else out
     with bar("planning") as progress:
-        watched = ProgressController(controller, progress)
-        found = schedule(env, watched, seed=seed, progress=watched.acted)
+        found = plans.plan(source, control, scenario=scenario, min_service=min_service, seed=seed, progress=progress)
+    network = found.network
+    who = Path(source).resolve().name if control is None else stem(network, control)
+    path = Path(f"plan_{who}.csv") if out is None else out
     path.parent.mkdir(parents=True, exist_ok=True)
     found.write(path)
-    title = f"{env.network.title or env.network.name}: {'what was learnt' if control is None else control}"
-    beside = write_decisions(path, found, title=title)
+    beside = write_decisions(path, found, title=f"{network.title or network.name}: {control or 'what was learnt'}")
     if page is not None:
         from cirl_marl.report.page_html import write_page
-        from cirl_marl.report.report_page import PLAN, page_of_schedule
+        from cirl_marl.report.report_page import page_of_schedule
 
-        name = "trained" if control is None else PLAN if control == "optimum" and not controller.note else control
-        beside.append(write_page(page, page_of_schedule(found, name, note=controller.note)))
+        beside.append(write_page(page, page_of_schedule(found)))
     console.print(decisions_table(found))
     console.print(savings_table(found))
-    _say_figures(found.rollout, env.network, found.episode_start)
-    usual = float(found.usual.episode_circularity[0])
-    say(f"as usual: λ̄ = {usual:.5g} {env.network.mass_unit}, service level {float(found.usual.episode_service[0]):.4f}")
-    if controller.note:
-        say(controller.note)
+    _say_lines(str(found))
     say(f"wrote {', '.join(map(str, (path, *beside)))}")
 
 
-def _actor(
-    source: str, control: str | None, scenario: str | None, min_service: float | None
-) -> tuple[MultiAgentVectorEnv, Controller]:
-    if control is not None and (Path(source) / "config.json").is_file():
-        raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
-    if control is not None:
-        return MultiAgentVectorEnv(source, num_envs=1, scenario=scenario), named_controller(
-            control, min_service=min_service
-        )
-    if source in networks() or file_and_region(source):
-        raise CirlError(f"plan {source}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
-    if scenario is not None or min_service is not None:
-        raise CirlError("--scenario and --min-service go with --control; a run has its own scenario and policies")
-    from cirl_marl.learners.interface import Trained
-    from cirl_marl.learners.run_directory import RunDirectory
-
-    run = RunDirectory(source)
-    return run.make_env(1), Trained(run)
-
-
-def _say_figures(run: Rollout, network: Network, begun: EpisodeStart, who: str = "") -> None:
-    """Say where an episode began, what came of it, and which flows were less than was asked for; ``who`` goes first."""
-    say(f"{who}start: {begun.description}")
-    figures = [
-        f"λ̄ = {float(run.episode_circularity[0]):.5g} {network.mass_unit}",
-        f"service level {float(run.episode_service[0]):.4f}",
-    ]
-    if network.objective.criticality is not None:
-        figures.append(f"time-window circularity {float(time_window(network, run)[0]):.5g} {network.mass_unit}")
-    console.print(who + ", ".join(figures))
-    if len(network.services) > 1:
-        each = zip(network.services, run.episode_levels[0].tolist(), strict=True)
-        say(f"{who}service levels: {', '.join(f'{service.id} {level:.4f}' for service, level in each)}")
-    for said in (*(short.description for short in shortages(run, network)), *service_shortages(run, network)):
-        say(f"{who}{said}")
+def _say_lines(text: str, who: str = "") -> None:
+    """Print the lines of a text; ``who`` goes first in each."""
+    for line in text.splitlines():
+        say(who + line)
 
 
 def _held(controls: Sequence[str], settings: list[str]) -> dict[str, float]:

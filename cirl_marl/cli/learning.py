@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,15 +24,17 @@ from cirl_marl.cli.common import (
     shares,
     training_bar,
 )
-from cirl_marl.controllers.rollout import Rollout
-from cirl_marl.controllers.shortages import service_shortages, shortages
+from cirl_marl.controllers.outcome import lacking
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES, Standing, run_jobs
-from cirl_marl.network import Network
 from cirl_marl.network.elements import OBSERVE, REWARDS
 
+EVALUATED = 0.6
+"""Share of the evaluation in the work on a page; the rest is to plan."""
+
 if TYPE_CHECKING:
+    from cirl_marl.evaluation.assessment import Evaluation
     from cirl_marl.paper.results import PaperRow, Results
 
 
@@ -124,18 +126,17 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
 
     The gap is to an upper bound, which no episode from the same start that serves at least as well exceeds.
     """
-    from cirl_marl.learners.run_directory import RunDirectory
-    from cirl_marl.report.run import choice, evaluate_run
+    from cirl_marl.evaluation import assessment
     from cirl_marl.report.terminal import evaluation_table, local_returns_table
 
     with shares() as progress:
-        figures, rollouts, env = evaluate_run(RunDirectory(run), episodes=episodes, seed=seed, progress=progress)
+        evaluation = assessment.evaluate(run, episodes=episodes, seed=seed, progress=progress)
+    figures = evaluation.figures
+    _write_figures(evaluation)
     console.print(evaluation_table(figures))
     console.print(local_returns_table(figures))
-    say(choice(RunDirectory(run)))
-    _say_shortages(rollouts, env.network)
-    if "not_written" in figures:
-        say(f"evaluation.json could not be written: {figures['not_written']}")
+    say(assessment.acting_checkpoint(evaluation.run))
+    _say_lacking(evaluation)
     if "no_bound" in figures:
         say(f"gap to bound: {figures['no_bound']}")
 
@@ -262,35 +263,51 @@ def what_is_kept(directory: Path) -> str:
     return f"what was learnt in the first {status['joint_steps'] * run.config.envs:,} steps is saved. {go_on}"
 
 
-def _say_shortages(rollouts: Mapping[str, Rollout], network: Network) -> None:
+def _write_figures(evaluation: Evaluation) -> None:
+    """Keep the figures in the run, or say why they cannot be kept there."""
+    try:
+        evaluation.write()
+    except OSError as error:
+        say(f"evaluation.json could not be written: {error}")
+
+
+def _say_lacking(evaluation: Evaluation) -> None:
     """Say under which control flows and services were less than was asked for, as means over the episodes."""
-    for name, run in rollouts.items():
-        for said in (*(short.description for short in shortages(run, network)), *service_shortages(run, network)):
-            say(f"{name}: {said}")
+    for name, rollout in evaluation.rollouts.items():
+        for line in lacking(evaluation.env.network, rollout):
+            say(f"{name}: {line}")
 
 
 def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | None = None) -> None:
     """Evaluate a run, say what came of it and draw its pictures; with ``page`` also hold it against the best."""
-    from cirl_marl.learners.run_directory import RunDirectory
-    from cirl_marl.report.run import choice, draw_run, evaluate_run, evaluate_story
+    from cirl_marl.evaluation import assessment
+    from cirl_marl.evaluation.comparison import part_of
+    from cirl_marl.report.report_page import PLAN
+    from cirl_marl.report.run import draw_run, page_of_evaluation
     from cirl_marl.report.terminal import evaluation_table
 
-    run, story = RunDirectory(directory), None
+    share = 1.0 if page is None else EVALUATED
     with shares() as progress:
-        if page is None:
-            figures, rollouts, env = evaluate_run(run, episodes=episodes, seed=seed, bounds=False, progress=progress)
-        else:
-            (figures, rollouts, env), story = evaluate_story(run, episodes=episodes, seed=seed, progress=progress)
-    console.print(evaluation_table(figures))
-    say(choice(run))
-    _say_shortages(rollouts, env.network)
-    for path in draw_run(run, rollouts, env):
+        evaluation = assessment.evaluate(
+            directory,
+            episodes=episodes,
+            seed=seed,
+            bounds=page is not None,
+            progress=lambda what, part: progress(what, share * part),
+        )
+        story = None if page is None else page_of_evaluation(evaluation, part_of(progress, PLAN, share, 1 - share))
+    _write_figures(evaluation)
+    console.print(evaluation_table(evaluation.figures))
+    say(assessment.acting_checkpoint(evaluation.run))
+    _say_lacking(evaluation)
+    for path in draw_run(evaluation):
         say(f"picture: {path}")
     if page is not None and story is not None:
         from cirl_marl.report.page_html import write_page
 
         say(f"wrote {write_page(page, story)}")
+    run = evaluation.run
     if not run.metrics()["env_steps"]:
-        needed = run.config.envs * env.network.episode.horizon
+        needed = run.config.envs * evaluation.env.network.episode.horizon
         say(f"no learning curves, as no episode ended: {run.config.envs} copies need {needed:,} steps")
     say(f"run: {directory}  (figures in evaluation.json; gap to the bound and more: cirl evaluate {directory})")

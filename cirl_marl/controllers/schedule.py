@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cirl_marl.controllers.basic import Arrays, Controller, Neutral
+from cirl_marl.controllers.outcome import outcome_lines
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
@@ -24,7 +25,8 @@ class Schedule:
     """One episode: the network, a header with units, columns of shape (columns, steps), its start, and the rollout.
 
     ``usual`` is what becomes of the same start if nobody acts, ``agents`` are those who do. It begins with the stocks
-    ``start``, shape (stores,), mass.
+    ``start``, shape (stores,), mass. ``control`` names who acts, empty for learnt policies; ``note`` is what has to be
+    said beside the figures.
     """
 
     network: Network
@@ -35,6 +37,15 @@ class Schedule:
     usual: Rollout
     agents: tuple[str, ...]
     start: Floats
+    control: str = ""
+    note: str = ""
+
+    def __str__(self) -> str:
+        """Say where the episode begins, what comes of it, and what business as usual would have come to."""
+        usual = f"λ̄ = {float(self.usual.episode_circularity[0]):.5g} {self.network.mass_unit}"
+        usual += f", service level {float(self.usual.episode_service[0]):.4f}"
+        lines = [*outcome_lines(self.network, self.rollout, self.episode_start), f"as usual: {usual}"]
+        return "\n".join([*lines, self.note] if self.note else lines)
 
     def write(self, path: Path) -> None:
         """Write a CSV file, whole or not at all; a ``CirlError`` says so if its folder is not there.

@@ -1,4 +1,4 @@
-"""Alternatives of a network, which are scenarios and controllers from the same seed, and what differs between them."""
+"""Simulated episodes of a network, and alternatives: scenarios and controllers from the same seed."""
 
 from __future__ import annotations
 
@@ -8,30 +8,21 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.controllers.basic import ProgressController
-from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, rollout
+from cirl_marl.controllers.basic import Controller, ProgressController
+from cirl_marl.controllers.outcome import outcome_lines
+from cirl_marl.controllers.pyramids import pyramids
+from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.calendar import labels
 from cirl_marl.network.declared import itemised
-from cirl_marl.optimum.bounds import relative
 from cirl_marl.optimum.registry import SETTABLE, named_controller
-
-ROUND_OFF = 1e-12
-"""Share of the largest value of its kind by which a quantity may differ and yet count as the same."""
-
-QuantityKind = Literal["circularity", "service", "flow", "stock"]
-NAMES: Mapping[QuantityKind, str] = {
-    "circularity": "mean circularity",
-    "service": "mean level of service {}",
-    "flow": "total flow of {}",
-    "stock": "final stock of {}",
-}
-"""What quantities are called, {} standing for the id of the service, arc or node."""
+from cirl_marl.records.files import write_atomically, write_table
 
 
 @itemised
@@ -42,7 +33,7 @@ class Simulation:
     name: Annotated[str, "scenario, controller or both, whichever there are several of; empty if it is alone"]
     control: Annotated[str, "name of the controller"]
     env: Annotated[MultiAgentVectorEnv, "one copy, in which it was simulated; alternatives of one scenario share it"]
-    begun: Annotated[EpisodeStart, "where the episode began"]
+    episode_start: Annotated[EpisodeStart, "where the episode began"]
     start: Annotated[Floats, "stocks there, shape (stores,), mass"]
     rollout: Annotated[Rollout, "what came of it"]
 
@@ -51,50 +42,105 @@ class Simulation:
         """The network under the scenario."""
         return self.env.network
 
+    def __str__(self) -> str:
+        """Say where the episode begins and what comes of it."""
+        return "\n".join(outcome_lines(self.network, self.rollout, self.episode_start))
 
-@itemised
-@dataclass(frozen=True, slots=True)
-class ComparedQuantity:
-    """A figure of a whole episode in each of A alternatives."""
+    def table(self) -> tuple[list[str], list[list[object]]]:
+        """Return header and rows: a row for the start and one for the end of each interval.
 
-    kind: Annotated[QuantityKind, "λ̄, mean level of a service, mass that an arc moved, or stock of a node at the end"]
-    of: Annotated[str, "id of the service, arc or node; empty for λ̄"]
-    unit: Annotated[str, "that of the values"]
-    values: Annotated[Floats, "shape (A,); NaN where a scenario has no such service, arc or node"]
-    round_off: Annotated[float, "largest difference at which values count as the same"]
-
-    @property
-    def name(self) -> str:
-        """What it is, in words."""
-        return NAMES[self.kind].format(self.of)
-
-    @property
-    def differences(self) -> Floats:
-        """Differences to the first alternative, shape (A,), in the unit of the values; NaN where one is missing."""
-        difference: Floats = self.values - self.values[0]
-        return difference
-
-    @property
-    def relative_differences(self) -> Floats:
-        """Differences in units of the first value's magnitude, shape (A,); NaN where that is 0 or one is missing."""
-        return relative(self.differences, self.values[0])
-
-    @property
-    def rank(self) -> float:
-        """Largest relative difference to the first value; 0 if all count as the same.
-
-        What does not exist counts as 0, and a first value below ``round_off`` as ``round_off``.
+        Columns are year or date at the end, if the network has a start on the calendar, λ at the end and the mean of λ,
+        the service level, stocks at the end, mean flows, what passes through nodes without stock, masses on the way,
+        inner states that an agent may see and mean ages. ``env`` is left at the start of the episode.
         """
-        there = np.nan_to_num(self.values)
-        largest = float(np.abs(there - there[0]).max())
-        return largest / max(abs(float(there[0])), self.round_off) if largest > self.round_off else 0.0
+        env, run = self.env, self.rollout
+        self.episode_start.reset(env)
+        start = env.physical
+        stock, load = env.rows.stocks(start.stock)[:, 0], env.dynamics.batches.loads(start.stock)[:, 0]
+        inner = start.inner[env.dynamics.inner.visible, 0]
+        lambdas = (run.circularity[0], run.circularity_mean[0])
+        moved = (*run.flow.T, *env.network.throughput(run.flow.T))
+        ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, stock)]
+        columns = (
+            *lambdas,
+            run.service[0],
+            *run.stock.T,
+            *moved,
+            *run.load.T,
+            *run.inner.T,
+            *(age[1:] for age in ages),
+        )
+        held = [*load.tolist(), *inner.tolist(), *(float(age[0]) for age in ages)]
+        first = [*[None] * 3, *stock.tolist(), *[None] * len(moved), *held]
+        times = np.concatenate([[0.0], interval_ends(env.network)])
+        clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
+        rows = [first, *zip(*(column.tolist() for column in columns), strict=True)]
+        return self._header(), [[*at, *figures] for at, figures in zip(clock, rows, strict=True)]
+
+    def _header(self) -> list[str]:
+        network, physics = self.network, self.env.dynamics.inner
+        mass, time = network.mass_unit, network.time_unit
+        header = [f"time ({time})", *(f"{calendar} at the end" for calendar in labels(network, 0.0)[0])]
+        header += [f"circularity at the end ({mass})", f"mean circularity ({mass})", "service level"]
+        header += [f"stock of {node.id} ({mass})" for node in network.stores]
+        header += [f"flow of {arc.id} ({mass}/{time})" for arc in network.arcs]
+        header += [f"throughput of {node.id} ({mass}/{time})" for node in network.nodes if not node.stores]
+        header += [f"mass on {line.id} ({mass})" for line in self.env.dynamics.batches.lines]
+        header += [physics.names[row] for row in physics.visible]
+        return [*header, *(f"mean age of {node.id} ({time})" for node in network.stores if node.lifetime is not None)]
+
+    def write(self, path: str | Path) -> Path:
+        """Write ``table`` to a CSV file, whole or not at all, and return its path; missing folders are made."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, lambda partial: write_table(partial, *self.table()))
+        return path
+
+
+def simulate(
+    network: str | Path | Network,
+    control: str | Controller = "neutral",
+    *,
+    scenario: str | None = None,
+    held: Mapping[str, float] | None = None,
+    steps: int | None = None,
+    seed: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Simulation:
+    """Simulate one episode of a network under one controller, without learning.
+
+    >>> import cirl_marl
+    >>> simulation = cirl_marl.simulate("net_zero", "scripted", steps=20)
+    >>> simulation.rollout.flow.shape == (20, len(simulation.network.arcs))
+    True
+
+    Args:
+        network: catalogue name, path of a definition file, or a network.
+        control: who acts: a name of CONTROLLERS, or a controller.
+        scenario: of the definition; None is the default, physical one.
+        held: agent → constant value in [−1, 1], for constant or scripted control.
+        steps: control intervals of the episode; None takes the definition's.
+        seed: of the evaluation whose first episode is simulated; None begins in the middle of all initial ranges.
+        progress: called with the share of the work that is done.
+
+    Returns:
+        The episode, with λ (mass), service levels, stocks (mass) and flows (mass/time) of each interval in
+        ``rollout``; ``write`` makes a CSV file of them.
+
+    Raises:
+        CirlError: if scenario or controller is unknown, does not fit the network, or does not take ``held``.
+    """
+    (only,) = simulate_alternatives(
+        network, scenarios=[scenario], controls=[control], held=held, steps=steps, seed=seed, progress=progress
+    )
+    return only
 
 
 def simulate_alternatives(
     network: str | Path | Network,
     *,
     scenarios: Sequence[str | None] = (None,),
-    controls: Sequence[str] = ("neutral",),
+    controls: Sequence[str | Controller] = ("neutral",),
     held: Mapping[str, float] | None = None,
     steps: int | None = None,
     seed: int | None = None,
@@ -108,7 +154,7 @@ def simulate_alternatives(
     Args:
         network: catalogue name, path of a definition file, or a network.
         scenarios: of the definition; None is the default, physical one.
-        controls: names of controllers, of CONTROLLERS.
+        controls: names of CONTROLLERS, or controllers.
         held: agent → constant value in [−1, 1], for those of the controllers that take such values.
         steps: control intervals of each episode; None takes the definition's.
         seed: of the evaluation whose first episode is simulated; None begins in the middle of all initial ranges.
@@ -123,12 +169,19 @@ def simulate_alternatives(
             controller cannot act in a scenario; names it.
     """
     envs = [MultiAgentVectorEnv(network, num_envs=1, scenario=scenario, horizon=steps) for scenario in scenarios]
-    _refuse(envs, controls, held)
-    cases = list(product(envs, controls))
-    controllers = [named_controller(control, constants=held if control in SETTABLE else None) for _, control in cases]
+    names = [control if isinstance(control, str) else type(control).__name__ for control in controls]
+    _refuse(envs, names, held)
+    cases = list(product(envs, names))
+    controllers = [
+        named_controller(control, constants=held if control in SETTABLE else None)
+        if isinstance(control, str)
+        else control
+        for _ in envs
+        for control in controls
+    ]
     simulated = []
     for i, ((env, control), controller) in enumerate(zip(cases, controllers, strict=True)):
-        choices = ((env.network.scenario_name, envs), (control, controls))
+        choices = ((env.network.scenario_name, envs), (control, names))
         name = ", ".join(chosen for chosen, among in choices if len(among) > 1)
         watched = ProgressController(controller, partial(_tell, progress, i, len(cases)))
         try:
@@ -138,6 +191,12 @@ def simulate_alternatives(
                 raise
             raise CirlError(f"{name}: {error}") from error
     return simulated
+
+
+def _controller(control: str | Controller, held: Mapping[str, float] | None) -> Controller:
+    if isinstance(control, Controller):
+        return control
+    return named_controller(control, constants=held if control in SETTABLE else None)
 
 
 def _refuse(envs: Sequence[MultiAgentVectorEnv], controls: Sequence[str], held: Mapping[str, float] | None) -> None:
@@ -189,35 +248,3 @@ def _obstacles(one: Network, other: Network) -> Iterator[str]:
         )
         advice = "; give a number of steps for both" if ours.control_interval == theirs.control_interval else ""
         yield f"horizon {mine} and {its}{advice}"
-
-
-def rank_quantities(found: Sequence[Simulation]) -> list[ComparedQuantity]:
-    """Return the figures of episodes of ``simulate_alternatives``, those first that differ most.
-
-    They are λ̄, the mean level of each service, the mass that each arc moved in the episode, and the stock of each node
-    at the end.
-
-    The order is that of ``ComparedQuantity.rank``. Round-off is ``ROUND_OFF`` of the largest value of the same kind.
-    """
-    figures = [_figures(each) for each in found]
-    quantities: list[ComparedQuantity] = []
-    for kind in NAMES:
-        ids = list(dict.fromkeys(id_ for each in figures for id_ in each[kind]))
-        values = np.array([[each[kind].get(id_, math.nan) for each in figures] for id_ in ids])
-        unit = "1" if kind == "service" else found[0].network.mass_unit
-        round_off = ROUND_OFF * float(np.abs(np.nan_to_num(values)).max(initial=0.0))
-        quantities += (ComparedQuantity(kind, id_, unit, row, round_off) for id_, row in zip(ids, values, strict=True))
-    return sorted(quantities, key=lambda quantity: -quantity.rank)
-
-
-def _figures(alternative: Simulation) -> dict[QuantityKind, dict[str, float]]:
-    """Return the figures of an episode by kind and id."""
-    network, run = alternative.network, alternative.rollout
-    duration = network.episode.horizon * network.episode.control_interval
-    levels, moved, stocks = run.episode_levels[0], run.mean_flow * duration, run.final_stock
-    return {
-        "circularity": {"": float(run.episode_circularity[0])},
-        "service": dict(zip((service.id for service in network.services), levels.tolist(), strict=True)),
-        "flow": dict(zip((arc.id for arc in network.arcs), moved.tolist(), strict=True)),
-        "stock": dict(zip((node.id for node in network.stores), stocks.tolist(), strict=True)),
-    }

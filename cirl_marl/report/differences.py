@@ -12,12 +12,12 @@ from rich.table import Table
 
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import DASHES, SERIES, axis_time, readable, save, style_axes, time_axis
-from cirl_marl.evaluation.simulations import ComparedQuantity, Simulation
+from cirl_marl.evaluation.quantities import ComparedQuantity
+from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import defined
 from cirl_marl.network import Floats, Network
 from cirl_marl.records.files import published, write_table
 from cirl_marl.report.curves import WIDTH
-from cirl_marl.report.trajectory import trajectory_table
 
 ROWS = 12
 """Largest number of quantities in a table on screen."""
@@ -56,7 +56,7 @@ def write_alternatives(
     Args:
         folder: where to write; it is made if it is not there.
         name: stem of ``name.csv``, with every quantity, and of the picture ``name.png``.
-        files: the alternatives by the stem of a CSV file each, which holds what ``trajectory_table`` returns.
+        files: the alternatives by the stem of a CSV file each, which holds its table.
         quantities: what ``rank_quantities`` found in them.
         title: heading of the picture.
     """
@@ -66,7 +66,7 @@ def write_alternatives(
         header += [each.name, f"difference of {each.name}", f"relative difference of {each.name}"]
     with published(folder) as partial:
         for stem, each in files.items():
-            write_table(partial / f"{stem}.csv", *trajectory_table(each.env, each.begun, each.rollout))
+            write_table(partial / f"{stem}.csv", *each.table())
         write_table(partial / f"{name}.csv", header, map(_row, quantities))
         save_alternatives(partial / f"{name}.png", found, quantities, title=title)
     return [folder / file for file in (*(f"{stem}.csv" for stem in files), f"{name}.csv", f"{name}.png")]

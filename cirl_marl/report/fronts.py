@@ -68,7 +68,7 @@ def _aggregate(found: Aggregate | None, form: str) -> str:
     return f"{value}\n[{form.format(found.low)}, {form.format(found.high)}]"
 
 
-def save_comparison(path: str | Path, comparison: Comparison) -> Path:
+def save_comparison(path: str | Path, comparison: Comparison, *, title: str = "") -> Path:
     """Save where each policy and controller of a comparison is, training seed by training seed."""
     series = [
         PointSeries(
@@ -78,7 +78,7 @@ def save_comparison(path: str | Path, comparison: Comparison) -> Path:
         )
         for row in comparison.rows
     ]
-    title = f"{comparison.network.title or comparison.network.name}: {comparison.episodes} episodes"
+    title = title or f"{comparison.network.title or comparison.network.name}: {comparison.episodes} episodes"
     return save_fronts(path, comparison.network, series, comparison.baseline.front, title=title)
 
 
@@ -154,9 +154,14 @@ def write_front(sweep: ParetoFront, folder: Path, **options: Any) -> list[Path]:
     with published(folder) as partial:
         write_table(partial / PARETO_FILES[0], header, plain)
         write_json(partial / PARETO_FILES[1], about | {"columns": header, "points": plain})
-        title = f"{sweep.network.title or sweep.network.name}: service against circularity"
-        save_fronts(partial / PARETO_FILES[2], sweep.network, list(_series(sweep)), sweep.front, title=title)
+        save_pareto(partial / PARETO_FILES[2], sweep)
     return [folder / name for name in PARETO_FILES]
+
+
+def save_pareto(path: str | Path, front: ParetoFront, *, title: str = "") -> Path:
+    """Save service against circularity as a PNG and return its path."""
+    title = title or f"{front.network.title or front.network.name}: service against circularity"
+    return save_fronts(path, front.network, list(_series(front)), front.front, title=title)
 
 
 def _series(sweep: ParetoFront) -> Iterator[PointSeries]:

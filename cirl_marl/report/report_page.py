@@ -96,7 +96,7 @@ def page_of_alternatives(found: Sequence[Simulation]) -> ReportPage:
         for each in found
     ]
     network = found[0].network
-    return ReportPage(_title(network), network, tuple(scenes), notes=(f"Start: {found[0].begun.description}.",))
+    return ReportPage(_title(network), network, tuple(scenes), notes=(f"Start: {found[0].episode_start.description}.",))
 
 
 def page_of_samples(found: SampledEpisodes, control: str) -> ReportPage:
@@ -118,9 +118,10 @@ def page_of_samples(found: SampledEpisodes, control: str) -> ReportPage:
     return ReportPage(_title(network), network, (scene,), notes=(note,))
 
 
-def page_of_schedule(found: Schedule, name: str, *, note: str = "") -> ReportPage:
+def page_of_schedule(found: Schedule) -> ReportPage:
     """Return the page of ``cirl plan``: business as usual, and what is planned."""
-    network, start = found.network, found.start
+    network, start, note = found.network, found.start, found.note
+    name = PLAN if found.control == "optimum" and not note else found.control or "trained"
     scenes = (
         _scene(USUAL, network, found.agents, start, found.usual),
         _scene(name, network, found.agents, start, found.rollout),

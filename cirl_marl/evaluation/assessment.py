@@ -1,0 +1,133 @@
+"""Evaluation of a training run: its policies beside neutral and random control, in the same fresh episodes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cirl_marl.controllers.rollout import Rollout
+from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.errors import RunError
+from cirl_marl.evaluation.comparison import Comparison, compare
+from cirl_marl.evaluation.figures import summary
+from cirl_marl.evaluation.statistics import over_episodes
+from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.records.files import write_json
+
+CONTROLLERS = ("neutral", "random")
+"""Whom a run is compared with."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What came of the policies of a run, and of neutral and random control, in the same episodes.
+
+    Attributes:
+        run: the run whose policies acted.
+        comparison: all episodes, and the bounds that they are held against.
+        bounded: whether bounds were asked for.
+        figures: means over episodes with their 95 % confidence intervals, ready for JSON.
+        env: environment of the run, with as many copies as there were episodes.
+    """
+
+    run: RunDirectory
+    comparison: Comparison
+    bounded: bool
+    figures: Mapping[str, Any]
+    env: MultiAgentVectorEnv
+
+    @property
+    def rollouts(self) -> dict[str, Rollout]:
+        """The episodes of ``trained``, ``neutral`` and ``random``."""
+        entries = zip(("trained", *CONTROLLERS), self.comparison.entries, strict=True)
+        return {name: entry.rollout for name, entry in entries}
+
+    def __str__(self) -> str:
+        """Say for each controller what λ̄, service level and gap were."""
+        lines, unit = [], self.figures["unit"]
+        for name, figures in self.figures["controllers"].items():
+            line = f"{name}: λ̄ {figures['circularity']['value']:.5g} {unit}"
+            line += f", service level {figures['service_level']['value']:.4f}"
+            gap = figures.get("gap", {}).get("value")
+            lines.append(line + (f", gap to the bound {gap:.1%}" if gap is not None else ""))
+        return "\n".join([*lines, acting_checkpoint(self.run)])
+
+    def write(self, path: str | Path | None = None) -> Path:
+        """Write the figures as JSON and return the path, that of ``evaluation.json`` in the run unless one is given.
+
+        The file in the run is left as it is if this evaluation has no bounds and the file is of the same checkpoint in
+        the same episodes, as it may have them.
+        """
+        kept = self.run.path / "evaluation.json"
+        if path is not None or self.bounded or not self._is_kept(kept):
+            write_json(kept if path is None else Path(path), self.figures)
+        return kept if path is None else Path(path)
+
+    def _is_kept(self, path: Path) -> bool:
+        try:
+            kept = json.loads(path.read_text()) if path.is_file() else {}
+        except ValueError as error:
+            raise RunError(f"{path}: cannot be read: {error}; delete it to evaluate anew") from error
+        return all(kept.get(name) == self.figures[name] for name in ("checkpoint", "episodes", "first_seed"))
+
+
+def evaluate(
+    run: str | Path | RunDirectory,
+    *,
+    episodes: int = 64,
+    seed: int = 0,
+    bounds: bool = True,
+    progress: Callable[[str, float], None] = lambda what, share: None,
+) -> Evaluation:
+    """Compare the trained policies of a run with neutral and random control on fresh episodes.
+
+    Args:
+        run: directory of a training run.
+        episodes: how many, at least 2.
+        seed: different seeds share no episode.
+        bounds: whether to hold the episodes against the best possible, which takes longer than the episodes.
+        progress: called with what is being done and the share of all that is done.
+
+    Raises:
+        CirlError: if ``episodes`` or ``seed`` cannot be used.
+        RunError: if the run is incomplete.
+    """
+    run = run if isinstance(run, RunDirectory) else RunDirectory(run)
+    comparison = compare([run], CONTROLLERS, episodes=episodes, seed=seed, bounds=bounds, progress=progress)
+    entries = dict(zip(("trained", *CONTROLLERS), comparison.entries, strict=True))
+    env = run.make_env(episodes)
+    figures = summary(env, {name: entry.rollout for name, entry in entries.items()})
+    for name, entry in entries.items():
+        if entry.bound is not None and entry.gap is not None:
+            figures["controllers"][name] |= {
+                "bound": over_episodes(entry.bound).as_dict(),
+                "gap": over_episodes(entry.gap, (0.0, np.inf)).as_dict(),
+            }
+    if comparison.baseline.reason:
+        figures["no_bound"] = comparison.baseline.reason
+    config = run.config
+    figures |= {"network": config.network, "recipe": config.recipe.name, "first_seed": comparison.first_seed}
+    figures["checkpoint"] = entries["trained"].checkpoint
+    return Evaluation(run, comparison, bounds, figures, env)
+
+
+def acting_checkpoint(run: RunDirectory) -> str:
+    """Say which checkpoint of a run acts, and by what it was chosen."""
+    status, config, network = run.status, run.config, run.network()
+    best = status["best"]
+    if best is None:
+        return f"who acts: the last checkpoint, after {status['joint_steps'] * config.envs:,} environment steps"
+    figures, demand = best["figures"], config.recipe.run.min_service
+    sentence = (
+        f"who acts: the checkpoint after {best['joint_steps'] * config.envs:,} environment steps, the best of "
+        f"{run.evaluations()} evaluations (λ̄ {figures['circularity']:.4g} {network.mass_unit}, "
+        f"lowest service {figures['service']:.4f})"
+    )
+    if demand is not None and figures["assured"] < demand:
+        sentence += f"; none assured the service of {demand:g} that the recipe demands"
+    return sentence

@@ -1,0 +1,91 @@
+"""Plans: what the policies of a run or a controller do in one episode, beside the same episode without them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
+from cirl_marl.controllers import Controller
+from cirl_marl.controllers.basic import ProgressController
+from cirl_marl.controllers.schedule import Schedule, schedule
+from cirl_marl.definitions.catalogue import file_and_region, networks
+from cirl_marl.environments.vector import MultiAgentVectorEnv
+from cirl_marl.errors import CirlError
+from cirl_marl.learners.run_directory import RunDirectory
+from cirl_marl.network import Network
+from cirl_marl.optimum.registry import CONTROLLERS, named_controller
+
+
+def plan(
+    source: str | Path | Network | RunDirectory,
+    control: str | Controller | None = None,
+    *,
+    scenario: str | None = None,
+    min_service: ArrayLike | None = None,
+    seed: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Schedule:
+    """Return what a policy or controller does in one episode, beside business as usual.
+
+    >>> import cirl_marl
+    >>> found = cirl_marl.plan("net_zero", "scripted")
+    >>> found.header[:2], found.columns.shape[1]
+    (('from (day)', 'to (day)'), 60)
+
+    Args:
+        source: directory of a training run, whose policies act; or catalogue name, definition file or network.
+        control: who acts in a network: a name of CONTROLLERS, or a controller; None for a run.
+        scenario: of the definition; None is the default, physical one.
+        min_service: mean level of every service, or of each, shape (services,), that ``mpc`` and ``optimum`` plan for,
+            a share in [0, 1]; None: as much as can be had.
+        seed: of the evaluation whose first episode is planned; None begins in the middle of all initial ranges.
+        progress: called with the share of the work that is done.
+
+    Returns:
+        The table of all controls, flows, λ and service level, a row for each control interval; ``write`` makes it a
+        CSV file.
+
+    Raises:
+        CirlError: for input that cannot be used, a controller that does not fit the network, or a solver that fails.
+        RunError: if the run is incomplete.
+    """
+    env, controller = _environment_and_controller(source, control, scenario, min_service)
+    watched = ProgressController(controller, progress)
+    table = schedule(env, watched, seed=seed, progress=watched.acted)
+    name = type(control).__name__ if isinstance(control, Controller) else control or ""
+    return replace(table, control=name, note=controller.note)
+
+
+def _environment_and_controller(
+    source: str | Path | Network | RunDirectory,
+    control: str | Controller | None,
+    scenario: str | None,
+    min_service: ArrayLike | None,
+) -> tuple[MultiAgentVectorEnv, Controller]:
+    """Return one copy of the environment, and who acts in it."""
+    run = _run_of(source)
+    if control is not None:
+        if isinstance(source, RunDirectory) or (run is not None and (run.path / "config.json").is_file()):
+            raise CirlError(f"plan {source}: is a training run, which acts by its policies; leave out --control")
+        env = MultiAgentVectorEnv(source, num_envs=1, scenario=scenario)
+        return env, named_controller(control, min_service=min_service) if isinstance(control, str) else control
+    if run is None:
+        name = source.name if isinstance(source, Network) else source
+        raise CirlError(f"plan {name}: which control? --control {'|'.join(CONTROLLERS)}; only a run has policies")
+    if scenario is not None or min_service is not None:
+        raise CirlError("--scenario and --min-service go with --control; a run has its own scenario and policies")
+    from cirl_marl.learners.interface import Trained  # it needs torch
+
+    return run.make_env(1), Trained(run)
+
+
+def _run_of(source: str | Path | Network | RunDirectory) -> RunDirectory | None:
+    """Return the training run that a source names, whether or not it is there; None for a network."""
+    if isinstance(source, Network | RunDirectory):
+        return source if isinstance(source, RunDirectory) else None
+    if (Path(source) / "config.json").is_file():
+        return RunDirectory(source)
+    return None if str(source) in networks() or file_and_region(str(source)) else RunDirectory(source)

@@ -1,0 +1,97 @@
+"""What differs between simulations: figures of whole episodes, those first that differ most."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+
+from cirl_marl.evaluation.simulations import Simulation
+from cirl_marl.network import Floats
+from cirl_marl.network.declared import itemised
+from cirl_marl.optimum.bounds import relative
+
+ROUND_OFF = 1e-12
+"""Share of the largest value of its kind by which a quantity may differ and yet count as the same."""
+
+QuantityKind = Literal["circularity", "service", "flow", "stock"]
+NAMES: Mapping[QuantityKind, str] = {
+    "circularity": "mean circularity",
+    "service": "mean level of service {}",
+    "flow": "total flow of {}",
+    "stock": "final stock of {}",
+}
+"""What quantities are called, {} standing for the id of the service, arc or node."""
+
+
+@itemised
+@dataclass(frozen=True, slots=True)
+class ComparedQuantity:
+    """A figure of a whole episode in each of A alternatives."""
+
+    kind: Annotated[QuantityKind, "λ̄, mean level of a service, mass that an arc moved, or stock of a node at the end"]
+    of: Annotated[str, "id of the service, arc or node; empty for λ̄"]
+    unit: Annotated[str, "that of the values"]
+    values: Annotated[Floats, "shape (A,); NaN where a scenario has no such service, arc or node"]
+    round_off: Annotated[float, "largest difference at which values count as the same"]
+
+    @property
+    def name(self) -> str:
+        """What it is, in words."""
+        return NAMES[self.kind].format(self.of)
+
+    @property
+    def differences(self) -> Floats:
+        """Differences to the first alternative, shape (A,), in the unit of the values; NaN where one is missing."""
+        difference: Floats = self.values - self.values[0]
+        return difference
+
+    @property
+    def relative_differences(self) -> Floats:
+        """Differences in units of the first value's magnitude, shape (A,); NaN where that is 0 or one is missing."""
+        return relative(self.differences, self.values[0])
+
+    @property
+    def rank(self) -> float:
+        """Largest relative difference to the first value; 0 if all count as the same.
+
+        What does not exist counts as 0, and a first value below ``round_off`` as ``round_off``.
+        """
+        there = np.nan_to_num(self.values)
+        largest = float(np.abs(there - there[0]).max())
+        return largest / max(abs(float(there[0])), self.round_off) if largest > self.round_off else 0.0
+
+
+def rank_quantities(found: Sequence[Simulation]) -> list[ComparedQuantity]:
+    """Return the figures of episodes of ``simulate_alternatives``, those first that differ most.
+
+    They are λ̄, the mean level of each service, the mass that each arc moved in the episode, and the stock of each node
+    at the end.
+
+    The order is that of ``ComparedQuantity.rank``. Round-off is ``ROUND_OFF`` of the largest value of the same kind.
+    """
+    figures = [_figures(each) for each in found]
+    quantities: list[ComparedQuantity] = []
+    for kind in NAMES:
+        ids = list(dict.fromkeys(id_ for each in figures for id_ in each[kind]))
+        values = np.array([[each[kind].get(id_, math.nan) for each in figures] for id_ in ids])
+        unit = "1" if kind == "service" else found[0].network.mass_unit
+        round_off = ROUND_OFF * float(np.abs(np.nan_to_num(values)).max(initial=0.0))
+        quantities += (ComparedQuantity(kind, id_, unit, row, round_off) for id_, row in zip(ids, values, strict=True))
+    return sorted(quantities, key=lambda quantity: -quantity.rank)
+
+
+def _figures(alternative: Simulation) -> dict[QuantityKind, dict[str, float]]:
+    """Return the figures of an episode by kind and id."""
+    network, run = alternative.network, alternative.rollout
+    duration = network.episode.horizon * network.episode.control_interval
+    levels, moved, stocks = run.episode_levels[0], run.mean_flow * duration, run.final_stock
+    return {
+        "circularity": {"": float(run.episode_circularity[0])},
+        "service": dict(zip((service.id for service in network.services), levels.tolist(), strict=True)),
+        "flow": dict(zip((arc.id for arc in network.arcs), moved.tolist(), strict=True)),
+        "stock": dict(zip((node.id for node in network.stores), stocks.tolist(), strict=True)),
+    }
