@@ -42,21 +42,21 @@ def write_report(path: str | Path, result: Result) -> Path:
     path = Path(path)
     if path.suffix != ".html":
         raise CirlError(f"{path}: a report needs the name of an .html file")
-    return write_page(path, _story(result))
+    return write_page(path, _page(result))
 
 
 @singledispatch
-def _story(result: object) -> report_page.ReportPage:
+def _page(result: object) -> report_page.ReportPage:
     if isinstance(result, Sequence) and result and all(isinstance(simulation, Simulation) for simulation in result):
         return report_page.page_of_alternatives(result)
     raise CirlError(f"there is no report of a {type(result).__name__}")
 
 
-_story.register(Schedule, report_page.page_of_schedule)
-_story.register(Comparison, report_page.page_of_comparison)
-_story.register(ParetoFront, report_page.page_of_front)
-_story.register(Evaluation, page_of_evaluation)
-_story.register(Simulation, lambda simulation: report_page.page_of_alternatives([simulation]))
+_page.register(Schedule, report_page.page_of_schedule)
+_page.register(Comparison, report_page.page_of_comparison)
+_page.register(ParetoFront, report_page.page_of_front)
+_page.register(Evaluation, page_of_evaluation)
+_page.register(Simulation, lambda simulation: report_page.page_of_alternatives([simulation]))
 
 
 def draw(path: str | Path, result: Result, *, title: str = "") -> Path:
