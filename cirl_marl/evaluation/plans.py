@@ -33,7 +33,7 @@ def plan(
     >>> import cirl_marl
     >>> found = cirl_marl.plan("net_zero", "scripted")
     >>> found.header[:2], found.columns.shape[1]
-    (('from (day)', 'to (day)'), 60)
+    (('from (day)', 'to (day)'), 120)
 
     Args:
         source: directory of a training run, whose policies act; or catalogue name, definition file or network.
