@@ -90,7 +90,7 @@ def test_a_complete_run_acts_and_learns_on(tmp_path: Path) -> None:
 
 def test_the_reasons_of_a_run_are_shown(tmp_path: Path) -> None:
     """They are those of the checkpoint that acts."""
-    from cirl_marl.report.reasons import reasons_of
+    from  import reasons_of
 
     run = RunDirectory(OLDER / "complete")
     sections, missing = reasons_of(run, run.chosen.name)
@@ -123,7 +123,7 @@ def test_aims_are_inferred_from_a_plan() -> None:
     """A CSV file of ``cirl plan`` is read as the course of its network."""
     from cirl_marl import infer
 
-    assert infer(OLDER / "bottles.toml", OLDER / "plan.csv").weights
+    assert infer(OLDER / "bottles.toml", OLDER / "plan.csv").terms
 
 
 def test_a_team_goes_on() -> None:
