@@ -90,10 +90,10 @@ def test_a_complete_run_acts_and_learns_on(tmp_path: Path) -> None:
 
 def test_the_reasons_of_a_run_are_shown(tmp_path: Path) -> None:
     """They are those of the checkpoint that acts."""
-    from  import reasons_of
+    from cirl_marl.report.explanations import read_reasons
 
     run = RunDirectory(OLDER / "complete")
-    sections, missing = reasons_of(run, run.chosen.name)
+    sections, missing = read_reasons(run, run.chosen.name)
     assert sections and not missing
 
 
