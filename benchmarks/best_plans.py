@@ -21,7 +21,7 @@ import numpy as np
 from cirl_marl import CirlError, MultiAgentVectorEnv, Network, load_network, networks
 from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.controllers.schedule import Schedule, schedule
-from cirl_marl.definitions.writing import fingerprint
+from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.network import Floats
 from cirl_marl.optimum import NoCertificate, Plan, bound, improved, search
 from cirl_marl.optimum.plans import starting_states

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from cirl_marl.definitions.catalogue import load_network as load_network
     from cirl_marl.definitions.catalogue import networks as networks
     from cirl_marl.definitions.catalogue import recipes as recipes
-    from cirl_marl.definitions.reading import write_network as write_network
+    from cirl_marl.definitions.reader import write_network as write_network
     from cirl_marl.environments.goal import GoalEnv as GoalEnv
     from cirl_marl.environments.parallel import NetworkParallelEnv as NetworkParallelEnv
     from cirl_marl.environments.parallel import aec_env as aec_env

@@ -18,9 +18,9 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Objective, Role, Series, Service
-from cirl_marl.definitions.reading import Definition
-from cirl_marl.dynamics.motion import Dynamics
-from cirl_marl.network.elements import FIXED, Lifetime
+from cirl_marl.definitions.reader import Definition
+from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.network.elements import FIXED_LIFETIME, Lifetime
 from cirl_marl.network.lifetimes import SURVIVALS
 
 if TYPE_CHECKING:
@@ -255,9 +255,9 @@ def _node(values: _Values, i: int, sets_flow: bool, stores: bool, divides: bool)
 
 def _living(rng: np.random.Generator, node: Node, interval: float, horizon: int) -> Node:
     """Return a node with a lifetime in place of a rate, perhaps with a history, or a stretch that changes."""
-    kind, mean = str(rng.choice([*SURVIVALS, FIXED])), interval * float(10 ** rng.uniform(0, 1.5))
+    kind, mean = str(rng.choice([*SURVIVALS, FIXED_LIFETIME])), interval * float(10 ** rng.uniform(0, 1.5))
     control, stretch = node.control, float(rng.uniform(0.5, 2))
-    if kind == FIXED:
+    if kind == FIXED_LIFETIME:
         mean, control, stretch = round(mean / interval) * interval, None, 1.0
     elif control is not None:
         low, neutral, high = np.sort(rng.uniform(0.5, 3.0, 3)).tolist()
@@ -273,10 +273,10 @@ def _living(rng: np.random.Generator, node: Node, interval: float, horizon: int)
         control=control,
         lifetime=Lifetime(
             mean=mean,
-            deviation=mean * float(rng.uniform(0.4, 1)) if kind not in (FIXED, "exponential") else None,
+            deviation=mean * float(rng.uniform(0.4, 1)) if kind not in (FIXED_LIFETIME, "exponential") else None,
             distribution=kind,
         ),
-        stretch=changing if kind != FIXED else 1.0,
+        stretch=changing if kind != FIXED_LIFETIME else 1.0,
         history=history,
         growth=float(rng.uniform(-0.1, 0.3) / mean) if rng.random() < 0.5 else None,
         initial=None if history is not None and rng.random() < 0.5 else node.initial,

@@ -8,13 +8,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.compartments import ContinuousModel, Outflowing, RewardState
+from cirl_marl.compartments import ContinuousModel, OutflowModel, RewardState
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fermenter(ContinuousModel, Outflowing):
+class Fermenter(ContinuousModel, OutflowModel):
     """Chemostat: Ẋ = (μ − D)X, Ṡ = D(S_in − S) − μX/Y with Monod growth μ; it gives off gas in proportion to μX."""
 
     kind: ClassVar[str] = "fermenter"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cirl_marl import Arc, Control, ControlKind, Network, Node, Role
-from cirl_marl.definitions.reading import Definition
+from cirl_marl.definitions.reader import Definition
 from cirl_marl.network.elements import Episode
 
 GUIDE = Path(__file__).parent.parent / "envs" / "README.md"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, Network, Node, Role, Series, Service, load_network
 from cirl_marl.definitions.catalogue import families
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network.series import Value
 
 Floats = NDArray[np.float64]

@@ -148,7 +148,7 @@ def test_a_poor_plan_is_far_from_the_best() -> None:
     """Under every weight some other plan is better; the least of that is what is said."""
     network = ladder(steps=8, growth=1.1)
     flow = np.full((8, 1), 0.0)
-    flow[-1] = network.held(network.services[0].low)[-1]  # it serves when that costs most
+    flow[-1] = network.interval_means(network.services[0].low)[-1]  # it serves when that costs most
     stock = np.cumsum(flow[:, 0])
     made = PlannedEpisode("late", np.array([1000.0, 0.0]), np.stack([1000 - stock, stock], axis=1), flow)
     found = infer(network, made, within=0.0)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cirl_marl import Arc, Control, ControlKind, MultiAgentVectorEnv, Network, NetworkError, Node, Role
-from cirl_marl.compartments import DiscreteTimeModel, Releasing, RewardState, model_class
+from cirl_marl.compartments import DiscreteTimeModel, ReleasingModel, RewardState, model_class
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Episode, Law, Objective, Service
 
@@ -21,7 +21,7 @@ ITEM = 100.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Belt(DiscreteTimeModel, Releasing):
+class Belt(DiscreteTimeModel, ReleasingModel):
     """A sorting belt without a robot: an item takes ``work`` steps; every ``nth`` one is missed."""
 
     kind: ClassVar[str] = "belt"
@@ -51,7 +51,7 @@ class Belt(DiscreteTimeModel, Releasing):
         complete = ready & (done % self.items == 0)
         return np.stack([np.where(ready, 0.0, worked), done, ready & ~missed, missed, complete]).astype(float)
 
-    def released(self, state: Floats) -> Floats:
+    def released_units(self, state: Floats) -> Floats:
         """Return items sorted and missed in the last step."""
         return state[2:4]
 

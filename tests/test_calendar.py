@@ -16,13 +16,13 @@ from series_definition import column, definition, written
 
 from cirl_marl import Episode, Network, NetworkError, Node, load_network, parallel_env, vector_env
 from cirl_marl.cli.episodes import plan, simulate
-from cirl_marl.network.calendar import When, elapsed, labels, year, years
+from cirl_marl.network.calendar import YearOrDate, elapsed_time, labels, year, years
 from cirl_marl.report import curves
 
 SOLD = 'control = { kind = "share", low = 0.1, neutral = 0.5, high = 0.9, unit = "1", source = "x" }'
 
 
-def network(start: When | None, unit: str, interval: float = 1.0) -> Network:
+def network(start: YearOrDate | None, unit: str, interval: float = 1.0) -> Network:
     """Return a network with this clock."""
     episode = Episode(control_interval=interval, horizon=4, start=start)
     return Network(name="x", nodes=(Node(id="a", initial=(1, 1)),), arcs=(), time_unit=unit, episode=episode)
@@ -42,7 +42,7 @@ def network(start: When | None, unit: str, interval: float = 1.0) -> Network:
         (2000.5, "day", 1.0, "date", ["2000-07-01 15:00", "2000-07-02 15:00", "2000-07-03 15:00"]),
     ],
 )
-def test_labels(start: When, unit: str, interval: float, header: str, expected: list[str]) -> None:
+def test_labels(start: YearOrDate, unit: str, interval: float, header: str, expected: list[str]) -> None:
     """Years for units of a month or more, dates for others, with the hour where it is not midnight."""
     assert labels(network(start, unit), np.arange(3) * interval) == ([header], [expected])
     assert labels(network(None, unit), np.arange(3) * interval) == ([], [])
@@ -55,13 +55,13 @@ def test_labels(start: When, unit: str, interval: float, header: str, expected: 
 )
 def test_there_and_back(begins: date, then: date, unit: str) -> None:
     """A date is read as the time that is called by that date."""
-    assert labels(network(begins, unit), elapsed(then, begins, unit))[1][0] == [then.isoformat()]
+    assert labels(network(begins, unit), elapsed_time(then, begins, unit))[1][0] == [then.isoformat()]
 
 
 @given(st.floats(1900, 2100), st.floats(1900, 2100), st.sampled_from(["year", "month", "day", "s"]))
 def test_years_there_and_back(begins: float, then: float, unit: str) -> None:
     """Likewise years, whatever the unit."""
-    assert years(network(begins, unit), elapsed(then, begins, unit)) == pytest.approx(then, abs=1e-9)
+    assert years(network(begins, unit), elapsed_time(then, begins, unit)) == pytest.approx(then, abs=1e-9)
 
 
 def test_years_of_dates() -> None:

@@ -25,7 +25,7 @@ from cirl_marl import Arc, Control, ControlKind, Law, MultiAgentVectorEnv, Netwo
 from cirl_marl.cli import demonstration
 from cirl_marl.controllers.rollout import episode_start, first_seed
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation.assessment import evaluate
 from cirl_marl.learners import RunDirectory, train
 from cirl_marl.optimum import search_each

@@ -27,7 +27,7 @@ from cirl_marl.evaluation.statistics import interquartile_mean
 from cirl_marl.learners import Progress, Recipe, RunDirectory, Training, load_recipe, resume, train
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
-from cirl_marl.records.files import published
+from cirl_marl.records.files import publish_folder
 from cirl_marl.report.fronts import COMPARISON_FILES, write_comparison
 
 pytestmark = pytest.mark.medium
@@ -152,7 +152,7 @@ def test_failed_writing_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "kept.txt").write_text("kept")
     for folder in ("new", "old"):
-        with pytest.raises(RuntimeError, match="disk"), published(tmp_path / folder) as partial:
+        with pytest.raises(RuntimeError, match="disk"), publish_folder(tmp_path / folder) as partial:
             (partial / "half.csv").write_text("half")
             raise RuntimeError("disk")
     assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == ["old", "old/kept.txt"]

@@ -24,7 +24,7 @@ from cirl_marl.compartments.microalgae_droop import MicroalgaeDroop
 from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
-from cirl_marl.network.model import ContinuousModel
+from cirl_marl.network.compartment_model import ContinuousModel
 from cirl_marl.network.rowsum import Floats
 
 
@@ -267,8 +267,8 @@ class TestDeliveryTruck:
         """Within 0.5 m of the place it heads for and slower than 1 m/s, in either direction; nowhere else."""
         state = np.array([[position], [speed], [destination]])
         slow = abs(speed) <= 1.0
-        assert self.TRUCK.boarding(state)[0] == (abs(position) <= 0.5 and slow and destination == 0.0)
-        assert self.TRUCK.arrived(state)[0] == (9.5 <= position <= 10.5 and slow and destination == 10.0)
+        assert self.TRUCK.can_board(state)[0] == (abs(position) <= 0.5 and slow and destination == 0.0)
+        assert self.TRUCK.has_arrived(state)[0] == (9.5 <= position <= 10.5 and slow and destination == 10.0)
 
     def test_turns_only_where_it_is_told(self) -> None:
         """The destination of the chosen columns changes, nothing else, and the given state stays as it was."""
@@ -290,17 +290,17 @@ class TestDeliveryTruck:
         peak = np.sqrt(9.5 * acceleration + 0.5)
         state = truck.depart(np.array([[0.0], [0.0], [0.0]]), yes)
         elapsed = 0.0
-        while not truck.arrived(state)[0]:
-            assert not truck.boarding(state)[0]
+        while not truck.has_arrived(state)[0]:
+            assert not truck.can_board(state)[0]
             assert elapsed < 10.0
             force = np.array([[12e3 if elapsed < peak / acceleration else -12e3]])
             state = state + h * truck.derivative(state, force, load_kg=load_kg)
             elapsed += h
         assert elapsed == pytest.approx((2.0 * peak - 1.0) / acceleration, abs=5 * h)
         state = truck.turn_back(state, yes)
-        assert not truck.arrived(state)[0]
+        assert not truck.has_arrived(state)[0]
         home = np.array([[0.4], [-0.9], [state[2, 0]]])
-        assert truck.boarding(home)[0]
+        assert truck.can_board(home)[0]
 
     def test_reward_is_the_distance_to_where_it_heads(self) -> None:
         """−((destination − x)² + 0.1 v² + 1e-8 F²), and nothing is better than to rest where it heads."""
@@ -416,7 +416,7 @@ class TestBalances:
         net = flows.feed + 5.0 + 3.0 - flows.ash - flows.char_out - flows.flue
         np.testing.assert_allclose(stored, net, rtol=1e-12, atol=1e-12)
         usual = PUBLISHED_FLOWS
-        assert usual.consumed - usual.char_made + usual.char_burnt - usual.gas_made == 66.0
+        assert usual.waste_consumed - usual.char_made + usual.char_burnt - usual.gas_made == 66.0
 
     def test_incinerator_recovers_the_published_rates(self) -> None:
         """At the reference inventories and temperature the rates of the bed are the published ones."""

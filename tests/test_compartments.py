@@ -26,17 +26,17 @@ from cirl_marl.compartments.microalgae_monod import MicroalgaeMonod
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
 from cirl_marl.errors import CirlError
-from cirl_marl.network.model import (
+from cirl_marl.network.compartment_model import (
     MOTIONS,
     OFFERS,
     CompartmentModel,
     ContinuousModel,
     DiscreteTimeModel,
     GoalTask,
-    Measuring,
-    Outflowing,
+    MeasuringModel,
+    OutflowModel,
     OwnStepModel,
-    Releasing,
+    ReleasingModel,
     Task,
     Vehicle,
     model_faults,
@@ -92,12 +92,12 @@ OFFERED = {
     "derivative": "ContinuousModel",
     "integrate": "OwnStepModel",
     "advance": "DiscreteTimeModel",
-    "outflow": "Outflowing",
-    "measures": "Measuring",
+    "outflow": "OutflowModel",
+    "measures": "MeasuringModel",
     "success": "Task",
     "goal_reward": "GoalTask",
-    "released": "Releasing",
-    "boarding": "Vehicle",
+    "released_units": "ReleasingModel",
+    "can_board": "Vehicle",
 }
 """A method of every contract that a model may inherit from."""
 
@@ -129,16 +129,16 @@ def outputs(
         found["integrate"], found["mean outflow"] = model.integrate(state, inputs, 0.01)
     if isinstance(model, DiscreteTimeModel):
         found["advance"] = model.advance(state, inputs, **context)
-    if isinstance(model, Outflowing):
+    if isinstance(model, OutflowModel):
         found["outflow"] = model.outflow(state, inputs)
-    if isinstance(model, Measuring):
+    if isinstance(model, MeasuringModel):
         found["measures"] = model.measures(state, inputs)
     if isinstance(model, Task):
         found["success"] = model.success(state, inputs)
-    if isinstance(model, Releasing):
-        found |= {"released": model.released(state), "complete": model.complete(state)}
+    if isinstance(model, ReleasingModel):
+        found |= {"released": model.released_units(state), "complete": model.complete(state)}
     if isinstance(model, Vehicle):
-        found |= {"boarding": model.boarding(state), "arrived": model.arrived(state)}
+        found |= {"boarding": model.can_board(state), "arrived": model.has_arrived(state)}
         found |= {"depart": model.depart(state, found["boarding"])}
         found |= {"turn_back": model.turn_back(state, found["arrived"])}
     return found
@@ -149,9 +149,9 @@ def shapes(model: CompartmentModel, size: int) -> dict[str, tuple[int, ...]]:
     found: dict[str, tuple[int, ...]] = dict.fromkeys(
         ("reward", "mean outflow", "outflow", "success", "complete", "boarding", "arrived"), (size,)
     )
-    if isinstance(model, Measuring):
+    if isinstance(model, MeasuringModel):
         found["measures"] = (len(model.measure_names), size)
-    if isinstance(model, Releasing):
+    if isinstance(model, ReleasingModel):
         found["released"] = (len(model.ports), size)
     return found
 
@@ -203,7 +203,7 @@ class TestRegistry:
         assert not hasattr(model, "__dict__")
         states, names = model.state_names, {*model.state_names, *model.input_names}
         assert len(names) == len(states) + len(model.input_names)
-        assert set(model.observed) <= set(states)
+        assert set(model.observed_states) <= set(states)
         assert set(model.bounds) <= names
         assert set(model.context_names) <= set(CONTEXT)
         assert model.ranged_states == (() if isinstance(model, DiscreteTimeModel) else states)
@@ -211,7 +211,7 @@ class TestRegistry:
         assert isinstance(model.robot, CompartmentModel)
         if isinstance(model, GoalTask):
             parts = (*model.observation_names, *model.achieved_names, *model.desired_names)
-            assert set(parts) <= set(model.observed)
+            assert set(parts) <= set(model.observed_states)
             assert len(model.achieved_names) == len(model.desired_names)
         if isinstance(model, DiscreteTimeModel):
             assert model.interval > 0.0
@@ -229,7 +229,7 @@ class TestRegistry:
         ("bases", "offered", "said"),
         [
             ((), "derivative", "it inherits from none of ContinuousModel, OwnStepModel, DiscreteTimeModel"),
-            ((Outflowing,), "outflow", "it inherits from none of ContinuousModel, OwnStepModel, DiscreteTimeModel"),
+            ((OutflowModel,), "outflow", "it inherits from none of ContinuousModel, OwnStepModel, DiscreteTimeModel"),
             ((ContinuousModel,), "reward", "it lacks derivative, input_names, kind, reward_state, state_names, time_"),
             ((DiscreteTimeModel,), "advance", "it lacks input_names, interval, kind, reward, reward_state, start, st"),
             *(((), name, f"it has {name} and does not inherit from {offer}") for name, offer in OFFERED.items()),

@@ -12,7 +12,7 @@ from series_definition import SOURCE, column, definition, written
 from cirl_marl import CirlError, DefinitionError, MultiAgentVectorEnv, Network, RecipeError, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.definitions.reading import Definition, write_network
+from cirl_marl.definitions.reader import Definition, write_network
 from cirl_marl.drawing.digraph import save_network
 from cirl_marl.drawing.folding import fold_copies
 from cirl_marl.learners import Recipe

@@ -13,8 +13,8 @@ import pytest
 from series_definition import CSV, column, definition, written
 
 from cirl_marl import DefinitionError, RunError, Series, load_network
-from cirl_marl.definitions import columns
-from cirl_marl.definitions.reading import Definition
+from cirl_marl.definitions import data_files
+from cirl_marl.definitions.reader import Definition
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.learners import Recipe, train
 from cirl_marl.learners.run_directory import RunDirectory
@@ -200,14 +200,14 @@ def test_a_broken_file_is_told_once(tmp_path: Path) -> None:
 def test_files_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """For all arcs, scenarios and regions of a definition; an edit of one is noticed."""
     read: list[str] = []
-    table = columns._Table
+    table = data_files._Table
 
     class Counted(table):  # type: ignore[misc, valid-type]
         def __init__(self, name: str, content: bytes) -> None:
             read.append(name)
             super().__init__(name, content)
 
-    monkeypatch.setattr(columns, "_Table", Counted)
+    monkeypatch.setattr(data_files, "_Table", Counted)
     arcs = "".join(f'[arcs.x{i}]\nfrom = "mine"\nto = "use"\nlaw = "exogenous"\nflow = {column()}\n' for i in range(5))
     regions = '[regions]\njapan = "Japan"\nchina = "China"\n[scenarios.other]\ntitle = "Other"\n'
     path = written(tmp_path, definition(column(), start="2000", more=arcs + regions))

@@ -12,31 +12,39 @@ from pydantic import ValidationError
 
 from cirl_marl import Arc, NetworkError, Node, load_network
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.definitions.columns import DataFiles
 from cirl_marl.definitions.conversion import Converter
-from cirl_marl.definitions.guide import format_guide
-from cirl_marl.definitions.mistakes import mistakes_of
+from cirl_marl.definitions.data_files import DataFiles
+from cirl_marl.definitions.error_messages import validation_mistakes
+from cirl_marl.definitions.format_guide import format_guide
 from cirl_marl.definitions.schema import NetworkTable, table_of
-from cirl_marl.definitions.writing import _Writer, definition_of, fingerprint
-from cirl_marl.network.declared import Declared, Numbers, Quantity, Word, bound_problems, declarations, frozen
+from cirl_marl.definitions.writer import _Writer, definition_of, fingerprint
+from cirl_marl.network.declarations import (
+    Declaration,
+    Numbers,
+    Quantity,
+    Word,
+    bound_problems,
+    declarations,
+    frozen_record,
+)
 from cirl_marl.network.elements import Control, Episode, Objective, Observation, Service
 
 DOCUMENT = tomllib.loads((folder("envs") / "copper_net.toml").read_text(encoding="utf-8"))
 MODES = ("slow", "fast")
 
 
-@frozen
+@frozen_record
 class Warmed(Episode):
     """An episode that begins with a warm-up."""
 
     warm_up: Annotated[float, Quantity("time before the first decision", of="time", low=0.0)] = 0.0
     mode: Annotated[str, Word("how it warms up", of=MODES)] = "slow"
-    heated: Annotated[tuple[str, ...], Declared("what is warmed up", key="what")] = ()
+    heated: Annotated[tuple[str, ...], Declaration("what is warmed up", key="what")] = ()
     reserve: Annotated[tuple[float, float], Numbers("held back", "(low, high)", (2,), "range", "rate")] = (
         0.0,
         0.0,
     )
-    cold: Annotated[bool, Declared("whether it begins cold")] = False
+    cold: Annotated[bool, Declaration("whether it begins cold")] = False
 
 
 def document(**more: object) -> dict[str, object]:
@@ -78,7 +86,7 @@ def test_a_new_field_is_checked() -> None:
         replace(read(), warm_up=(1.0, 2.0))  # type: ignore[arg-type]
     with pytest.raises(ValidationError) as raised:
         read(warmup={"value": 6, "unit": "hour", "source": "x"})
-    assert mistakes_of(raised.value, table_of(Warmed))[0].startswith(
+    assert validation_mistakes(raised.value, table_of(Warmed))[0].startswith(
         "warmup: unknown key 'warmup'. Did you mean 'warm_up'"
     )
 
@@ -116,7 +124,7 @@ def test_values_are_of_their_kind(made: Any, changes: dict[str, Any], said: str)
 def test_numbers_without_a_spelling_are_a_fault_of_the_declaration() -> None:
     """They would be lost on writing."""
 
-    @frozen
+    @frozen_record
     class Lossy(Episode):
         """An episode with numbers that no file can hold."""
 

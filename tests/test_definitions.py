@@ -27,7 +27,7 @@ from cirl_marl import (
     parallel_env,
 )
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.definitions.reading import Definition, write_network
+from cirl_marl.definitions.reader import Definition, write_network
 from cirl_marl.definitions.schema import json_schema
 from cirl_marl.network.elements import ControlKind
 from cirl_marl.records import files

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from benchmarks.generated import yearly_network
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role, Series
-from cirl_marl.dynamics.detours import Detours, Onward, contracted, woven
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, contract_hubs, square_matrix
 from cirl_marl.network import RowSum
 
 Floats = NDArray[np.float64]
@@ -50,13 +50,13 @@ def cycle(seed: int, stores: int, passing: int, leak: float = 0.1, **episode: An
 
 def keeping(kept: Iterable[int]) -> Any:
     """Return what makes networks keep these nodes, constant or not, and all others that can be eliminated be so."""
-    eliminate, kept = Detours._eliminate, set(kept)
+    eliminate, kept = StaticElimination._eliminate, set(kept)
 
-    def chosen(self: Detours, constant: set[int]) -> None:
-        with patch("cirl_marl.dynamics.detours.THRIFT", np.inf):
+    def chosen(self: StaticElimination, constant: set[int]) -> None:
+        with patch("cirl_marl.dynamics.static_elimination.THRIFT", np.inf):
             eliminate(self, constant - kept)
 
-    return patch.object(Detours, "_eliminate", chosen)
+    return patch.object(StaticElimination, "_eliminate", chosen)
 
 
 def played(network: Network, seed: int, *, short: bool = True, kept: Iterable[int] | None = None) -> list[Floats]:
@@ -151,13 +151,13 @@ def test_contraction_keeps_what_sources_send(seed: int, hubs: int) -> None:
     weights = np.tril(rng.random((size, size)), -1) * (rng.random((size, size)) < 0.4)
     weights[:3], weights[:, -3:] = 0.0, 0.0
 
-    def sent(gives: Mapping[int, Onward]) -> Floats:
-        matrix = woven(gives, {i: i for i in range(size)}, size)
+    def sent(gives: Mapping[int, SparseRow]) -> Floats:
+        matrix = square_matrix(gives, {i: i for i in range(size)}, size)
         return matrix.substitute(np.eye(size))[-3:, :3]
 
     gives = {i: {int(j): float(weights[j, i]) for j in np.flatnonzero(weights[:, i])} for i in range(size - 3)}
     expected, before = sent(gives), sum(map(len, gives.values()))
-    left = contracted(gives, range(3, size - 3))
+    left = contract_hubs(gives, range(3, size - 3))
     assert sum(map(len, gives.values())) <= before
     assert gives.keys() == {0, 1, 2, *left}
     np.testing.assert_allclose(sent(gives), expected, rtol=1e-13)
@@ -169,7 +169,7 @@ def test_a_cycle_of_500_nodes_keeps_few() -> None:
     env = MultiAgentVectorEnv(network, num_envs=3)
     passing = network.nodes[len(network.stores) :]
     assert (len(network.nodes), len(passing)) == (501, 400)
-    kept = {passing[i].id for i in env.dynamics.routing.detours.kept}
+    kept = {passing[i].id for i in env.dynamics.routing.detours.kept_nodes}
     assert kept >= {arc.donor for arc in network.arcs if arc.control is not None}
     assert len(kept) <= 20
     env.reset(seed=4)

@@ -18,7 +18,7 @@ from imports import arrows, modules, rooms
 import cirl_marl
 from cirl_marl import cli
 from cirl_marl.definitions.catalogue import families
-from cirl_marl.definitions.reading import Definition
+from cirl_marl.definitions.reader import Definition
 from cirl_marl.learners import load_recipe, train
 
 ROOT = Path(__file__).parent.parent

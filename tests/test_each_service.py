@@ -27,7 +27,7 @@ from cirl_marl import (
 from cirl_marl.cli.episodes import simulate
 from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation import compare, solve_baseline
 from cirl_marl.evaluation.pareto import pareto_front
 from cirl_marl.optimum import Plan, achieved, bound, envelope, improved, search

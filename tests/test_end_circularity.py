@@ -92,7 +92,7 @@ def test_a_scheduled_flow_at_the_end_is_the_one_realised() -> None:
 @given(network=st.from_type(Network), seed=st.integers(0, 1000))
 def test_it_follows_from_the_stocks_at_the_end(network: Network, seed: int) -> None:
     """With flows driven by their donors, λ at the end is −Δ·σᵀ(v·a·x) of the stocks at the end."""
-    assume(not network.changing and not any(arc.law is Law.SHARE for arc in network.arcs))
+    assume(not network.time_dependent and not any(arc.law is Law.SHARE for arc in network.arcs))
     network = _stock_driven(network)
     env = MultiAgentVectorEnv(network, num_envs=3)
     env.reset(seed=seed)

@@ -30,7 +30,7 @@ from cirl_marl import (
 )
 from cirl_marl.controllers import Constant, Random, ScriptController
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments import rewards as credit
 from cirl_marl.network.elements import Episode
 from cirl_marl.testing import check_parallel_env, check_vector_env

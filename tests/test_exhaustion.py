@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from small_networks import NO_STATES, advanced, small, start
 
 from cirl_marl import Arc, Control, ControlKind, Episode, Law, MultiAgentVectorEnv, Network, Node, Role
-from cirl_marl.compartments import ContinuousModel, Outflowing, RewardState
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.compartments import ContinuousModel, OutflowModel, RewardState
+from cirl_marl.dynamics.integrator import Dynamics
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ def order(id_: str, donor: str, recipient: str, most: float) -> Arc:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Source(ContinuousModel, Outflowing):
+class Source(ContinuousModel, OutflowModel):
     """A model without states whose output is constant."""
 
     kind: ClassVar[str] = "source"
@@ -75,7 +75,7 @@ def test_overdrawn_donor_is_emptied(rate: float) -> None:
     stock = transition.stock[:-1, 0]
     assert 0 <= stock[0] <= 1e-10
     assert stock.sum() == pytest.approx(10.0, rel=1e-14)
-    assert transition.moved.sum() == pytest.approx(10.0, rel=1e-11)
+    assert transition.moved_mass.sum() == pytest.approx(10.0, rel=1e-11)
 
 
 def test_competing_orders_share_the_donor() -> None:
@@ -164,7 +164,7 @@ def test_models_do_not_reverse_flows() -> None:
     env.reset(seed=0)
     assert env.physical.flow[0, 0] == 0.0
     transition = env.dynamics.advance(env.physical.stock, env.physical.inner, np.empty((0, 1)), env.physical.step)
-    assert transition.moved[0, 0] == transition.flow[0, 0] == 0.0
+    assert transition.moved_mass[0, 0] == transition.flow[0, 0] == 0.0
 
 
 @pytest.mark.parametrize("solver", ["exact", "rk4"])

@@ -60,7 +60,7 @@ def test_imports_go_one_way() -> None:
     ("module", "line"),
     [
         ("errors", "from cirl_marl.network import Network"),
-        ("network/units", "if TYPE_CHECKING:\n    from cirl_marl.dynamics.motion import Dynamics"),
+        ("network/units", "if TYPE_CHECKING:\n    from cirl_marl.dynamics.integrator import Dynamics"),
         ("optimum/matrices", "def late():\n    from cirl_marl.optimum import bound"),
     ],
 )

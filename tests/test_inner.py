@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from cirl_marl import Arc, Control, ControlKind, MultiAgentVectorEnv, Network, NetworkError, Node, Role, parallel_env
 from cirl_marl.compartments import model_class
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.definitions.reading import Definition, write_network
+from cirl_marl.definitions.reader import Definition, write_network
 from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Episode, Law, Objective, Observation

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from written_jobs import written
 
-from cirl_marl.definitions.permission import code_allowed
+from cirl_marl.definitions.code_permission import code_allowed
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.jobs import Standing, driver, places, raise_first, run_jobs
 from cirl_marl.jobs.work import JobFiles

@@ -53,7 +53,7 @@ def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: 
     for p in range(pieces):
         size = chain.stages
         system = np.zeros((size + 1, size + 1))
-        system[:size, :size], system[:size, size] = chain.matrix * rate[p] / chain.rate, chain.entering
+        system[:size, :size], system[:size, size] = chain.matrix * rate[p] / chain.rate, chain.inflow_shares
         half, whole = expm(system / FINE / 2), expm(system / FINE)
         for k in range(FINE):
             middle = half[:size, :size] @ stages + half[:size, size] * inflow[p, k]

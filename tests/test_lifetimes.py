@@ -34,12 +34,12 @@ from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.pyramids import pyramids
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.definitions.reading import write_network
-from cirl_marl.dynamics.stages import staged
+from cirl_marl.definitions.reader import write_network
+from cirl_marl.dynamics.stages import staged_network
 from cirl_marl.evaluation.simulations import simulate
 from cirl_marl.network import Network
-from cirl_marl.network.ages import remaining
 from cirl_marl.network.elements import Lifetime
+from cirl_marl.network.initial_ages import remaining_history
 from cirl_marl.network.lifetimes import chain_of
 from cirl_marl.report.terminal import law_text, nodes_table
 from cirl_marl.report.trajectory import write_trajectory
@@ -212,7 +212,7 @@ def test_what_has_grown_goes_on_growing(lifetime: Lifetime, growth: float) -> No
             env = MultiAgentVectorEnv(town(lifetime, grown[560:], initial=80.0, **kept), num_envs=1)
             env.reset(seed=0)
             parts = env.physical.stock[env.rows.stages[1], 0]
-            long = remaining(town(lifetime, grown[560:], history=history).nodes[1], 1.0)
+            long = remaining_history(town(lifetime, grown[560:], history=history).nodes[1], 1.0)
             np.testing.assert_allclose(parts / parts.sum(), long / long.sum(), atol=2e-3)
 
 
@@ -324,7 +324,7 @@ def test_ages_are_those_of_cohorts(lifetime: Lifetime, stretch: float | Series) 
 @given(network=st.from_type(Network))
 def test_stages_count_as_their_node(network: Network) -> None:
     """In λ, whatever its role: what moves within a node counts nothing, what enters and leaves it as it did."""
-    written, arcs = staged(network), len(network.arcs)
+    written, arcs = staged_network(network), len(network.arcs)
     np.testing.assert_array_equal(written.sustainability[:arcs], network.sustainability)
     np.testing.assert_array_equal(written.environmental[:arcs], network.environmental)
     assert not written.sustainability[arcs:].any() and not written.environmental[arcs:].any()

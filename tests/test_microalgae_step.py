@@ -254,7 +254,7 @@ class TestDrawDown:
                 np.testing.assert_allclose(found.nutrient, settled.nutrient, rtol=1e-10)
                 np.testing.assert_allclose(found.saturation, settled.saturation, rtol=0.0, atol=1e-11 * span)
                 untouched = outside * np.exp(-DILUTION * span) - FEED * np.expm1(-DILUTION * span)
-                np.testing.assert_allclose(found.nutrient + demand * found.retained, untouched, rtol=1e-13)
+                np.testing.assert_allclose(found.nutrient + demand * found.share_retained, untouched, rtol=1e-13)
 
     def test_long_span_is_quasi_steady(self) -> None:
         """S tends to r₁, the positive root of DS² + (DK + q − DS_in)S − D·S_in·K."""

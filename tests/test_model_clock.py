@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from cirl_marl import Arc, Episode, Law, MultiAgentVectorEnv, Network, Node
-from cirl_marl.compartments import ContinuousModel, Outflowing, OwnStepModel, RewardState
+from cirl_marl.compartments import ContinuousModel, OutflowModel, OwnStepModel, RewardState
 from cirl_marl.network import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Decay(Outflowing):
+class _Decay(OutflowModel):
     """ż = −k z, k = 0.1/h; z is given off."""
 
     kind: ClassVar[str] = "decay"

@@ -31,7 +31,7 @@ from cirl_marl.compartments.digester import Digester
 from cirl_marl.compartments.digester_published import DigesterPublished
 from cirl_marl.compartments.troposphere_temperature import TroposphereTemperature
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reader import write_network
 from cirl_marl.network.series import Series
 
 
@@ -101,8 +101,8 @@ DIGESTER: dict[str, Any] = {"model": Digester(), "inner": ((1.0, 1.0),) * 6}
         ({"services": (OWED, OWED)}, "service 's': the id is used twice$"),
         ({"nodes": (A, B, B)}, "node 'b': the id is used twice$"),
         ({"arcs": (replace(LINK, id="b"),)}, "node and arc 'b': the id is used twice; nodes and arcs share one set"),
-        ({"acting": ("b",)}, "agents: 'b' has no control, so that it cannot act"),
-        ({"acting": ("c",)}, "agents: unknown agent 'c'. Known: none"),
+        ({"default_agents": ("b",)}, "agents: 'b' has no control, so that it cannot act"),
+        ({"default_agents": ("c",)}, "agents: unknown agent 'c'. Known: none"),
         (
             {"arcs": (DELAYED,), "services": (replace(OWED, provider="a", quantity="outflow"),)},
             "service 's': quantity 'outflow': 'a' gives batches to k, which count on arrival; ask for the 'flow'",

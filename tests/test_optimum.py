@@ -33,7 +33,7 @@ from cirl_marl import (
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.network.elements import FIXED
+from cirl_marl.network.elements import FIXED_LIFETIME
 from cirl_marl.network.series import Series
 from cirl_marl.optimum import Bound, Certificate, NoCertificate, Plan, achieved, bound, envelope, improved, reach
 from cirl_marl.optimum.admissible import Admissible
@@ -61,7 +61,7 @@ def certifiable(network: Network, interval: float, pulls: bool) -> Network:
     episode = replace(network.episode, control_interval=shorter, solver="exact", solver_step=None)
     nodes = []
     for node in network.nodes:
-        if node.lifetime is not None and node.lifetime.distribution == FIXED:
+        if node.lifetime is not None and node.lifetime.distribution == FIXED_LIFETIME:
             node = replace(node, lifetime=replace(node.lifetime, mean=round(node.lifetime.mean / longer) * shorter))
         nodes.append(node)
     return replace(network, nodes=tuple(nodes), arcs=tuple(arcs), episode=episode)
@@ -172,7 +172,7 @@ def test_reach(network: Network, interval: float, seed: int) -> None:
     dynamics = FlowLaws(single)
     steps = np.arange(single.episode.horizon)
     asked = dynamics.rate(np.repeat(dynamics.neutral[:, :1], len(steps), axis=1), steps).T
-    sure = reached.uncut & dynamics.scheduled
+    sure = reached.uncut & dynamics.is_scheduled
     np.testing.assert_allclose(run.flow[sure], asked[sure], rtol=1e-9)
 
 
@@ -184,7 +184,9 @@ def test_ranges_are_those_of_the_flow_laws(network: Network) -> None:
     highest = np.max([admissible.rate(step)[1] for step in range(network.episode.horizon)], axis=0)
     most = FlowLaws(network).max_rate
     assert (highest <= most * (1 + 1e-12)).all()
-    same = ~admissible.shared & np.array([not {arc.id, arc.donor} & {*network.changing} for arc in network.arcs], bool)
+    same = ~admissible.shared & np.array(
+        [not {arc.id, arc.donor} & {*network.time_dependent} for arc in network.arcs], bool
+    )
     np.testing.assert_allclose(highest[same], most[same], rtol=1e-12)
 
 

@@ -26,7 +26,7 @@ from cirl_marl import (
 )
 from cirl_marl.compartments import kind_of, model_class
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reader import write_network
 from cirl_marl.evaluation import compare
 from cirl_marl.learners import Recipe, train
 

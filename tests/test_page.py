@@ -18,7 +18,7 @@ from pages import HOSTILE, bottles_at, shown, world
 
 from cirl_marl import CirlError, Network, load_network
 from cirl_marl.definitions.catalogue import families
-from cirl_marl.definitions.sources import stated
+from cirl_marl.definitions.sources import stated_numbers
 from cirl_marl.drawing.grouping import flow_diagrams, groups
 from cirl_marl.drawing.layered import NARROW, layered_layout
 from cirl_marl.errors import DefinitionError
@@ -119,7 +119,7 @@ def test_groups_fold_and_unfold() -> None:
 def test_every_number_has_its_source(name: str) -> None:
     """What is told of compartments is what their definition states, under the scenario."""
     network = load_network(name)
-    told = stated(network)
+    told = stated_numbers(network)
     assert set(told["nodes"]) == {node.id for node in network.nodes}
     assert set(told["arcs"]) == {arc.id for arc in network.arcs}
     assert all(each.source for table in told.values() for found in table.values() for each in found)
@@ -128,14 +128,14 @@ def test_every_number_has_its_source(name: str) -> None:
 def test_sources_follow_scenario_and_file(tmp_path: Path) -> None:
     """A scenario's number has the scenario's source; a file that was changed since tells nothing of this network."""
     network = bottles_at(tmp_path)
-    (initial,) = (each for each in stated(network)["nodes"]["quarry"] if each.key == "initial")
+    (initial,) = (each for each in stated_numbers(network)["nodes"]["quarry"] if each.key == "initial")
     assert (initial.value, initial.source) == ("10000 – 10000 t", "survey")
-    crisis = {each.key: each.source for each in stated(network.scenario("crisis"))["nodes"]["quarry"]}
+    crisis = {each.key: each.source for each in stated_numbers(network.scenario("crisis"))["nodes"]["quarry"]}
     assert crisis["initial"] == "assumed" and crisis["control"] == "quarrying from none to +20 %"
-    assert set(stated(replace(network, source=None))) == {"nodes", "arcs", "services"}
+    assert set(stated_numbers(replace(network, source=None))) == {"nodes", "arcs", "services"}
     (tmp_path / "bottles.toml").write_text("name = 'other'")
     with pytest.raises(DefinitionError, match="has changed since it was read"):
-        stated(network)
+        stated_numbers(network)
 
 
 def test_the_page_shows_what_was_simulated(tmp_path: Path) -> None:

@@ -33,9 +33,9 @@ from cirl_marl import (
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.dynamics.motion import Dynamics
-from cirl_marl.dynamics.passes import Passes
-from cirl_marl.network.splits import splits
+from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.visit_bounds import VisitBounds
+from cirl_marl.network.split_fractions import splits
 
 FEED = Arc(id="feed", donor="mine", recipient="m0", law=Law.EXOGENOUS, flow=7.0)
 MINE, USE = Node(id="mine", role=Role.NONRENEWABLE_RESERVOIR), Node(id="use", initial=(0.0, 0.0))
@@ -101,7 +101,7 @@ def test_throughputs_are_accurate_however_much_goes_round(seed: int, count: int,
                 matrix[j] = [a - factor * b for a, b in zip(matrix[j], matrix[i], strict=True)]
     exact = [float(matrix[i][count] / matrix[i][i]) for i in range(count)]
     flow = dynamics.advance(dynamics.extend(network.initial[1][:, None]), NO_STATES, np.empty((0, 1)), np.array([0]))
-    np.testing.assert_allclose(network.throughput(flow.moved)[:, 0], exact, rtol=1e-12)
+    np.testing.assert_allclose(network.throughput(flow.moved_mass)[:, 0], exact, rtol=1e-12)
 
 
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 40))
@@ -168,10 +168,10 @@ def test_passes_are_the_most_there_can_be(seed: int, count: int) -> None:
     for corner in product((0, 2), repeat=sum(arc.control is not None for arc in arcs)):
         ends, kept = iter(corner), np.zeros((count, count))
         for split in splits(network):
-            for row, k in enumerate(split.controlled):
+            for row, k in enumerate(split.controlled_arcs):
                 kept[int(split.donor[1:]), int(network.arcs[k].recipient[1:])] = split.bounds[next(ends), row, 0]
         most = np.maximum(most, np.linalg.solve(np.eye(count) - kept, np.ones(count)))
-    np.testing.assert_allclose(Passes(network).total(0), most, rtol=1e-7)
+    np.testing.assert_allclose(VisitBounds(network).total(0), most, rtol=1e-7)
 
 
 def test_a_source_without_a_known_reserve_starts_with_what_may_be_asked() -> None:
@@ -335,11 +335,11 @@ def test_loops_in_loops_have_a_bound_or_a_message() -> None:
         return markets(depth + 1, [*arcs, *back, share(f"m{depth}", "m0")])
 
     network = nested(1)
-    total = Passes(network).total(0)
-    assert (total >= 1.0 + Passes(network).best(total[:, None], 0)[:, 0]).all()
+    total = VisitBounds(network).total(0)
+    assert (total >= 1.0 + VisitBounds(network).best(total[:, None], 0)[:, 0]).all()
     np.testing.assert_allclose(total[0], 2e6, rtol=1e-3)
     with pytest.raises(NetworkError, match="pass mass round so often that it cannot be told"):
-        Passes(nested(5)).total(0)
+        VisitBounds(nested(5)).total(0)
 
 
 def test_a_control_that_sets_a_flow_is_no_valve_on_the_others() -> None:

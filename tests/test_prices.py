@@ -133,7 +133,7 @@ def test_demands_and_levels_against_programs_solved_again(shortened: tuple[Netwo
     for s, service in enumerate(network.services):
         slopes = []
         for step in (1e-4, -1e-4):
-            low = np.array(network.held(service.low))
+            low = np.array(network.interval_means(service.low))
             low[3] *= 1 + step
             other = replace(service, low=in_intervals(low, interval))
             services = tuple(other if each is service else each for each in network.services)

@@ -32,7 +32,7 @@ from cirl_marl import (
     Service,
 )
 from cirl_marl.network.series import Series
-from cirl_marl.network.splits import splits
+from cirl_marl.network.split_fractions import splits
 from cirl_marl.optimum import NoCertificate, bound
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.matrices import Layout
@@ -267,7 +267,7 @@ def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int
         met["cut"] += played.cut
         met["valve"] += len(layout.openings) > 0
         met["series"] += any(isinstance(arc.flow, Series) for arc in network.arcs)
-        met["shares"] += any(split.controlled for split in splits(network))
+        met["shares"] += any(split.controlled_arcs for split in splits(network))
         met["passing"] += len(network.stores) < len(network.nodes)
         met["changing"] += len(np.unique(Admissible.of(network).kinds)) > 1
         met["substeps"] += layout.pieces > 1

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from small_networks import constant
 
 from cirl_marl import CirlError, Law, MultiAgentVectorEnv, load_network, parallel_env, single_agent_env
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.registration import PAPER_ENVIRONMENTS
 
 PAPER = {"CopperNet": ("copper_net", "use_to_collection"), "CarboNet": ("carbo_net", "urban_to_capture")}

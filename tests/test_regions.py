@@ -13,7 +13,7 @@ import cirl_marl
 from cirl_marl import CirlError, DefinitionError, Series, load_network, networks
 from cirl_marl.cli.networks import check, list_networks, show
 from cirl_marl.definitions import catalogue
-from cirl_marl.definitions.reading import Definition, write_network
+from cirl_marl.definitions.reader import Definition, write_network
 
 REGIONS = '[regions]\njapan = "Japan"\nchina = "China"\nspain = "Spain"\n'
 FLOW = column('where = { country = "{region}" }')
@@ -60,7 +60,7 @@ def test_only_the_region_asked_for_is_built(tmp_path: Path) -> None:
     path = written(tmp_path, TEXT)
     definition_ = Definition(path)
     definition_.network(region="japan")
-    assert list(definition_._built) == [("default", "japan")]
+    assert list(definition_._networks) == [("default", "japan")]
     with pytest.raises(DefinitionError, match=r"arcs\.ore\.flow: .*unknown country 'Spain'. Did you mean 'Japan'\?"):
         load_network(f"{path}:spain")
 

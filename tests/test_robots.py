@@ -151,7 +151,7 @@ class TestRobots:
         """As many names as rows; what is observed is a part of them; the step is the library's."""
         state = starts(robot, 1)
         assert len(robot.state_names) == len(set(robot.state_names)) == len(state)
-        assert set(robot.observed) <= set(robot.state_names)
+        assert set(robot.observed_states) <= set(robot.state_names)
         env = reference(robot)
         assert robot.interval == env.unwrapped.dt
         env.close()
@@ -251,8 +251,8 @@ class TestTasks:
 
 def act(robot: Robot, script: Callable[[ModelStates], Floats], state: Floats) -> Floats:
     """Return the script's inputs, from what the robot's agent sees."""
-    rows = [robot.state_names.index(name) for name in robot.observed]
-    inputs: Floats = np.clip(script(dict(zip(robot.observed, state[rows], strict=True))), -1.0, 1.0)
+    rows = [robot.state_names.index(name) for name in robot.observed_states]
+    inputs: Floats = np.clip(script(dict(zip(robot.observed_states, state[rows], strict=True))), -1.0, 1.0)
     return inputs
 
 
@@ -318,7 +318,7 @@ class TestSortingStation:
                     np.testing.assert_array_equal(state[: len(BOOKS), i], ledger)
                     np.testing.assert_array_equal(state[len(BOOKS) :, i], own.column)
                 np.testing.assert_array_equal(station.reward(state, inputs), [own.reward for own in books])
-                np.testing.assert_array_equal(station.released(state).T, [own.now[:2] for own in books])
+                np.testing.assert_array_equal(station.released_units(state).T, [own.now[:2] for own in books])
                 np.testing.assert_array_equal(station.complete(state), [own.now[2] for own in books])
 
     def test_sorts_a_batch(self) -> None:
@@ -330,7 +330,8 @@ class TestSortingStation:
                 inputs = act(Fetch(), script, state[len(BOOKS) :])
                 stock_kg = 300.0 - 100.0 * released.sum(axis=0)
                 state = station.advance(state, inputs, stock_kg=stock_kg)
-                released, completed = released + station.released(state), completed + int(station.complete(state)[0])
+                released += station.released_units(state)
+                completed += int(station.complete(state)[0])
             np.testing.assert_array_equal(released[:, 0], ports)
             assert completed == 1
             assert state[BOOKS.index("busy"), 0] == 0.0
@@ -355,9 +356,9 @@ class TestSortingStation:
         for robot in ROBOTS:
             station = SortingStation(form=robot.kind)  # type: ignore[arg-type]
             assert station.state_names == (*BOOKS, *robot.state_names)
-            assert station.observed == ("busy", *robot.observed)
+            assert station.observed_states == ("busy", *robot.observed_states)
             assert (station.input_names, station.interval) == (robot.input_names, robot.interval)
-            assert len(station.ports) == len(station.released(starts(station, 1)))
+            assert len(station.ports) == len(station.released_units(starts(station, 1)))
 
     @pytest.mark.parametrize(
         ("given_", "message"),

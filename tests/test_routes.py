@@ -13,7 +13,7 @@ from small_networks import plain_networks
 from benchmarks.yearly import planned, yearly_network
 from cirl_marl import Law, Network
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.passes import Passes
+from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.reach import RouteBounds
 
@@ -23,7 +23,7 @@ def test_shares_lie_in_their_ranges(network: Network, seed: int) -> None:
     """Whatever some agents ask for while the others are neutral; the ends of the ranges are met."""
     network = network.with_options(episode={"solver": "exact", "solver_step": None})
     arcs = tuple(arc for arc in network.arcs if arc.law is not Law.BATCH)
-    network = replace(network, arcs=arcs, services=(), acting=())
+    network = replace(network, arcs=arcs, services=(), default_agents=())
     rng = np.random.default_rng(seed)
     agents = [agent for agent in network.agents if rng.random() < 0.6] or None
     admissible, laws = Admissible.of(network, agents), FlowLaws(network)
@@ -46,7 +46,7 @@ def test_routes_bound_what_passes(seed: int) -> None:
     """Throughputs and arrivals under random shares lie within their bounds."""
     network = yearly_network(seed)
     admissible, laws, stores = Admissible.of(network), FlowLaws(network), len(network.stores)
-    routes = RouteBounds(admissible, Passes(network), 0)
+    routes = RouteBounds(admissible, VisitBounds(network), 0)
     low, _, high = network.control_bounds[:, :, 0]
     rng = np.random.default_rng(seed)
     for _ in range(50):

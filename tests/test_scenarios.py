@@ -10,7 +10,7 @@ import pytest
 
 from cirl_marl import DefinitionError, load_network
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.definitions.reading import Definition
+from cirl_marl.definitions.reader import Definition
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from cirl_marl import Arc, Control, Episode, Law, Network, NetworkError, Node, Role, Series, Service, load_network
-from cirl_marl.definitions.reading import write_network
-from cirl_marl.definitions.writing import definition_of, fingerprint
+from cirl_marl.definitions.reader import write_network
+from cirl_marl.definitions.writer import definition_of, fingerprint
 from cirl_marl.network.elements import ControlKind
 from cirl_marl.network.series import extremes
 
@@ -58,7 +58,7 @@ def test_means_are_integrals(
 def test_a_constant_and_a_series_that_stays() -> None:
     """Are held alike."""
     network = replaced(flow=Series(times=(-1.0,), values=(7.0,)))
-    np.testing.assert_array_equal(network.held(network.arcs[0].flow), network.held(7.0))
+    np.testing.assert_array_equal(network.interval_means(network.arcs[0].flow), network.interval_means(7.0))
     assert extremes(STEPS) == (0.5, 3.0)
     assert extremes(2.0) == (2.0, 2.0)
     assert f"{STEPS:g}" == "0.5 … 3"
@@ -194,6 +194,6 @@ def test_a_factor_covers_what_it_multiplies() -> None:
     """Nothing is told of the time before it begins."""
     late = Series(times=(-2.0, 0.0), values=(1.0, 8.0), interpolation="linear")
     history = Series(times=(-30.0, 0.0), values=(1.0, 1.0), interpolation="linear", factor=late)
-    assert "series begins at -2, after what it multiplies at -30" in history.unfinished()
-    assert history.uncovered(3.0)
-    assert replace(history, factor=replace(late, times=(-31.0, 0.0))).unfinished() == ""
+    assert "series begins at -2, after what it multiplies at -30" in history.history_problem()
+    assert history.coverage_problem(3.0)
+    assert replace(history, factor=replace(late, times=(-31.0, 0.0))).history_problem() == ""

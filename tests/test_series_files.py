@@ -14,7 +14,7 @@ from series_definition import CONSTANT, HALF, SOURCE, column, definition, writte
 from cirl_marl import DefinitionError, Series, load_network
 from cirl_marl.definitions.schema import json_schema
 from cirl_marl.network import Network
-from cirl_marl.network.splits import splits
+from cirl_marl.network.split_fractions import splits
 
 SHARED = f'control = {{ kind = "share", low = 0.1, neutral = 0.5, high = 0.9, unit = "1", {SOURCE} }}'
 

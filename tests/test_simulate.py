@@ -28,7 +28,7 @@ from cirl_marl import (
 )
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.network.series import Series
 
 Floats = NDArray[np.float64]
@@ -135,7 +135,7 @@ def test_two_nodes_in_exchange() -> None:
 @given(network=any_network)
 def test_intervals_compose(network: Network) -> None:
     """Two half intervals are one interval, where nothing is cut and no series changes."""
-    assume(not network.changing)
+    assume(not network.time_dependent)
     whole = ample(network, 0.3)
     assume(stays_positive(whole, 0.3))
     mass = start(whole)[:-1].sum()

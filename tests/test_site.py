@@ -20,9 +20,9 @@ from benchmarks.best_plans import FOLDER, LEFT_OUT, read_plan, replayed
 from cirl_marl import CirlError, cli, load_network
 from cirl_marl.compartments import models
 from cirl_marl.definitions.catalogue import families
-from cirl_marl.definitions.sources import stated, stated_settings
+from cirl_marl.definitions.sources import stated_numbers, stated_settings
 from cirl_marl.learners import load_recipe
-from cirl_marl.network.declared import declarations
+from cirl_marl.network.declarations import declarations
 from docs.site import networks as network_pages
 from docs.site import notebooks
 from docs.site.api import api_pages
@@ -56,7 +56,7 @@ def test_network_pages_say_what_definitions_say(name: str) -> None:
     """Every compartment, every number with its source, every agent; λ by the flows that count; bound and plan."""
     network, page = load_network(name), network_page(name)
     rows = cells(page.text)
-    told = stated(network)
+    told = stated_numbers(network)
     own = [id_ for id_ in network.compartments if not any(id_.startswith(f"{copy}_") for copy in network.copies)]
     for part in ("nodes", "arcs"):
         for id_, found in told[part].items():

@@ -22,8 +22,8 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.evaluation.figures import summary
 from cirl_marl.network import Floats
+from cirl_marl.network.batch_circularity import staged_circularity, time_window_circularity
 from cirl_marl.network.elements import REWARDS, Law
-from cirl_marl.network.staged import staged_circularity, time_window_circularity
 from cirl_marl.testing.nested import same_or_raise
 
 pytestmark = pytest.mark.medium
@@ -371,11 +371,11 @@ def test_truck_knows_where_it_is() -> None:
     speed = np.array([0.0, 1.0, -1.0, 0.0, 1.01, 0.0, 0.0, -1.0, 0.0, -1.1, 0.0])
     heading = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 10.0, 10.0, 10.0, 10.0, 10.0, 0.0])
     state = np.stack([position, speed, heading])
-    np.testing.assert_array_equal(np.flatnonzero(truck.boarding(state)), [0, 1, 2])
-    np.testing.assert_array_equal(np.flatnonzero(truck.arrived(state)), [6, 7])
-    loaded = truck.depart(state, truck.boarding(state))
+    np.testing.assert_array_equal(np.flatnonzero(truck.can_board(state)), [0, 1, 2])
+    np.testing.assert_array_equal(np.flatnonzero(truck.has_arrived(state)), [6, 7])
+    loaded = truck.depart(state, truck.can_board(state))
     np.testing.assert_array_equal(loaded[2], np.where(np.arange(11) < 3, 10.0, heading))
-    np.testing.assert_array_equal(truck.turn_back(state, truck.arrived(state))[2][6:8], 0.0)
+    np.testing.assert_array_equal(truck.turn_back(state, truck.has_arrived(state))[2][6:8], 0.0)
     np.testing.assert_array_equal(state[2], heading)
     expected = -((heading - position) ** 2 + 0.1 * speed**2 + 1e-8 * 3e3**2)
     np.testing.assert_allclose(truck.reward(state, np.full((1, 11), 3e3)), expected, rtol=1e-14)

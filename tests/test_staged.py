@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cirl_marl import CirlError
-from cirl_marl.network.staged import staged_circularity, time_window_circularity
+from cirl_marl.network.batch_circularity import staged_circularity, time_window_circularity
 
 
 @pytest.mark.parametrize(

@@ -153,7 +153,7 @@ def test_nothing_that_is_imported_is_free() -> None:
     for arc in PRIMARY:
         assert roles[network.arcs[network.arc_index[arc]].donor] is Role.NONRENEWABLE_RESERVOIR
     assert roles[network.arcs[network.arc_index["scrap_imports"]].donor] is Role.TECHNOSPHERE
-    exports = [network.arcs[k].id for k in network.metered(network.services[1])]
+    exports = [network.arcs[k].id for k in network.service_arcs(network.services[1])]
     assert sorted(exports) == ["flat_exports", "goods_exports", "long_exports", "semis_exports"]
     assert {each for arcs in SPLITS.values() for each in arcs} <= set(network.arc_index)
 

@@ -51,7 +51,7 @@ def of(network: Network, run: Rollout, arcs: Sequence[str]) -> Floats:
 def test_every_country_is_in_it(world: Network, everyone: list[Country]) -> None:
     """Each with its agents and one service of demand; markets store nothing; one service more is that of the rest."""
     regions = identifiers(each.name for each in everyone).values()
-    assert len(world.acting) == 13 * 30 and len(world.acting) == len(set(world.acting))
+    assert len(world.default_agents) == 13 * 30 and len(world.default_agents) == len(set(world.default_agents))
     asked = [service.id for service in world.services]
     assert sorted(asked) == sorted([*(f"{each}_steel_in_use" for each in regions), "rest_of_world_supply"])
     market = {node.id for node in world.nodes if node.id.startswith("world_")}
@@ -172,4 +172,4 @@ def test_all_that_can_be_had_is_had(world: Network, usual: Rollout) -> None:
     begun = episode_start(MultiAgentVectorEnv(world, num_envs=1))
     later = rollout(env, Neutral(), start=begun.initial_state)
     assert later.episode_circularity[0] > 0.9 * usual.episode_circularity[0]
-    assert len(load_network("steel_world", scenario="longer_lives").acting) == 17 * 30
+    assert len(load_network("steel_world", scenario="longer_lives").default_agents) == 17 * 30

@@ -21,7 +21,7 @@ from test_own_models import brewery
 from cirl_marl import CirlError, MultiAgentVectorEnv, RunError, load_network, single_agent_env
 from cirl_marl.cli import main
 from cirl_marl.definitions.catalogue import folder
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reader import write_network
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners.interface import Trained
 from cirl_marl.network.units import factor

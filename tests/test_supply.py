@@ -31,7 +31,7 @@ from cirl_marl.controllers import Constant, Neutral
 from cirl_marl.controllers.lint import lint_warnings
 from cirl_marl.controllers.rollout import rollout
 from cirl_marl.controllers.shortages import service_shortages
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reader import write_network
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import achieved, bound, improved
@@ -55,7 +55,7 @@ def cycle(scenario: str | None = None, *, high: float = 400.0, **arc: Any) -> Ne
 
 def demanded(network: Network) -> Floats:
     """Return the demand of each year."""
-    return np.array(network.held(network.services[0].low))
+    return np.array(network.interval_means(network.services[0].low))
 
 
 @pytest.mark.parametrize("scenario", ["default", "lifetimes"])
@@ -187,7 +187,7 @@ def test_several_services_are_solved_together() -> None:
     assert exact.sum() >= 4
     homes, cars = (run.stock[:, network.node_index[each]] for each in ("homes", "cars"))
     np.testing.assert_allclose(homes[exact], 88.0, rtol=1e-9)
-    np.testing.assert_allclose(cars[exact], np.array(network.held(network.services[0].low))[exact], rtol=1e-9)
+    np.testing.assert_allclose(cars[exact], np.array(network.interval_means(network.services[0].low))[exact], rtol=1e-9)
 
 
 def reserve(stock: float, most: float, demand: float = 47.0, export: float = 0.0) -> Network:
@@ -228,7 +228,7 @@ def test_where_one_is_at_its_bound_others_supply_more(high: tuple[float, float])
     network = town((0.5, 0.5), high=(1.0 + high[0], high[1]))
     run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     cars = run.stock[:, network.node_index["cars"]]
-    wanted = np.array(network.held(network.services[0].low))
+    wanted = np.array(network.interval_means(network.services[0].low))
     np.testing.assert_allclose(cars, np.maximum(cars, wanted), rtol=1e-9)
     assert (run.controls[:, 0] == 1.0 + high[0]).any()
     arcs = tuple(
@@ -250,7 +250,7 @@ def test_services_that_hang_together_are_all_met() -> None:
     changed: dict[str, dict[str, Any]] = {"mine_a": {"weight": None}, "mine_b": homes}
     arcs = [replace(arc, **changed.get(arc.id, {})) for arc in network.arcs if arc.id != "import"]
     run = rollout(MultiAgentVectorEnv(replace(network, arcs=tuple(arcs)), num_envs=1), Neutral())
-    wanted = np.array([network.held(service.low) for service in network.services])
+    wanted = np.array([network.interval_means(service.low) for service in network.services])
     stock = run.stock[:, [network.node_index[each] for each in ("cars", "homes")]].T
     lowest = (stock / wanted).min(axis=0)
     np.testing.assert_allclose(lowest[run.controls[:, :2].max(axis=1) > 1.0], 1.0, rtol=1e-6)
@@ -277,7 +277,7 @@ def test_copies_are_lone_environments(network: Network) -> None:
 
 def test_bounds_allow_all_that_may_be_supplied() -> None:
     """An idle supply may be any amount in the program; its plan is carried out with what is supplied then."""
-    network = replace(cycle("lifetimes"), acting=("old_scrap",))
+    network = replace(cycle("lifetimes"), default_agents=("old_scrap",))
     found = bound(network, min_service=0.999)
     assert str(found).endswith("smelting may supply any amount within bounds in it")
     assert "may supply" not in str(bound(cycle(), min_service=0.9, horizon=3))
@@ -303,7 +303,7 @@ def test_supplies_keep_the_proportions_that_the_program_knows(
 
     Flows are means over the interval, which satisfy rows that are the same in each of its pieces.
     """
-    network = replace(town((weight, 1 - weight), high), acting=("import",))
+    network = replace(town((weight, 1 - weight), high), default_agents=("import",))
     nodes = tuple(replace(node, initial=(ore, ore)) if node.id == "ore_a" else node for node in network.nodes)
     network = replace(network, nodes=nodes)
     programs = Programs(Admissible.of(network, ("import",)), 2, None, merge_pieces=merged)
@@ -333,7 +333,7 @@ def test_supplies_keep_the_proportions_that_the_program_knows(
 
 def test_no_bound_chooses_among_sources_that_nobody_chooses_among() -> None:
     """One source counts in λ, one does not: both are drawn on alike in the plan of the bound, as in the simulator."""
-    network = replace(town((0.5, 0.5)), acting=("import",))
+    network = replace(town((0.5, 0.5)), default_agents=("import",))
     nodes = tuple(replace(node, role=Role.ENVIRONMENT) if node.id == "ore_b" else node for node in network.nodes)
     network = replace(network, nodes=nodes)
     found = bound(network, min_service=0.999)

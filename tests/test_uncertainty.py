@@ -36,13 +36,13 @@ from cirl_marl import (
 from cirl_marl.cli import app
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import rollout
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reader import write_network
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.environments.state import Outcome
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
 from cirl_marl.learners import train
-from cirl_marl.network.uncertainty import DISTRIBUTIONS, Spread, drawn
+from cirl_marl.network.uncertainty import DISTRIBUTIONS, Spread, draw_network
 from cirl_marl.optimum import bound
 
 Floats = NDArray[np.floating]
@@ -98,7 +98,7 @@ def test_a_draw_is_the_network_with_other_numbers() -> None:
     twice = Spread(low=1.0, high=2.0, distribution="uniform")
     flow = Series(times=(0.0, 2.0), values=(10.0, 4.0))
     network = line({"arcs.dig.flow": twice, "arcs.leak.rate": twice, "arcs.tails.share": twice}, flow=flow)
-    found = drawn(network, [2.0, 1.5, 2.0])
+    found = draw_network(network, [2.0, 1.5, 2.0])
     dig, tails, metal, leak = found.arcs
     assert dig.flow == replace(flow, values=(20.0, 8.0)) and leak.rate == pytest.approx(0.15)
     assert tails.share == pytest.approx(0.4) and metal.share is None
@@ -110,13 +110,13 @@ def test_a_draw_is_the_network_with_other_numbers() -> None:
 def test_shares_stay_shares() -> None:
     """Where all are stated they are divided by their sum; where one takes the rest it is never less than none."""
     wide = Spread(low=0.1, high=9.0, distribution="uniform")
-    stated = drawn(line({"arcs.tails.share": wide}, kept=0.8), [9.0])
+    stated = draw_network(line({"arcs.tails.share": wide}, kept=0.8), [9.0])
     assert stated.arcs[1].share == pytest.approx(1.8 / 2.6) and stated.arcs[2].share == pytest.approx(0.8 / 2.6)
-    little = drawn(line({"arcs.tails.share": wide}, kept=0.8), [0.1])
+    little = draw_network(line({"arcs.tails.share": wide}, kept=0.8), [0.1])
     assert little.arcs[1].share == pytest.approx(0.02 / 0.82) and little.arcs[2].share == pytest.approx(0.8 / 0.82)
-    rest = drawn(line({"arcs.tails.share": wide}), [9.0])
+    rest = draw_network(line({"arcs.tails.share": wide}), [9.0])
     assert rest.arcs[1].share == pytest.approx(1.0)
-    assert drawn(line({"arcs.tails.share": wide}), [0.1]).arcs[1].share == pytest.approx(0.02)
+    assert draw_network(line({"arcs.tails.share": wide}), [0.1]).arcs[1].share == pytest.approx(0.02)
 
 
 def test_samples_are_single_simulations() -> None:
@@ -153,7 +153,9 @@ def test_causes_are_the_shares_of_the_variance() -> None:
         factors = np.ones((2, 3))
         factors[:, k] += np.array([-1, 1]) * (0.1, 0.4)[k]
         low, high = (
-            rollout(MultiAgentVectorEnv(drawn(network, each.tolist()), num_envs=1), Neutral()).episode_circularity[0]
+            rollout(
+                MultiAgentVectorEnv(draw_network(network, each.tolist()), num_envs=1), Neutral()
+            ).episode_circularity[0]
             for each in factors
         )
         parts.append(((high - low) / 2) ** 2)
@@ -260,7 +262,7 @@ def test_each_copy_is_the_network_with_what_it_drew(network: Network, seed: int)
     lone = MultiAgentVectorEnv(network, num_envs=1, uncertain=True, reward="mixed_difference")
     lone.reset(seed=seed + 1)
     others = [
-        MultiAgentVectorEnv(drawn(network, factors[:, i].tolist()), num_envs=1, reward="mixed_difference")
+        MultiAgentVectorEnv(draw_network(network, factors[:, i].tolist()), num_envs=1, reward="mixed_difference")
         for i in (0, 1)
     ]
     names = env.rows.start_names
@@ -285,7 +287,7 @@ def test_supplies_make_up_for_what_was_drawn() -> None:
     run = rollout(env, Neutral(), seed=2)
     for i in range(3):
         other = MultiAgentVectorEnv(
-            drawn(network, env.physical.factors[:, i].tolist()), num_envs=3, reward="difference"
+            draw_network(network, env.physical.factors[:, i].tolist()), num_envs=3, reward="difference"
         )
         alone = rollout(other, Neutral(), seed=2)
         np.testing.assert_allclose(run.circularity_mean[i], alone.circularity_mean[i], rtol=1e-9)
@@ -388,7 +390,7 @@ def test_no_draw_exceeds_what_arrays_are_made_for() -> None:
     assert MultiAgentVectorEnv(network, num_envs=1, uncertain=True).dynamics.substeps == 2
     (mine_,) = (i for i, node in enumerate(network.stores) if node.id == "mine")
     assert network.initial[0, mine_] == pytest.approx(10.0 * 5.0 * 4)
-    np.testing.assert_array_equal(drawn(network, factors[:, 7].tolist()).initial, network.initial)
+    np.testing.assert_array_equal(draw_network(network, factors[:, 7].tolist()).initial, network.initial)
 
 
 @pytest.mark.slow
@@ -403,7 +405,7 @@ def test_an_episode_is_held_against_what_it_drew(tmp_path: Path) -> None:
     for entry in found.entries:
         assert entry.bound is not None
         for i in range(3):
-            certain, levels = drawn(network, factors[:, i].tolist()), entry.rollout.episode_levels[i]
+            certain, levels = draw_network(network, factors[:, i].tolist()), entry.rollout.episode_levels[i]
             least, most = (bound(certain, starts[:, i], min_service=levels - cut).objective for cut in (1e-7, 2e-4))
             assert least - 1e-6 <= entry.bound[i] <= most
             assert entry.bound[i] >= entry.circularity[i]

@@ -14,8 +14,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from cirl_marl.definitions.permission import code_allowed
-from cirl_marl.definitions.reading import DEFAULT
+from cirl_marl.definitions.code_permission import code_allowed
+from cirl_marl.definitions.reader import DEFAULT
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
 

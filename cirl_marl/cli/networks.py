@@ -13,7 +13,7 @@ import typer
 from cirl_marl.cli.common import NETWORKS, NetworkName, Scenario, StartSeed, app, bar, console, errors, plain, say, stem
 from cirl_marl.controllers.rollout import episode_start
 from cirl_marl.definitions.catalogue import families, load_network, recipes
-from cirl_marl.definitions.reading import Definition
+from cirl_marl.definitions.reader import Definition
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
@@ -142,7 +142,7 @@ def _part(progress: Callable[[float], None], place: int, count: int, share: floa
 
 def _with_regions(source: str) -> list[str]:
     """Return a file as it is, or once for each region that it has."""
-    from cirl_marl.definitions.reading import read_toml
+    from cirl_marl.definitions.reader import read_toml
 
     try:
         regions = read_toml(Path(source)).get("regions") if source.endswith(".toml") else None
@@ -153,7 +153,7 @@ def _with_regions(source: str) -> list[str]:
 
 def _is_recipe(source: str) -> bool:
     """Whether a file says how to learn, or a name is that of a recipe."""
-    from cirl_marl.definitions.reading import read_toml
+    from cirl_marl.definitions.reader import read_toml
 
     if not source.endswith(".toml"):
         return source in recipes()

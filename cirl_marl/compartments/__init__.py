@@ -9,15 +9,15 @@ from inspect import isabstract
 from typing import Any
 
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.network.model import (
+from cirl_marl.network.compartment_model import (
     CompartmentModel,
     ContinuousModel,
     DiscreteTimeModel,
     GoalTask,
-    Measuring,
-    Outflowing,
+    MeasuringModel,
+    OutflowModel,
     OwnStepModel,
-    Releasing,
+    ReleasingModel,
     RewardState,
     Task,
     Vehicle,
@@ -29,10 +29,10 @@ __all__ = [
     "ContinuousModel",
     "DiscreteTimeModel",
     "GoalTask",
-    "Measuring",
-    "Outflowing",
+    "MeasuringModel",
+    "OutflowModel",
     "OwnStepModel",
-    "Releasing",
+    "ReleasingModel",
     "RewardState",
     "Task",
     "Vehicle",

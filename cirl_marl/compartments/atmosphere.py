@@ -6,12 +6,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from cirl_marl.network.declared import frozen
-from cirl_marl.network.model import ContinuousModel, RewardState
+from cirl_marl.network.compartment_model import ContinuousModel, RewardState
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.network.rowsum import Floats
 
 
-@frozen
+@frozen_record
 class Atmosphere(ContinuousModel):
     """Stock of CO₂ that rises by what is emitted and falls by what is removed: ṁ = ṁ12 − ṁ23 (arXiv 2502.02382).
 

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from cirl_marl.compartments.transport_truck import TransportTruck
 from cirl_marl.errors import CirlError
-from cirl_marl.network.declared import NotNegative, Positive, Quantity, frozen
-from cirl_marl.network.model import RewardState, Vehicle
+from cirl_marl.network.compartment_model import RewardState, Vehicle
+from cirl_marl.network.declarations import NotNegative, Positive, Quantity, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 
-@frozen
+@frozen_record
 class DeliveryTruck(TransportTruck, Vehicle):
     """The point mass of ``TransportTruck`` with the load that the network gives it, on a road of ``target_m``.
 
@@ -65,11 +65,11 @@ class DeliveryTruck(TransportTruck, Vehicle):
         cost: Floats = distance + self.speed_weight * speed_m_s**2 + self.force_weight * inputs[0] ** 2
         return -cost
 
-    def boarding(self, state: Floats) -> NDArray[np.bool_]:
+    def can_board(self, state: Floats) -> NDArray[np.bool_]:
         """Return where the truck rests at the donor and heads nowhere, shape (B,)."""
         return self._at(state, 0.0)
 
-    def arrived(self, state: Floats) -> NDArray[np.bool_]:
+    def has_arrived(self, state: Floats) -> NDArray[np.bool_]:
         """Return where the truck rests at the recipient with its load, shape (B,)."""
         return self._at(state, self.target_m)
 

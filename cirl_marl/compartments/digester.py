@@ -9,13 +9,13 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from cirl_marl.errors import CirlError
-from cirl_marl.network.declared import NotNegative, Positive, Quantity, Share, frozen
-from cirl_marl.network.model import ContinuousModel, Measuring, Outflowing, RewardState
+from cirl_marl.network.compartment_model import ContinuousModel, MeasuringModel, OutflowModel, RewardState
+from cirl_marl.network.declarations import NotNegative, Positive, Quantity, Share, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 
-@frozen
-class Digester(ContinuousModel, Outflowing, Measuring):
+@frozen_record
+class Digester(ContinuousModel, OutflowModel, MeasuringModel):
     """AM2 with one dilution rate D, the control: the physically sound form.
 
     Ẋ1 = (μ1 − αD)X1, Ṡ1 = D(S1in − S1) − k1μ1X1, Ẋ2 = (μ2 − αD)X2, Ṡ2 = D(S2in − S2) + k2μ1X1 − k3μ2X2,

@@ -8,13 +8,13 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from cirl_marl.compartments.digester import Digester
-from cirl_marl.network.declared import Declared, Positive, frozen
-from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
+from cirl_marl.network.compartment_model import ContinuousModel, OutflowModel, RewardState
+from cirl_marl.network.declarations import Declaration, Positive, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 
-@frozen
-class DigesterPublished(ContinuousModel, Outflowing):
+@frozen_record
+class DigesterPublished(ContinuousModel, OutflowModel):
     """AM2 after arXiv 2502.02382: ż = f(z) + G(z)·(D̄ + φ) with one dilution D̄ + φ_i for each state.
 
     The initial-condition-dependent controller φ = −½G⁻¹(2f + ∇V) with V = p(x̃ᵀx̃)^q and x̃ = z − z̄ gives x̃̇ = −½∇V and
@@ -33,12 +33,12 @@ class DigesterPublished(ContinuousModel, Outflowing):
     time_unit: ClassVar[str] = "day"
     reward_state: ClassVar[RewardState] = "before"
 
-    process: Annotated[Digester, Declared("the parameters, and what both forms share")] = field(
+    process: Annotated[Digester, Declaration("the parameters, and what both forms share")] = field(
         default_factory=Digester
     )
     dilution_per_day: Annotated[float, Positive("D̄ at the equilibrium z̄ [published]")] = 0.5
     settling_day: Annotated[float, Positive("T_max of the controller, d [published]")] = 3.5
-    misprint: Annotated[bool, Declared("whether P_C has the published product [published: True]")] = True
+    misprint: Annotated[bool, Declaration("whether P_C has the published product [published: True]")] = True
 
     @property
     def equilibrium(self) -> Floats:

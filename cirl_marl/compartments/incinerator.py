@@ -9,8 +9,8 @@ from typing import Annotated, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from cirl_marl.network.declared import NotNegative, Positive, Quantity, Share, Word, frozen
-from cirl_marl.network.model import ContinuousModel, Outflowing, RewardState
+from cirl_marl.network.compartment_model import ContinuousModel, OutflowModel, RewardState
+from cirl_marl.network.declarations import NotNegative, Positive, Quantity, Share, Word, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ min. Horizon 100 and T_g(0) ~ U[900, 1100] °C are inferred: from the
@@ -26,7 +26,7 @@ class Flows(NamedTuple):
 
     feed: Floats | float = 100.0
     ash: Floats | float = 10.0
-    consumed: Floats | float = 70.0
+    waste_consumed: Floats | float = 70.0
     char_made: Floats | float = 6.0
     char_burnt: Floats | float = 3.0
     char_out: Floats | float = 2.0
@@ -39,8 +39,8 @@ PUBLISHED_FLOWS = Flows()
 """F_in, F_out, R_w, P, R_c, F_c, R_g, F_w, F_g. [published] They leave 3 kg/min of gas in the freeboard for ever."""
 
 
-@frozen
-class Incinerator(ContinuousModel, Outflowing):
+@frozen_record
+class Incinerator(ContinuousModel, OutflowModel):
     """Masses and temperatures of wastebed (waste M, char M_c, gas M_w, T_w) and freeboard (gas M_f, T_g).
 
     Ṁ = F_in − F_out − R_w, Ṁ_c = P − R_c − F_c, Ṁ_w = F_aI + R_g − F_w, Ṁ_f = F_w + F_aII − F_g,
@@ -123,12 +123,12 @@ class Incinerator(ContinuousModel, Outflowing):
         faster = np.exp(self.activation_k * inverse)
         of_waste, of_char = waste / self.waste_reference_kg, char / self.char_reference_kg
         usual = PUBLISHED_FLOWS
-        consumed, char_burnt = usual.consumed * faster * of_waste, usual.char_burnt * faster * of_char
-        char_made = usual.char_made / usual.consumed * consumed
+        consumed, char_burnt = usual.waste_consumed * faster * of_waste, usual.char_burnt * faster * of_char
+        char_made = usual.char_made / usual.waste_consumed * consumed
         return Flows(
             feed=feed,
             ash=usual.ash * of_waste,
-            consumed=consumed,
+            waste_consumed=consumed,
             char_made=char_made,
             char_burnt=char_burnt,
             char_out=usual.char_out * of_char,
@@ -145,7 +145,7 @@ class Incinerator(ContinuousModel, Outflowing):
         like = np.zeros_like(state[0])
         return np.stack(
             [
-                like + (flows.feed - flows.ash - flows.consumed),
+                like + (flows.feed - flows.ash - flows.waste_consumed),
                 like + (-flows.char_out + flows.char_made - flows.char_burnt),
                 bed_power / bed_capacity,
                 like + (self.air_bed_kg_min - flows.to_freeboard + flows.gas_made),

@@ -9,7 +9,7 @@ from functools import partial
 from typing import ClassVar
 
 from cirl_marl.compartments.nutrient import Drawdown, draw_down, substeps
-from cirl_marl.network.model import ContinuousModel, Form, OwnStepModel
+from cirl_marl.network.compartment_model import ContinuousModel, Form, OwnStepModel
 from cirl_marl.network.rowsum import Floats
 
 

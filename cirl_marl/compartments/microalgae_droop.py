@@ -8,15 +8,15 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from cirl_marl.compartments.microalgae import Microalgae
-from cirl_marl.network.declared import NotNegative, Positive, frozen
-from cirl_marl.network.model import Form, RewardState
+from cirl_marl.network.compartment_model import Form, RewardState
+from cirl_marl.network.declarations import NotNegative, Positive, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[0, 5] µmol/L is inferred (mean return 454; the paper's end
 # at 446 to 473). The light changes the return by no more than 0.1 %.
 
 
-@frozen
+@frozen_record
 class MicroalgaeDroop(Microalgae):
     """Chemostat with biomass X, cell quota Q and dissolved nutrient S; the control is the light I.
 
@@ -95,13 +95,13 @@ class MicroalgaeDroop(Microalgae):
         for _ in range(steps):
             early_demand = most * biomass
             early = draw(nutrient, early_demand)
-            quota = quota + most / kept * early.retained
+            quota = quota + most / kept * early.share_retained
 
             grown = least + (quota - least) * ungrown
             biomass, quota = biomass * (kept * kept) * (quota / grown), grown
 
             late_demand = most * biomass
             late = draw(early.nutrient, late_demand)
-            quota, nutrient = quota + most * late.retained, late.nutrient
+            quota, nutrient = quota + most * late.share_retained, late.nutrient
             uptake += self._taken(most, (early_demand, early), (late_demand, late))
         return np.stack([biomass, quota, nutrient]), self.co2_per_nutrient / interval * uptake

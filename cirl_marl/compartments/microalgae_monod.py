@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from cirl_marl.compartments.microalgae import Microalgae
-from cirl_marl.network.declared import NotNegative, Positive, frozen
-from cirl_marl.network.model import Form, RewardState
+from cirl_marl.network.compartment_model import Form, RewardState
+from cirl_marl.network.declarations import NotNegative, Positive, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ d. S(0) ~ U[1, 5] µmol/L is inferred: from S = 0 constant darkness
@@ -16,7 +16,7 @@ from cirl_marl.network.rowsum import Floats
 # more S at most 0.2 more: the paper's best end, its untrained policies, its DDPG stuck at full light.
 
 
-@frozen
+@frozen_record
 class MicroalgaeMonod(Microalgae):
     """Chemostat with biomass X and dissolved nutrient S; the control is the light I.
 
@@ -85,12 +85,12 @@ class MicroalgaeMonod(Microalgae):
         for _ in range(steps):
             early_demand = most * biomass
             early = draw(nutrient, early_demand)
-            grown = self.biovolume_yield * early_demand * early.retained
+            grown = self.biovolume_yield * early_demand * early.share_retained
             biomass = biomass * kept + grown
 
             late_demand = most * (biomass * kept + grown)
             late = draw(early.nutrient, late_demand)
-            biomass = biomass * kept + self.biovolume_yield * late_demand * late.retained
+            biomass = biomass * kept + self.biovolume_yield * late_demand * late.share_retained
             nutrient = late.nutrient
             uptake += self._taken(most, (early_demand, early), (late_demand, late))
         return np.stack([biomass, nutrient]), self.co2_per_nutrient / interval * uptake

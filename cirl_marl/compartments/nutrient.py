@@ -37,7 +37,7 @@ class Drawdown(NamedTuple):
 
     nutrient: Floats
     saturation: Floats
-    retained: Floats
+    share_retained: Floats
 
 
 def draw_down(

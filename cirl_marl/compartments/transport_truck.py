@@ -6,15 +6,15 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.network.declared import NotNegative, Positive, frozen
-from cirl_marl.network.model import ContinuousModel, Form, RewardState
+from cirl_marl.network.compartment_model import ContinuousModel, Form, RewardState
+from cirl_marl.network.declarations import NotNegative, Positive, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 # The registered environment: one step is 5·10⁻⁵ s, an episode 0.01 s. x(0) ~ U[0, 500] m is inferred: from 0 the
 # published returns of −1.2·10⁸ are out of reach (the best is −1.99992·10⁸).
 
 
-@frozen
+@frozen_record
 class TransportTruck(ContinuousModel):
     """Point mass on a straight road, driven by a force F.
 

@@ -6,14 +6,14 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from cirl_marl.network.declared import NotNegative, Positive, Share, frozen
-from cirl_marl.network.model import ContinuousModel, RewardState
+from cirl_marl.network.compartment_model import ContinuousModel, RewardState
+from cirl_marl.network.declarations import NotNegative, Positive, Share, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 SECONDS_PER_DAY = 86400.0
 
 
-@frozen
+@frozen_record
 class TroposphereTemperature(ContinuousModel):
     """Radiation balance C·Ṫ = S(1 − α) − ε·σ·T⁴ with the emissivity ε = ε_n − η·x₁/V₁ of air that holds x₁ of CO₂.
 

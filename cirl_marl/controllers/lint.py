@@ -14,12 +14,12 @@ from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.compartment_model import ReleasingModel
 from cirl_marl.network.elements import ControlKind, Law, Role
 from cirl_marl.network.lifetimes import CLOSE
-from cirl_marl.network.model import Releasing
 from cirl_marl.network.series import Series, extremes
 from cirl_marl.network.units import factor
-from cirl_marl.network.validate_settings import is_whole
+from cirl_marl.network.validation.settings import is_whole
 
 COARSE = 0.01
 """Share of its largest value by which a state may depend on the step of the solver."""
@@ -80,7 +80,7 @@ def _shares(network: Network) -> Iterator[str]:
     """
     for node in network.nodes:
         split = {arc.id: arc for arc in network.arcs if arc.donor == node.id and arc.law is Law.DONOR}
-        rates = {arc.id: float(network.held(arc.rate)[0]) for arc in split.values()}
+        rates = {arc.id: float(network.interval_means(arc.rate)[0]) for arc in split.values()}
         valves = [(arc, arc.control) for arc in split.values() if arc.control is not None]
         for arc, control in valves if len(valves) < sum(rate > 0 for rate in rates.values()) else ():
             share = rates[arc.id] / sum(rates.values())
@@ -105,7 +105,7 @@ def _departures(network: Network) -> Iterator[str]:
         if len(times) > 1 and times[1] >= horizon * interval:
             yield f"arc '{arc.id}': series: {end}, so that what begins at {times[1]:g} {network.time_unit} never comes"
         recipient = network.nodes[network.node_index[arc.recipient]]
-        batch_kg = recipient.model.batch_kg if isinstance(recipient.model, Releasing) else None
+        batch_kg = recipient.model.batch_kg if isinstance(recipient.model, ReleasingModel) else None
         for time, mass in arc.batches:
             at = f"arc '{arc.id}': batch at {time:g} {network.time_unit}"
             if round(time / interval) >= horizon:
@@ -181,7 +181,7 @@ def _starved(network: Network) -> Iterator[str]:
 
     A source is a donor that nothing enters. That agents can empty others is no fault of the network.
     """
-    scheduled = {arc.id: arc.donor for arc in network.arcs if LAWS[arc.law].scheduled}
+    scheduled = {arc.id: arc.donor for arc in network.arcs if LAWS[arc.law].is_scheduled}
     if not scheduled:
         return
     fed = {arc.recipient for arc in network.arcs}

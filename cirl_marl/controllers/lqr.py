@@ -23,7 +23,7 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declared import frozen
+from cirl_marl.network.declarations import frozen_record
 from cirl_marl.network.elements import ControlKind, Law, Role
 
 RANK, DECAY = 1e-9, 1e-7
@@ -32,7 +32,7 @@ ITERATIONS, CONVERGED = 500, 1e-12
 """Most steps of the fixed point of output feedback, and the relative change at which it has converged."""
 
 
-@frozen
+@frozen_record
 class LinearSystem:
     """The linear laws ẋ = A x + B u + c of a network, read off its compiled flow laws.
 
@@ -246,8 +246,8 @@ def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:
     for arc in network.arcs:
         if reason := reasons.get(arc.law, ""):
             yield f"{reason} '{arc.id}'"
-    if network.changing:
-        yield f"numbers change in time: {', '.join(network.changing)}"
+    if network.time_dependent:
+        yield f"numbers change in time: {', '.join(network.time_dependent)}"
 
 
 def _remedy(network: Network) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout
 from cirl_marl.controllers.shortages import service_shortages, shortages
 from cirl_marl.network import Network
-from cirl_marl.network.staged import CIRO_FACTOR
+from cirl_marl.network.batch_circularity import CIRO_FACTOR
 
 
 def outcome_lines(network: Network, run: Rollout, begun: EpisodeStart) -> list[str]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.ages import entered, held_for, slots
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Node
+from cirl_marl.network.initial_ages import past_inflows, propagator, slots
 from cirl_marl.network.lifetimes import Chain
 
 OLD = 1e-4
@@ -21,7 +21,7 @@ MOST = 2_000
 """Largest number of ages that are."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Pyramid:
     """The ages of what is in use in a node, by the control interval in which it entered."""
@@ -56,7 +56,7 @@ def pyramids(network: Network, run: Rollout, start: Floats) -> list[Pyramid]:
         if node.lifetime is None:
             continue
         inflow = run.flow[:, network.recipients == place].sum(axis=1)
-        chain, stretch = node.lifetime.chain, network.held(node.stretch)
+        chain, stretch = node.lifetime.chain, network.interval_means(node.stretch)
         if node.control is not None:
             stretch = stretch * run.controls[:, network.control_rows[node.id].start]
         if chain is None:
@@ -70,7 +70,7 @@ def pyramids(network: Network, run: Rollout, start: Floats) -> list[Pyramid]:
 def _of_line(node: Node, interval: float, inflow: Floats, start: float) -> Floats:
     assert node.lifetime is not None
     count = slots(node.lifetime, interval)
-    past = entered(node, interval, count)
+    past = past_inflows(node, interval, count)
     every = np.concatenate([(past * start / past.sum())[::-1], inflow * interval])
     return np.array([every[step : step + count][::-1] for step in range(len(inflow) + 1)])
 
@@ -82,12 +82,12 @@ def _of_chain(node: Node, chain: Chain, interval: float, inflow: Floats, start: 
 
     @cache
     def moved(factor: float) -> tuple[Floats, Floats]:
-        return held_for(chain, interval / (mean * factor))
+        return propagator(chain, interval / (mean * factor))
 
     count = _told_apart(chain, interval / mean / max(1.0, float(stretch.max())))
     kept, got = moved(1.0)
     stages, cohorts = got, np.zeros((chain.stages, count))
-    for age, mass in enumerate(entered(node, interval, count)):
+    for age, mass in enumerate(past_inflows(node, interval, count)):
         cohorts[:, age] = stages * mass
         stages = kept @ stages
     cohorts *= start / cohorts.sum()

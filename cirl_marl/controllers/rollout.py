@@ -12,7 +12,7 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 
 EVALUATION_SEEDS = 2**31
 """First seed of evaluations; training draws its seeds below it, so no evaluated episode was trained on."""
@@ -24,7 +24,7 @@ SEED_SPACING = 1_000_000
 """Distance between the first seeds of two evaluations with different ``seed``, so that they share no episode."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class EpisodeStart:
     """Where a single episode begins."""
@@ -38,7 +38,7 @@ class EpisodeStart:
         return env.reset(seed=self.seed, options={"initial_state": self.initial_state})
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Rollout:
     """One episode of each of B copies under one controller."""
@@ -105,7 +105,7 @@ def rollout(
     stock, flow = np.empty((steps, len(env.network.stores))), np.empty((steps, len(env.network.arcs)))
     load, inner = np.empty((steps, len(batches.lines))), np.empty((steps, len(physics.visible)))
     total_flow = np.zeros(len(env.network.arcs))
-    orders = np.flatnonzero(env.dynamics.scheduled[: len(total_flow)])
+    orders = np.flatnonzero(env.dynamics.is_scheduled[: len(total_flow)])
     controls = np.empty((steps, len(env.dynamics.neutral)))
     unmet = np.zeros((steps, len(orders)))
     for t in range(steps):
@@ -143,9 +143,9 @@ def episode_start(env: MultiAgentVectorEnv, seed: int | None = None) -> EpisodeS
     nodes = (node.id for node in env.network.stores)
     middle = dict(zip(nodes, env.network.initial.mean(axis=0).tolist(), strict=True))
     inner = env.dynamics.inner
-    rows = zip(inner.ranged.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
+    rows = zip(inner.range_rows.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
     middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}
-    drawn = "" if len(inner.ranged) == len(inner.names) else "; what models draw themselves as in evaluation 0"
+    drawn = "" if len(inner.range_rows) == len(inner.names) else "; what models draw themselves as in evaluation 0"
     return EpisodeStart(first_seed(0), middle, f"the middle of all initial ranges{drawn}")
 
 

@@ -12,8 +12,8 @@ from cirl_marl.controllers.basic import Arrays, Constant, Controller
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats
+from cirl_marl.network.compartment_model import CompartmentModel
 from cirl_marl.network.elements import ControlKind
-from cirl_marl.network.model import CompartmentModel
 
 ModelStates = dict[str, Floats]
 """Observed states of an agent's own model by name, shape (B,) each, in physical units."""

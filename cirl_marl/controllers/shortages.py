@@ -30,7 +30,7 @@ class Shortage:
 def shortages(run: Rollout, network: Network) -> Iterator[Shortage]:
     """Yield the scheduled flows that were cut in a rollout of ``network``; masses are means over its copies."""
     interval = network.episode.control_interval
-    scheduled = [k for k, arc in enumerate(network.arcs) if LAWS[arc.law].scheduled]
+    scheduled = [k for k, arc in enumerate(network.arcs) if LAWS[arc.law].is_scheduled]
     for k, unmet in zip(scheduled, run.shortage.T, strict=True):
         mass = float(unmet.sum())
         asked = mass + float(run.mean_flow[k]) * interval * len(unmet)

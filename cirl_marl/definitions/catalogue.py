@@ -8,18 +8,18 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from cirl_marl.definitions.permission import code_allowed
-from cirl_marl.definitions.reading import Definition
+from cirl_marl.definitions.code_permission import code_allowed
+from cirl_marl.definitions.reader import Definition
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Network
 
-PACKAGED = Path(__file__).parent.parent / "_catalogue"
+IN_PACKAGE = Path(__file__).parent.parent / "_catalogue"
 CHECKOUT = Path(__file__).parent.parent.parent
 
 
 def folder(kind: str) -> Path:
     """Return the folder of definitions ``envs`` or ``agents``, of the installed package or of a checkout."""
-    packaged = PACKAGED / kind
+    packaged = IN_PACKAGE / kind
     if packaged.is_dir():
         return packaged
     beside = CHECKOUT / kind
@@ -100,7 +100,7 @@ def _definition(path: Path) -> Definition:
     """Return a definition, as it was read before if neither it nor its data files have been edited since."""
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
     found = _read(path.resolve(), stamp)
-    if found.files.edited:
+    if found.files.has_changed:
         _read.cache_clear()
         found = _read(path.resolve(), stamp)
     return found

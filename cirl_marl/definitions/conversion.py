@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.compartments import CompartmentModel, model_class
-from cirl_marl.definitions.columns import DataFiles
-from cirl_marl.definitions.mistakes import parameter_mistakes
-from cirl_marl.definitions.permission import refusal
+from cirl_marl.definitions.code_permission import refusal
+from cirl_marl.definitions.data_files import DataFiles
+from cirl_marl.definitions.error_messages import parameter_mistakes
 from cirl_marl.definitions.quantities import AmountColumn, AmountSeries, QuantityTable, Range
 from cirl_marl.definitions.schema import Batches, ModelTable, NetworkTable
-from cirl_marl.definitions.series import Clock, column_value, inline_series, product
+from cirl_marl.definitions.series_tables import Clock, column_value, inline_series, product
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network import Network, elements
-from cirl_marl.network.declared import Declared, Nested, Numbers, Quantity, declarations
-from cirl_marl.network.elements import TAKEN, Arc, Control, ControlKind, Law, Node
+from cirl_marl.network.declarations import Declaration, Numbers, Quantity, Subtable, declarations
+from cirl_marl.network.elements import LAW_FIELDS, Arc, Control, ControlKind, Law, Node
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import Spread
 from cirl_marl.network.units import factor
 
-GIVEN = ("rate", "flow", "batches")
+FLOW_KEYS = ("rate", "flow", "batches")
 """Keys of which a law needs one, if it takes any of them."""
 CONSTANT = "cannot change in time; fix the time, too, in 'where', and leave no column of times"
 REGION = "{region}"
@@ -44,9 +44,9 @@ class Converter:
         """Take the document, the files that it names and the region meant; ``network`` converts it."""
         self.table, self.files, self.region = table, files, region
         self.mistakes: list[str] = []
-        self.used: set[str] = set()
+        self.data_files: set[str] = set()
         self.uncertain: dict[str, Spread] = {}
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         mass, time = table.units.mass, table.units.time
         self.targets = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})", "steps": "1"}
         self.factors: dict[tuple[str, str], float] = {}
@@ -79,7 +79,7 @@ class Converter:
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),
         }
-        title, material = (self._placed(getattr(table, key), key) for key in ("title", "material"))
+        title, material = (self._with_region(getattr(table, key), key) for key in ("title", "material"))
         if self.mistakes:
             raise NetworkError(table.name, self.mistakes)
         return Network(
@@ -90,8 +90,8 @@ class Converter:
             mass_unit=table.units.mass,
             time_unit=table.units.time,
             region=self.region,
-            data_sha256={name: self.files.sha256(name) for name in sorted({*self.used, *self.files.others})},
-            acting=tuple(table.agents),
+            data_sha256={name: self.files.sha256(name) for name in sorted({*self.data_files, *self.files.plain_files})},
+            default_agents=tuple(table.agents),
             uncertain=self.uncertain,
             **parts,
             **known,
@@ -108,13 +108,13 @@ class Converter:
         except NetworkError as error:
             raise NetworkError(self.table.name, [f"{where}: {problem}" for problem in error.problems]) from None
 
-    def _read(self, declared: Declared, given: Any, table: Any, where: str) -> Any:
+    def _read(self, declared: Declaration, given: Any, table: Any, where: str) -> Any:
         """Return what a declared field is in Python."""
         if isinstance(declared, Quantity):
             kind = declared.kind(table)
-            if declared.shared:
+            if declared.unit_of_table:
                 return given * self._factor(table.unit, kind, where)
-            value: Any = None if given == declared.none else self._value(given, kind, where)
+            value: Any = None if given == declared.none_word else self._value(given, kind, where)
             if isinstance(value, Series) and not declared.varies:
                 self.mistakes.append(f"{where}: {CONSTANT}")
                 return 1
@@ -123,13 +123,13 @@ class Converter:
             if value != int(value):
                 self.mistakes.append(f"{where}: {value} must be a whole number of control intervals")
             return int(value)
-        if isinstance(declared, Nested) and declared.of == "lifetime":
+        if isinstance(declared, Subtable) and declared.of == "lifetime":
             return self._part(elements.Lifetime, given, where)
         if isinstance(given, Range):
             assert isinstance(declared, Numbers)
             scale = self._factor(given.unit, declared.of, where)
             return given.low * scale, given.high * scale
-        if isinstance(declared, Numbers) and declared.spelled == "range":
+        if isinstance(declared, Numbers) and declared.table_form == "range":
             stock = self._number(given, declared.of, where)
             return stock, stock
         if isinstance(given, Batches):
@@ -150,10 +150,10 @@ class Converter:
 
     def _check_law(self, arc: Any, where: str) -> None:
         """Note an arc that lacks what its law needs, or gives what only others take."""
-        given = [key for key in GIVEN if getattr(arc, key) is not None]
-        needed = [key for key in GIVEN if key in TAKEN[Law(arc.law)]]
+        given = [key for key in FLOW_KEYS if getattr(arc, key) is not None]
+        needed = [key for key in FLOW_KEYS if key in LAW_FIELDS[Law(arc.law)]]
         if len(given) != min(1, len(needed)) or not set(given) <= set(needed):
-            asked = " or ".join(needed) or f"none of {', '.join(GIVEN)}"
+            asked = " or ".join(needed) or f"none of {', '.join(FLOW_KEYS)}"
             self.mistakes.append(f"{where}: law '{arc.law}' needs {asked}, got {given or 'none'}")
         if arc.share is not None and Law(arc.law) is not Law.SHARE:
             self.mistakes.append(f"{where}.share: law '{arc.law}' takes none; shares need law = \"share\"")
@@ -271,17 +271,17 @@ class Converter:
         try:
             if isinstance(given, AmountSeries):
                 return inline_series(given, unit, self.clock)
-            texts = {key: self._placed(text, f"{where}.where.{key}") for key, text in given.where.items()}
+            texts = {key: self._with_region(text, f"{where}.where.{key}") for key, text in given.where.items()}
             found = column_value(given, texts, self.files, unit, self.clock)
         except CirlError as error:
-            if str(error) not in self._told or isinstance(given, AmountSeries):
+            if str(error) not in self._reported or isinstance(given, AmountSeries):
                 self.mistakes.append(f"{where}: {error}")
-            self._told.add(str(error))  # a file that cannot be read is told once, not for each of its columns
+            self._reported.add(str(error))  # a file that cannot be read is told once, not for each of its columns
             return 0.0
-        self.used.add(given.file)
+        self.data_files.add(given.file)
         return found
 
-    def _placed(self, text: str, where: str) -> str:
+    def _with_region(self, text: str, where: str) -> str:
         """Return a text of the file with that of the region in its place."""
         if REGION in text and not self.region:
             self.mistakes.append(f"{where}: '{text}': a definition without [regions] has no {REGION}")

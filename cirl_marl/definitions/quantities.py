@@ -150,7 +150,7 @@ def _form(given: object) -> str:
     return COLUMN if {"file", "column", "where"} & keys else SERIES if {"times", "values"} & keys else VALUE
 
 
-def varying(value: Any, series: Any, column: Any, word: str = "") -> Any:
+def number_forms(value: Any, series: Any, column: Any, word: str = "") -> Any:
     """Return the type of a number that may be given in several forms, which its keys tell, or as a word.
 
     Without ``value`` it has to change in time.
@@ -164,7 +164,7 @@ def varying(value: Any, series: Any, column: Any, word: str = "") -> Any:
 
 
 if not TYPE_CHECKING:
-    Factor = varying(QuantityTable, SeriesTable, ColumnTable) | None
+    Factor = number_forms(QuantityTable, SeriesTable, ColumnTable) | None
 for _made in (StatedTable, QuantityTable, SeriesTable, ColumnTable):
     _made.model_rebuild()
 
@@ -178,4 +178,4 @@ def forms(kind: Any) -> dict[str, Any]:
     return found
 
 
-VaryingAmount = varying(Number, AmountSeries, AmountColumn)
+VaryingAmount = number_forms(Number, AmountSeries, AmountColumn)

@@ -20,21 +20,30 @@ from cirl_marl.definitions.quantities import (
     Table,
     Time,
     VaryingAmount,
-    varying,
+    number_forms,
 )
-from cirl_marl.network.declared import (
+from cirl_marl.network.declarations import (
     CalendarTime,
-    Declared,
-    Nested,
+    Declaration,
     Numbers,
     Quantity,
+    Subtable,
     Word,
     declarations,
     default_of,
     is_required,
 )
-from cirl_marl.network.elements import Arc, Control, Episode, Lifetime, Node, Objective, Observation, Service
-from cirl_marl.network.validate import IDENTIFIER
+from cirl_marl.network.elements import (
+    IDENTIFIER,
+    Arc,
+    Control,
+    Episode,
+    Lifetime,
+    Node,
+    Objective,
+    Observation,
+    Service,
+)
 
 Identifier = Annotated[str, Field(pattern=IDENTIFIER)]
 IN_MODEL = ("inner", "reward_scale")
@@ -79,12 +88,13 @@ class ModelTable(Table):
 def table_of(made: type[Any], **more: Any) -> Any:
     """Return the table of a part: a key for each declared field, with ``more`` that Python has otherwise."""
     told, hints = declarations(made), get_type_hints(made)
-    unspelt = [n for n, each in told.items() if isinstance(each, Numbers) and not each.spelled and n not in IN_MODEL]
+    unspelt = [n for n, each in told.items() if isinstance(each, Numbers) and not each.table_form and n not in IN_MODEL]
     if unspelt:
         raise TypeError(f"{made.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
-    spelled = {name: _spelled(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
+    spelled = {name: _field_type(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
     keys = {name: _key(made, name, kind) for name, kind in spelled.items() if kind is not None}
-    if VaryingAmount in spelled.values() or any(isinstance(each, Quantity) and each.shared for each in told.values()):
+    of_table = any(isinstance(each, Quantity) and each.unit_of_table for each in told.values())
+    if of_table or VaryingAmount in spelled.values():
         more |= {"unit": (str, ...), "source": (Source, ...)}
     summary = str(made.__doc__).partition("\n")[0]
     return create_model(f"{made.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
@@ -96,34 +106,34 @@ def _key(made: type[Any], name: str, kind: Any) -> tuple[Any, Any]:
     told: dict[str, Any] = {"description": declared.meaning, "alias": declared.key or None}
     if is_required(made, name):
         return kind, Field(**told)
-    if isinstance(declared, Quantity | Numbers | Nested | CalendarTime):
+    if isinstance(declared, Quantity | Numbers | Subtable | CalendarTime):
         return kind | None, Field(None, **told)
     return kind, Field(list(default) if isinstance(default, tuple) else default, **told)
 
 
-def _spelled(declared: Declared, hint: Any) -> Any:
+def _field_type(declared: Declaration, hint: Any) -> Any:
     """Return the type of a declared field in a file; None if it stands in the table of another."""
     if isinstance(declared, Word):
         return declared.of if isinstance(declared.of, type) else Literal[declared.of]
     if isinstance(declared, Numbers):
-        tables = {"range": varying(Range, None, ColumnTable), "batches": Batches, "amount": VaryingAmount}
-        return tables[declared.spelled] if declared.spelled else None
-    if isinstance(declared, Nested):
+        tables = {"range": number_forms(Range, None, ColumnTable), "batches": Batches, "amount": VaryingAmount}
+        return tables[declared.table_form] if declared.table_form else None
+    if isinstance(declared, Subtable):
         return {"control": ControlTable, "lifetime": LifetimeTable, "model": ModelTable}[declared.of]
     if isinstance(declared, CalendarTime):
         return Time
-    if isinstance(declared, Quantity) and declared.shared:
+    if isinstance(declared, Quantity) and declared.unit_of_table:
         return Number
     if isinstance(declared, Quantity) and declared.past:
-        return varying(None, SeriesTable, ColumnTable)
+        return number_forms(None, SeriesTable, ColumnTable)
     if isinstance(declared, Quantity) and declared.varies:
-        return varying(QuantityTable, SeriesTable, ColumnTable, declared.none)
+        return number_forms(QuantityTable, SeriesTable, ColumnTable, declared.none_word)
     if isinstance(declared, Quantity):
         return FixedQuantity
     return {bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
 
 
-FixedQuantity = varying(QuantityTable, None, ColumnTable)
+FixedQuantity = number_forms(QuantityTable, None, ColumnTable)
 ControlTable = table_of(Control)
 LifetimeTable = table_of(Lifetime)
 NodeTable = table_of(Node)

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from cirl_marl.definitions.reading import Definition
+from cirl_marl.definitions.reader import Definition
 from cirl_marl.errors import DefinitionError
 from cirl_marl.network import Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 
 TABLES = ("nodes", "arcs", "services")
 SETTINGS = ("scales", "episode", "objective")
@@ -17,9 +17,9 @@ ENDS = ("value", "low", "neutral", "high")
 """What a quantity, a range and the span of a control consist of."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
-class Stated:
+class StatedNumber:
     """A number as its definition states it."""
 
     key: Annotated[str, "dotted path within the compartment, service or file, such as ``rate`` or ``control``"]
@@ -27,7 +27,7 @@ class Stated:
     source: Annotated[str, "where it comes from"]
 
 
-def stated(network: Network) -> Mapping[str, Mapping[str, tuple[Stated, ...]]]:
+def stated_numbers(network: Network) -> Mapping[str, Mapping[str, tuple[StatedNumber, ...]]]:
     """Return what the definition of ``network`` states, by table (``nodes``, ``arcs``, ``services``) and id.
 
     It is empty for a network that was built in Python.
@@ -36,13 +36,15 @@ def stated(network: Network) -> Mapping[str, Mapping[str, tuple[Stated, ...]]]:
         DefinitionError: if the file has changed since the network was read from it.
     """
     document = _document(network)
-    return {table: {id_: tuple(_stated(each, "")) for id_, each in document.get(table, {}).items()} for table in TABLES}
+    return {
+        table: {id_: tuple(_numbers_in(each, "")) for id_, each in document.get(table, {}).items()} for table in TABLES
+    }
 
 
-def stated_settings(network: Network) -> tuple[Stated, ...]:
+def stated_settings(network: Network) -> tuple[StatedNumber, ...]:
     """Return what the definition of ``network`` states of scales, episode and objective; see ``stated``."""
     document = _document(network)
-    return tuple(each for table in SETTINGS for each in _stated(document.get(table), table))
+    return tuple(each for table in SETTINGS for each in _numbers_in(document.get(table), table))
 
 
 def _document(network: Network) -> Mapping[str, Any]:
@@ -54,16 +56,16 @@ def _document(network: Network) -> Mapping[str, Any]:
     return definition.document(network.scenario_name)
 
 
-def _stated(value: Any, key: str) -> Iterator[Stated]:
+def _numbers_in(value: Any, key: str) -> Iterator[StatedNumber]:
     if not isinstance(value, Mapping):
         return
     if isinstance(source := value.get("source"), str):
-        yield Stated(key, _said(value), source)
+        yield StatedNumber(key, _in_words(value), source)
     for name, each in value.items():
-        yield from _stated(each, f"{key}.{name}".lstrip("."))
+        yield from _numbers_in(each, f"{key}.{name}".lstrip("."))
 
 
-def _said(value: Mapping[str, Any]) -> str:
+def _in_words(value: Mapping[str, Any]) -> str:
     """Say a quantity, a range, the span of a control, a lifetime, a series, a column of a file, or a model."""
     ends = [value[name] for name in ENDS if name in value] or [value]
     said = " – ".join(map(_end, ends))

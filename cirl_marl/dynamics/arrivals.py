@@ -20,7 +20,7 @@ class Arrivals:
     def __init__(self, laws: FlowLaws, services: Sequence[Service], arcs: Integers, of: Integers) -> None:
         """Take the arcs, and which of ``services`` each stands for."""
         self._laws, self._arcs, self._of, self._count = laws, arcs, of, len(services)
-        network, routing = laws.inside, laws.routing
+        network, routing = laws.staged_network, laws.routing
         stores = len(network.stores)
         ends = network.recipients[arcs] - stores
         self._entering: Integers = np.flatnonzero(ends >= 0)
@@ -32,7 +32,7 @@ class Arrivals:
             if service.quantity == "stock":
                 measured = self._arriving(service)
             else:
-                measured = [int(k) for k in laws.inside.metered(service)]
+                measured = [int(k) for k in laws.staged_network.service_arcs(service)]
             found = [place[k] for k in measured if k in place]
             rows += [row] * len(found)
             columns += found
@@ -40,7 +40,7 @@ class Arrivals:
 
     def _arriving(self, service: Service) -> list[int]:
         """Return the arcs that bring something to the stock that a service measures, from elsewhere."""
-        network = self._laws.inside
+        network = self._laws.staged_network
         parts = getattr(network, "parts", {})
         stock = {node.id for node in network.stores if parts.get(node.id, node.id) in service.providers}
         return [k for k, arc in enumerate(network.arcs) if arc.recipient in stock and arc.donor not in stock]
@@ -62,6 +62,6 @@ class Arrivals:
             np.add.at(through, self._into, own[self._entering])
             passed = np.empty((0, rate.shape[1]))
             if routes is not None:
-                passed = routing.throughputs(through, routes).take(routing.found, 0) * shares
+                passed = routing.throughputs(through, routes).take(routing.throughput_rows, 0) * shares
             found[:, s] = self._measure(np.concatenate([passed, own]))
         return found

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cirl_marl.dynamics.inner import InnerPhysics
-from cirl_marl.dynamics.rows import Line, Rows
+from cirl_marl.dynamics.inner_physics import InnerPhysics
+from cirl_marl.dynamics.state_layout import BatchLine, StateLayout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import RowSum, disposable
@@ -31,7 +31,7 @@ class BatchTransport:
         lines: the batch arcs.
     """
 
-    def __init__(self, network: Network, rows: Rows) -> None:
+    def __init__(self, network: Network, rows: StateLayout) -> None:
         """Compile the batch arcs, whose rows are those of ``rows``."""
         self._network, self._rows, self.lines = network, rows, rows.lines
         self.arcs = [k for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH]
@@ -100,18 +100,19 @@ class BatchTransport:
             physics.receive(node, inner, arrived[node])
         counted = self._arrivals(delivered)
         for line in self._releasing:
-            counted[line.part] += line.leaves * self._collect(line, stock, physics.released(line.by, line.port, inner))
+            units = physics.released_units(line.by, line.port, inner)
+            counted[line.part] += line.leaves * self._collect(line, stock, units)
             self._send(line, stock, inner, step, physics)
         return delivered, counted
 
-    def _collect(self, line: Line, stock: Floats, released: Floats) -> Floats:
+    def _collect(self, line: BatchLine, stock: Floats, released: Floats) -> Floats:
         """Move what the model of ``by`` released in this interval out of the donor."""
         mass: Floats = np.minimum(line.unit * released, stock[line.donor])
         stock[line.donor] -= mass
         stock[line.collecting] += mass
         return mass
 
-    def _send(self, line: Line, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> None:
+    def _send(self, line: BatchLine, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> None:
         """Send complete batches on their way."""
         complete = np.where(physics.complete(line.by, inner), stock[line.collecting], 0.0)
         stock[line.collecting] -= complete

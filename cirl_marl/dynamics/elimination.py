@@ -14,13 +14,13 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.network import Floats, Integers, RowSum
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 
 COSTLY = 2
 """A round eliminates nodes that are at most this many times as costly as the cheapest."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class _Round:
     """Nodes that are eliminated together, and the shares of theirs that are left then."""
@@ -40,7 +40,7 @@ class _Round:
     sources: Annotated[Integers, "node that gives each of ``into``"]
 
 
-class Elimination:
+class EliminationOrder:
     """A sparse order: in each round nodes that are no neighbours and make few detours.
 
     Attributes:
@@ -128,10 +128,10 @@ class Elimination:
         )
 
 
-class Eliminated:
+class EliminatedShares:
     """The eliminated shares of one control interval, in each copy."""
 
-    def __init__(self, order: Elimination, values: Floats) -> None:
+    def __init__(self, order: EliminationOrder, values: Floats) -> None:
         """Eliminate ``values``, shape (entries, B or 1): of each node what leaves the set, then the shares."""
         self._steps = []
         self._inverse = np.empty((order.nodes, values.shape[1]))

@@ -18,15 +18,15 @@ from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.dynamics.factors import DrawnFlows
 from cirl_marl.dynamics.routing import Routing
-from cirl_marl.dynamics.rows import Rows
 from cirl_marl.dynamics.shares import Shares
-from cirl_marl.dynamics.stages import StagedNetwork, inside
+from cirl_marl.dynamics.stages import StagedNetwork, simulated_network
+from cirl_marl.dynamics.state_layout import StateLayout
+from cirl_marl.dynamics.uncertain_factors import FlowFactors
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Arc, ControlKind, Law
-from cirl_marl.network.rowsum import RowSum, narrowed
+from cirl_marl.network.rowsum import RowSum, single_column
 from cirl_marl.network.series import Series, Value
 
 FLOW = ControlKind.FLOW
@@ -34,19 +34,19 @@ SCALING = (ControlKind.RATE, FLOW, ControlKind.STRETCH)
 """Kinds of controls that are factors of flows, a stretch by its inverse."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class FlowLaw:
     """One law, f = r·y[driver]."""
 
-    driver: Annotated[Callable[[Arc, Network, Rows], int], "row whose value the flow is proportional to"]
+    driver: Annotated[Callable[[Arc, Network, StateLayout], int], "row whose value the flow is proportional to"]
     coefficient: Annotated[Callable[[Arc, Network], Value], "r with every control and share at 1"] = (
         lambda arc, network: arc.rate
     )
-    scheduled: Annotated[bool, "whether it asks for a flow, which is cut to what the donor can deliver"] = False
+    is_scheduled: Annotated[bool, "whether it asks for a flow, which is cut to what the donor can deliver"] = False
 
 
-def _unit(arc: Arc, network: Network, rows: Rows) -> int:
+def _unit(arc: Arc, network: Network, rows: StateLayout) -> int:
     return rows.unit
 
 
@@ -59,8 +59,8 @@ LAWS: Mapping[Law, FlowLaw] = {
     Law.DONOR: FlowLaw(lambda arc, network, _: network.node_index[arc.donor]),  # a·x_donor
     Law.RECIPIENT: FlowLaw(lambda arc, network, _: network.node_index[arc.recipient]),  # a·x_recipient
     Law.COMPARTMENT: FlowLaw(lambda arc, _, rows: rows.outputs[arc.by]),  # a·y, y the output of a model
-    Law.CONTROLLED: FlowLaw(_unit, lambda arc, network: 1.0, scheduled=True),  # u, which the control sets
-    Law.EXOGENOUS: FlowLaw(_unit, lambda arc, network: arc.flow, scheduled=True),  # e(t)
+    Law.CONTROLLED: FlowLaw(_unit, lambda arc, network: 1.0, is_scheduled=True),  # u, which the control sets
+    Law.EXOGENOUS: FlowLaw(_unit, lambda arc, network: arc.flow, is_scheduled=True),  # e(t)
     Law.BATCH: FlowLaw(_unit, lambda arc, network: 0.0),  # nothing flows: what moves in batches moves at once
     # s·a·x_donor, or s·q of a donor that stores nothing
     Law.SHARE: FlowLaw(lambda arc, network, rows: int(rows.donors[network.arc_index[arc.id]]), _release),
@@ -94,15 +94,15 @@ class FlowLaws:
     def __init__(self, network: Network, *, uncertain: bool = False) -> None:
         """Compile ``network``."""
         self.network = network
-        self.inside = network = inside(network)
+        self.staged_network = network = simulated_network(network)
         arcs = len(network.arcs)
-        self.rows = rows = Rows(network)
+        self.rows = rows = StateLayout(network)
         ends, twice = np.concatenate([network.donors, network.recipients]), np.tile(np.arange(arcs), 2)
         stored = ends < rows.nodes.stop
         signs = np.repeat([-1.0, 1.0], arcs)
         self.incidence = RowSum(ends[stored], twice[stored], signs[stored], (rows.masses, arcs))
         laws = [LAWS[arc.law] for arc in network.arcs]
-        self.scheduled = np.array([law.scheduled for law in laws], dtype=bool)
+        self.is_scheduled = np.array([law.is_scheduled for law in laws], dtype=bool)
         drivers = [law.driver(arc, network, rows) for law, arc in zip(laws, network.arcs, strict=True)]
         self.driver: Integers = np.array(drivers, dtype=np.intp)
         base = [law.coefficient(arc, network) for law, arc in zip(laws, network.arcs, strict=True)]
@@ -110,20 +110,20 @@ class FlowLaws:
         self._base: Floats = np.array(constant, dtype=float).reshape(-1, 1)
         self._compile_controls()
         # of a series r is the mean over the interval, which ``rate`` multiplies in
-        changing = [(k, network.held(value)) for k, value in enumerate(base) if isinstance(value, Series)]
+        changing = [(k, network.interval_means(value)) for k, value in enumerate(base) if isinstance(value, Series)]
         self._series_arcs: Integers = np.array([k for k, _ in changing], dtype=np.intp)
         self._series = np.array([means for _, means in changing]).reshape(len(changing), network.episode.horizon)
-        self._drawn = DrawnFlows(network) if uncertain else None
+        self._drawn = FlowFactors(network) if uncertain else None
         self._shares = Shares(network, uncertain=uncertain)
-        named = [*self._series_arcs, *(self._shares.varying if self._shares.changing else ())]
-        self.timed = tuple(network.arcs[k].id for k in named)
+        named = [*self._series_arcs, *(self._shares.varying_arcs if self._shares.is_time_varying else ())]
+        self.time_dependent = tuple(network.arcs[k].id for k in named)
         self._bound_rates()
         self._share_out()
-        self.routing = Routing(network, self.rate(self.neutral[:, :1]), self.fixed)
+        self.routing = Routing(network, self.rate(self.neutral[:, :1]), self.is_fixed)
 
     def _bound_rates(self) -> None:
         """Bound what arcs carry and stocks drive with every control at its upper bound."""
-        widest = narrowed(self.control_high).max(axis=1, keepdims=True)
+        widest = single_column(self.control_high).max(axis=1, keepdims=True)
         widest[self._stretched] = self.control_low[self._stretched].min(axis=1, keepdims=True)
         self.max_rate: Floats = self._unshared(widest)[:, 0]
         if len(self._series_arcs):
@@ -132,27 +132,27 @@ class FlowLaws:
             self.max_rate[self._drawn.arcs] *= self._drawn.highest
         # the arcs of a split carry together what one of them would carry alone
         stores = self.rows.nodes.stop
-        counted, ends = self.driver < stores, np.minimum(self.inside.recipients, stores)
+        counted, ends = self.driver < stores, np.minimum(self.staged_network.recipients, stores)
         counted[self._shares.arcs] = False
-        leading = self._shares.leading[self.driver[self._shares.leading] < stores]
+        leading = self._shares.leading_arcs[self.driver[self._shares.leading_arcs] < stores]
         counted[leading], ends[leading] = True, stores
-        self.driven = np.flatnonzero(counted)
-        self.driven_to, self.driven_rate = ends[self.driven], self.max_rate[self.driven]
-        self.turnover: Floats = np.bincount(self.driver[self.driven], self.driven_rate, stores).astype(float)
+        self.driven_arcs = np.flatnonzero(counted)
+        self.driven_to, self.driven_rate = ends[self.driven_arcs], self.max_rate[self.driven_arcs]
+        self.turnover: Floats = np.bincount(self.driver[self.driven_arcs], self.driven_rate, stores).astype(float)
         self.max_rate[self._shares.arcs] *= self._shares.highest
 
     def _share_out(self) -> None:
         """Multiply constant shares into r, where no control comes before them, and find out which r never change."""
         shares = self._shares
-        self.fixed = ~self.scheduled
-        self.fixed[self._acted] = False
-        once = ~np.isin(shares.constant, self._acted)
-        self._base[shares.constant[once]] *= shares.values[once]
-        self._constant_shares = shares.constant[~once], shares.values[~once]
-        self.fixed[self._series_arcs] = False
-        self.fixed[shares.varying] = False
+        self.is_fixed = ~self.is_scheduled
+        self.is_fixed[self._acted] = False
+        once = ~np.isin(shares.constant_arcs, self._acted)
+        self._base[shares.constant_arcs[once]] *= shares.values[once]
+        self._constant_shares = shares.constant_arcs[~once], shares.values[~once]
+        self.is_fixed[self._series_arcs] = False
+        self.is_fixed[shares.varying_arcs] = False
         if self._drawn is not None:
-            self.fixed[self._drawn.arcs] = False
+            self.is_fixed[self._drawn.arcs] = False
 
     def rate(self, controls: Floats, step: Integers | None = None, factors: Floats | None = None) -> Floats:
         """Return r of each arc, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
@@ -166,8 +166,8 @@ class FlowLaws:
         if len(self._constant_shares[0]):
             arcs, shares = self._constant_shares
             rate[arcs] *= shares
-        if len(self._shares.varying):
-            rate[self._shares.varying] *= self._shares(controls, step, factors)
+        if len(self._shares.varying_arcs):
+            rate[self._shares.varying_arcs] *= self._shares(controls, step, factors)
         if step is not None and len(self._series_arcs):
             rate[self._series_arcs] *= self._series[:, step]
         if factors is not None and self._drawn is not None:
@@ -176,7 +176,7 @@ class FlowLaws:
 
     def neutral_in(self, step: Integers) -> Floats:
         """Return the controls while nobody acts, in one interval of each copy, shape (controls, B)."""
-        table = narrowed(self.neutral)  # ``take`` would first write out what is broadcast
+        table = single_column(self.neutral)  # ``take`` would first write out what is broadcast
         return table.take(step, axis=1) if table.shape[1] > 1 else np.repeat(table, len(step), axis=1)
 
     def _unshared(self, controls: Floats) -> Floats:
@@ -212,7 +212,7 @@ class FlowLaws:
 
     def _compile_controls(self) -> None:
         """Find for each arc the rows of the control array that act on it; the row past the last is 1."""
-        network = self.inside
+        network = self.staged_network
         kinds = {c.id: c.control.kind for c in network.compartments.values() if c.control is not None}
         position = {id_: network.control_rows[id_].start for id_, kind in kinds.items() if kind in SCALING}
         stretched = [position[id_] for id_, kind in kinds.items() if kind is ControlKind.STRETCH]

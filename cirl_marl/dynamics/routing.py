@@ -17,20 +17,20 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.dynamics.detours import Detours, Onward, woven
-from cirl_marl.dynamics.elimination import Eliminated
-from cirl_marl.dynamics.passes import Passes
+from cirl_marl.dynamics.elimination import EliminatedShares
+from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, square_matrix
+from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats, Integers, Network, RowSum
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
-class Routed:
+class IntervalRoutes:
     """The shares of one control interval, in each copy."""
 
     rate: Annotated[Floats, "of all arcs, which is their share of those that leave nodes without stock, (arcs, B or 1)"]
-    kept: Annotated[Eliminated, "the kept nodes, eliminated"]
+    kept_nodes: Annotated[EliminatedShares, "the kept nodes, eliminated"]
 
 
 class Routing:
@@ -61,42 +61,44 @@ class Routing:
         self.donors: Integers = network.donors[self.arcs] - stores
         ends = network.recipients[self.arcs] - stores
         self.ends: Integers = np.where(ends < 0, ends + stores + self.nodes, ends)
-        self.fixed = fixed[self.arcs]
+        self.is_fixed = fixed[self.arcs]
         shares = rate[self.arcs, 0]
-        gives: dict[int, Onward] = {i: {} for i in range(self.nodes)}
+        gives: dict[int, SparseRow] = {i: {} for i in range(self.nodes)}
         for i, j, share, same in zip(
-            self.donors.tolist(), self.ends.tolist(), shares.tolist(), self.fixed, strict=True
+            self.donors.tolist(), self.ends.tolist(), shares.tolist(), self.is_fixed, strict=True
         ):
             if share > 0 or not same:
                 gives[i][j] = gives[i].get(j, 0.0) + share
-        constant = set(range(self.nodes)).difference(self.donors[~self.fixed].tolist())
-        self.detours = Detours(self.nodes, constant, gives)
+        constant = set(range(self.nodes)).difference(self.donors[~self.is_fixed].tolist())
+        self.detours = StaticElimination(self.nodes, constant, gives)
         self._compile_passing()
         self._compile_shares(shares)
-        self._constant = self._routes(rate) if self.fixed.all() else None
+        self._constant = self._routes(rate) if self.is_fixed.all() else None
 
     def _compile_passing(self) -> None:
         """Arrange throughputs in the order in which constant nodes are eliminated; the kept ones follow."""
         detours, network, stores = self.detours, self._network, len(self._network.stores)
         early = len(detours.order)
         self._early = slice(0, early)
-        place = {i: n for n, i in enumerate((*detours.order, *detours.kept))}
+        place = {i: n for n, i in enumerate((*detours.order, *detours.kept_nodes))}
         self.places: Integers = np.array([place[i] for i in range(self.nodes)], dtype=np.intp)
         entering = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
         shape = (self.nodes, len(network.arcs))
         self._entering = RowSum(self.places[network.recipients[entering] - stores], entering, 1.0, shape)
         gives = dict(zip(detours.order, detours.out, strict=True))
-        self._ahead = woven(gives, place, self.nodes)
-        self._among = woven(gives, {i: place[i] for i in detours.order}, self.nodes)
+        self._ahead = square_matrix(gives, place, self.nodes)
+        self._among = square_matrix(gives, {i: place[i] for i in detours.order}, self.nodes)
         # throughputs follow from the last to the first: their rows are in the opposite order
         self._inverse = np.array(detours.inverse)[::-1, None]
         back = {i: early - 1 - place[i] for i in detours.order}
-        comes: dict[int, Onward] = {i: {} for i in detours.order}
+        comes: dict[int, SparseRow] = {i: {} for i in detours.order}
         for i, into in zip(detours.order, detours.into, strict=True):
             for j, part in into.items():
                 comes[j][i] = part
-        self._back = woven(comes, back, self.nodes)
-        self.found: Integers = np.where(self.places < early, early - 1 - self.places, self.places)[self.donors]
+        self._back = square_matrix(comes, back, self.nodes)
+        self.throughput_rows: Integers = np.where(self.places < early, early - 1 - self.places, self.places)[
+            self.donors
+        ]
         on = np.flatnonzero((self.places[self.donors] >= early) & (self.ends < self.nodes))
         on = on[self.places[self.ends[on]] < early]
         self._on, self._on_from = self.arcs[on], self.places[self.donors[on]] - early
@@ -105,15 +107,15 @@ class Routing:
     def _compile_shares(self, shares: Floats) -> None:
         """Write the shares between kept nodes as weighted sums of the shares of arcs."""
         detours, order = self.detours, self.detours.elimination
-        place, reach = {i: n for n, i in enumerate(detours.kept)}, detours.reach()
+        place, reach = {i: n for n, i in enumerate(detours.kept_nodes)}, detours.reach()
         same: list[tuple[int, int, float]] = []
         other: list[tuple[int, int, float]] = []
         for k, (i, end) in enumerate(zip(self.donors.tolist(), self.ends.tolist(), strict=True)):
-            if i in place and (shares[k] > 0 or not self.fixed[k]):
+            if i in place and (shares[k] > 0 or not self.is_fixed[k]):
                 for j, part in reach.get(end, {end if end < self.nodes else -1: 1.0}).items():
                     if j != i:
                         entry = order.entry(place[i], place.get(j, -1))
-                        (same if self.fixed[k] else other).append((entry, k, part))
+                        (same if self.is_fixed[k] else other).append((entry, k, part))
         given = [part * shares[k] for _, k, part in same]
         self._given = np.bincount([entry for entry, _, _ in same], given, order.size).astype(float)[:, None]
         self._varying = np.array(sorted({k for _, k, _ in other}), dtype=np.intp)
@@ -121,22 +123,22 @@ class Routing:
         weights = [part for _, _, part in other]
         self._entries = RowSum([entry for entry, _, _ in other], columns, weights, (order.size, len(self._varying)))
 
-    def routes(self, rate: Floats) -> Routed | None:
+    def routes(self, rate: Floats) -> IntervalRoutes | None:
         """Return what to pass flows on with while ``rate``, shape (arcs, B), holds; None if every node stores."""
         return (self._constant or self._routes(rate)) if self.nodes else None
 
-    def _routes(self, rate: Floats) -> Routed:
+    def _routes(self, rate: Floats) -> IntervalRoutes:
         values = np.repeat(self._given, rate.shape[1], axis=1)
         self._entries.add_to(values, rate.take(self.arcs[self._varying], 0))
-        return Routed(rate, Eliminated(self.detours.elimination, values))
+        return IntervalRoutes(rate, EliminatedShares(self.detours.elimination, values))
 
-    def pass_on(self, flow: Floats, routes: Routed) -> None:
+    def pass_on(self, flow: Floats, routes: IntervalRoutes) -> None:
         """Fill in what leaves the nodes without stock, given in place what enters them, shape (arcs, B)."""
-        sent = self.throughputs(self._entering(flow), routes).take(self.found, 0)
+        sent = self.throughputs(self._entering(flow), routes).take(self.throughput_rows, 0)
         sent *= routes.rate.take(self.arcs, 0)
         flow[self.arcs] = sent
 
-    def throughputs(self, through: Floats, routes: Routed) -> Floats:
+    def throughputs(self, through: Floats, routes: IntervalRoutes) -> Floats:
         """Return what passes through, in the rows of ``found``, for what enters, in ``places``, which is used up.
 
         Shapes are (nodes, B).
@@ -146,7 +148,7 @@ class Routing:
         if late.start < late.stop:
             kept = found[late]
             kept[...] = self._ahead.substitute(through.copy())[late]
-            routes.kept.throughput(kept)
+            routes.kept_nodes.throughput(kept)
             self._on_to.add_to(through, kept.take(self._on_from, 0) * routes.rate.take(self._on, 0))
         self._among.substitute(through)
         np.multiply(through[early][::-1], self._inverse, out=found[early])
@@ -158,7 +160,7 @@ class Routing:
         Whatever the shares, what enters node j passes through nodes without stock at most v_j times in all
         (``passes``): no node sees more than that.
         """
-        passes = Passes(self._network)
+        passes = VisitBounds(self._network)
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
         entering = self._entering(flow[:, None])[self.places, 0]
         return np.full(self.nodes, float(entering @ total))

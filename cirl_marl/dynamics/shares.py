@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from cirl_marl.dynamics.factors import Scaled
+from cirl_marl.dynamics.uncertain_factors import RowFactors
 from cirl_marl.network import Floats, Integers, Network, RowSum
-from cirl_marl.network.rowsum import narrowed
-from cirl_marl.network.splits import splits
+from cirl_marl.network.rowsum import single_column
+from cirl_marl.network.split_fractions import splits
 from cirl_marl.network.uncertainty import numbers_of
 
 
@@ -29,27 +29,27 @@ class Shares:
         numbers = numbers_of(network, "arcs", "share") if uncertain else {}
         drawn = {network.arc_index[id_]: number for id_, number in numbers.items()}
         every = splits(network)
-        tables = [(narrowed(split.bounds), narrowed(split.proportions)) for split in every]
-        self.changing = any(table.shape[-1] > 1 for pair in tables for table in pair)
-        columns = network.episode.horizon if self.changing else 1
+        tables = [(single_column(split.bounds), single_column(split.proportions)) for split in every]
+        self.is_time_varying = any(table.shape[-1] > 1 for pair in tables for table in pair)
+        columns = network.episode.horizon if self.is_time_varying else 1
         steady = [
-            not s.controlled and drawn.keys().isdisjoint(s.others) and (shares == shares[:, :1]).all()
+            not s.controlled_arcs and drawn.keys().isdisjoint(s.other_arcs) and (shares == shares[:, :1]).all()
             for s, (_, shares) in zip(every, tables, strict=True)
         ]
         found = [split for split, same in zip(every, steady, strict=True) if not same]
-        controlled = [(d, k) for d, split in enumerate(found) for k in split.controlled]
-        others = [(d, k) for d, split in enumerate(found) for k in split.others]
+        controlled = [(d, k) for d, split in enumerate(found) for k in split.controlled_arcs]
+        others = [(d, k) for d, split in enumerate(found) for k in split.other_arcs]
         rest = [
             (k, share)
             for split, same in zip(every, steady, strict=True)
             if same
-            for k, share in zip(split.others, split.proportions[:, 0].tolist(), strict=True)
+            for k, share in zip(split.other_arcs, split.proportions[:, 0].tolist(), strict=True)
         ]
-        self.varying: Integers = np.array([k for _, k in (*controlled, *others)], dtype=np.intp)
-        self.constant: Integers = np.array([k for k, _ in rest], dtype=np.intp)
+        self.varying_arcs: Integers = np.array([k for _, k in (*controlled, *others)], dtype=np.intp)
+        self.constant_arcs: Integers = np.array([k for k, _ in rest], dtype=np.intp)
         self.values: Floats = np.array([share for _, share in rest]).reshape(-1, 1)
-        self.arcs: Integers = np.concatenate([self.varying, self.constant])
-        self.leading: Integers = np.array([split.others[0] for split in every], dtype=np.intp)
+        self.arcs: Integers = np.concatenate([self.varying_arcs, self.constant_arcs])
+        self.leading_arcs: Integers = np.array([split.other_arcs[0] for split in every], dtype=np.intp)
         self._rows: Integers = np.array(
             [network.control_rows[network.arcs[k].id].start for _, k in controlled], dtype=np.intp
         )
@@ -60,11 +60,11 @@ class Shares:
         self._low, high = np.ascontiguousarray(bounds[0]), bounds[2]
         self._room = np.maximum(1.0 - self._total(self._low), 0.0)
         self._proportions = np.concatenate([np.empty((0, columns)), *(s.proportions[:, :columns] for s in found)])
-        given = np.concatenate([np.empty((0, columns)), *(s.given[:, :columns] for s in found)])
+        given = np.concatenate([np.empty((0, columns)), *(s.stated_shares[:, :columns] for s in found)])
         self._rest, self._given = np.isnan(given), np.where(np.isnan(given), 0.0, given)
         self._left = 1.0 - self._total(np.ascontiguousarray(bounds[1]))
         self._total_of_others = RowSum(self._of_others, np.arange(len(others)), 1.0, (len(found), len(others)))
-        self._drawn = Scaled({n: drawn[k] for n, (_, k) in enumerate(others) if k in drawn})
+        self._drawn = RowFactors({n: drawn[k] for n, (_, k) in enumerate(others) if k in drawn})
         proportions = self._proportions
         if drawn:
             ends = np.array([spread.ends for spread in network.uncertain.values()]).T
@@ -75,7 +75,7 @@ class Shares:
     def __call__(self, controls: Floats, step: Integers | None, factors: Floats | None = None) -> Floats:
         """Return the shares of ``varying``, shape (shares, B); arguments are those of ``FlowLaws.rate``."""
         low, room, proportions = self._low, self._room, self._proportions
-        if self.changing:
+        if self.is_time_varying:
             # without a step the first interval stands for all
             chosen = np.zeros(1, dtype=np.intp) if step is None else step
             low, room, proportions = (table.take(chosen, axis=1) for table in (low, room, proportions))
@@ -94,7 +94,7 @@ class Shares:
     def _drawn_proportions(self, step: Integers | None, factors: Floats) -> Floats:
         """Return π of the arcs without control, shape (others, B), for what was drawn (``splits.proportions``)."""
         given, left, rest = self._given, self._left, self._rest
-        if self.changing:
+        if self.is_time_varying:
             chosen = np.zeros(1, dtype=np.intp) if step is None else step
             given, left, rest = (table.take(chosen, axis=1) for table in (given, left, rest))
         weights = self._drawn(given, factors)

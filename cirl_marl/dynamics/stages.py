@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.ages import slots
 from cirl_marl.network.elements import Arc, Law, Node, Role, Service
+from cirl_marl.network.initial_ages import slots
 from cirl_marl.network.rowsum import Integers
 from cirl_marl.network.series import Value, in_intervals
 
@@ -39,7 +39,7 @@ class StagedNetwork(Network):
 
     stages: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     valves: Mapping[str, str] = field(default_factory=dict)
-    leaving: Mapping[str, str] = field(default_factory=dict)
+    release_arcs: Mapping[str, str] = field(default_factory=dict)
     parts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -62,7 +62,7 @@ class StagedNetwork(Network):
     def metered(self, service: Service) -> Integers:
         """Return the arcs whose flows add up to what a service measures; an outflow is what leaves the whole node."""
         if service.quantity != "outflow":
-            return super().metered(service)
+            return super().service_arcs(service)
         leaves = [self.parts.get(arc.donor, arc.donor) in service.providers for arc in self.arcs]
         return np.flatnonzero(np.array(leaves, dtype=bool) & ~self._within)
 
@@ -80,11 +80,11 @@ class StagedNetwork(Network):
     def lines(self) -> Mapping[str, str]:
         """The part of ``leaving`` that comes out of slots."""
         arcs = {arc.id: arc for arc in self.arcs}
-        written = {node: arc for node, arc in self.leaving.items() if len(self.stages[node]) > 1}
+        written = {node: arc for node, arc in self.release_arcs.items() if len(self.stages[node]) > 1}
         return {node: arc for node, arc in written.items() if arcs[arc].law is Law.EXOGENOUS}
 
 
-def staged(network: Network, whole: Container[str] = ()) -> StagedNetwork:
+def staged_network(network: Network, whole: Container[str] = ()) -> StagedNetwork:
     """Return ``network`` with its lifetimes as chains and lines.
 
     Of nodes that stay ``whole`` the arc ``leaving`` alone is written, with the rate of the stages, or 1 for a line:
@@ -112,12 +112,14 @@ def staged(network: Network, whole: Container[str] = ()) -> StagedNetwork:
     kept = {each: getattr(network, each) for each in network.__dataclass_fields__}
     kept |= {"nodes": (*stores, *parts.stores, *network.nodes[len(stores) :], *passing), "scenarios": {}}
     kept["arcs"] = (*arcs, *parts.arcs)
-    return StagedNetwork(**kept, stages=parts.stages, valves=parts.valves, leaving=parts.leaving, parts=parts.of)
+    return StagedNetwork(
+        **kept, stages=parts.stages, valves=parts.valves, release_arcs=parts.release_arcs, parts=parts.of
+    )
 
 
-def inside(network: Network) -> Network:
+def simulated_network(network: Network) -> Network:
     """Return the network whose motion the simulator follows: with lifetimes as chains and lines, if it has any."""
-    return staged(network) if any(node.lifetime is not None for node in network.stores) else network
+    return staged_network(network) if any(node.lifetime is not None for node in network.stores) else network
 
 
 class _Parts:
@@ -131,7 +133,7 @@ class _Parts:
         self.leaves: dict[str, str] = {}
         self.stages: dict[str, tuple[str, ...]] = {}
         self.valves: dict[str, str] = {}
-        self.leaving: dict[str, str] = {}
+        self.release_arcs: dict[str, str] = {}
         self.of: dict[str, str] = {}
 
     def chain(self, node: Node) -> None:
@@ -142,16 +144,16 @@ class _Parts:
         for name, following in zip(names, (*names[1:], release), strict=True):
             self.valves[name] = node.id
             self.arcs.append(Arc(id=f"{name}.leaving", donor=name, recipient=following, rate=self._rate(node)))
-        for end, part in zip((*names, release), (*chain.entering, chain.weights[0]), strict=True):
+        for end, part in zip((*names, release), (*chain.inflow_shares, chain.weights[0]), strict=True):
             if part > 0:
-                self.arcs.append(self._shared(entry, end, float(part)))
+                self.arcs.append(self._share_arc(entry, end, float(part)))
 
     def line(self, node: Node) -> None:
         """Add the slots of a fixed lifetime, and the arc through which it comes out."""
         assert node.lifetime is not None
         entry = self._entry(node)
         names = self._stores(node, slots(node.lifetime, self.network.episode.control_interval))
-        self.arcs.append(self._shared(entry, names[0], 1.0))
+        self.arcs.append(self._share_arc(entry, names[0], 1.0))
         self._out(node, Law.EXOGENOUS)
 
     def whole(self, node: Node) -> None:
@@ -166,14 +168,14 @@ class _Parts:
         return self.enters[node.id]
 
     def _release(self, node: Node) -> str:
-        self.leaves[node.id], self.leaving[node.id] = f"{node.id}.release", f"{node.id}.leaving"
+        self.leaves[node.id], self.release_arcs[node.id] = f"{node.id}.release", f"{node.id}.leaving"
         self.of[self.leaves[node.id]] = node.id
         return self.leaves[node.id]
 
     def _out(self, node: Node, law: Law) -> None:
         release, driven = self._release(node), law is Law.DONOR
         rate, flow = (self._rate(node), 0.0) if driven else (0.0, 1.0)
-        arc = Arc(id=self.leaving[node.id], donor=node.id, recipient=release, law=law, rate=rate, flow=flow)
+        arc = Arc(id=self.release_arcs[node.id], donor=node.id, recipient=release, law=law, rate=rate, flow=flow)
         self.arcs.append(arc)
 
     def _stores(self, node: Node, further: int) -> tuple[str, ...]:
@@ -184,14 +186,14 @@ class _Parts:
         self.stages[node.id] = (*names, node.id)
         return self.stages[node.id]
 
-    def _shared(self, entry: str, end: str, part: float) -> Arc:
+    def _share_arc(self, entry: str, end: str, part: float) -> Arc:
         return Arc(id=f"{entry}.to.{end}", donor=entry, recipient=end, law=Law.SHARE, share=part)
 
     def _rate(self, node: Node) -> Value:
         """Return the rate of a node's stages, divided by the stretch of each interval."""
         assert node.lifetime is not None and node.lifetime.chain is not None
         rate = node.lifetime.chain.rate / node.lifetime.mean
-        return in_intervals(rate / self.network.held(node.stretch), self.network.episode.control_interval)
+        return in_intervals(rate / self.network.interval_means(node.stretch), self.network.episode.control_interval)
 
 
 class FixedLifetimes:

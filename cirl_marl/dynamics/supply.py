@@ -21,10 +21,10 @@ from collections.abc import Container
 import numpy as np
 
 from cirl_marl.dynamics.arrivals import Arrivals
-from cirl_marl.dynamics.factors import Scaled
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.uncertain_factors import RowFactors
 from cirl_marl.network import Floats, Integers, RowSum
-from cirl_marl.network.model import Bools
+from cirl_marl.network.compartment_model import Bools
 from cirl_marl.network.uncertainty import numbers_of
 
 TINY = 1e-9
@@ -36,11 +36,11 @@ PROBE, LEAST = 1e-3, 1e-6
 ROUNDS, SWEEPS, CHANGES = 12, 500, 30
 """Most times that the map is followed where it bends; and each time Gauss-Seidel sweeps, and changes of which supplies
 are at their bounds."""
-PROBED = 4
+MOST_PROBES = 4
 """Most services for each of which an interval is tried to find a column of A."""
 CELLS = 80_000
 """Most masses of all copies together that are worked on at once; more do not stay in a cache."""
-SEEN = 1e-7
+NOTICEABLE = 1e-7
 """Part of what is demanded, beyond which what a correction has brought about tells how the next one will do."""
 
 
@@ -63,16 +63,16 @@ class Supply:
         self._rows: Integers = np.array([network.control_rows[arc.id].start for arc in made_up], dtype=np.intp)
         weights = [1.0 if arc.weight is None else arc.weight for arc in made_up]
         self._weights = np.array(weights).reshape(-1, 1)
-        demand = [network.held(service.low) for service in services]
+        demand = [network.interval_means(service.low) for service in services]
         self._demand = np.array(demand).reshape(len(services), network.episode.horizon)
         numbers = numbers_of(network, "services", "low")
-        self._drawn = Scaled({row: numbers[each.id] for row, each in enumerate(services) if each.id in numbers})
+        self._drawn = RowFactors({row: numbers[each.id] for row, each in enumerate(services) if each.id in numbers})
         stores, rows, columns = len(network.stores), [], []
         for row, service in enumerate(services):
             if service.quantity == "stock":
                 read = [network.node_index[each] for each in service.providers]
             else:
-                read = [stores + int(k) for k in network.metered(service)]
+                read = [stores + int(k) for k in network.service_arcs(service)]
             rows += [row] * len(read)
             columns += read
         self._measure = RowSum(rows, columns, 1.0, (len(services), stores + len(network.arcs)))
@@ -172,14 +172,14 @@ class Supply:
             open_ &= lacks.any(axis=0)
             if not open_.any():
                 break
-            if count <= PROBED:
+            if count <= MOST_PROBES:
                 slope = _by_copy(probed(supply, base))
             else:
                 bent = np.ones((1, batch), dtype=bool)
                 if before is not None:
                     bent = (room(supply) != room(before[0])).any(axis=0, keepdims=True)
                     # where an arc has come to its bound, less was to be expected
-                    told = (np.abs(before[2]) > SEEN * demand) & ~bent
+                    told = (np.abs(before[2]) > NOTICEABLE * demand) & ~bent
                     factor *= np.divide(base - before[1], before[2], out=np.ones_like(base), where=told)
                 if bent.any():
                     arrivals = _by_copy(arriving(supply))
@@ -198,7 +198,7 @@ class Supply:
         if factors is not None:
             drawn = np.tile(factors, (1, times))
         done = dynamics.advance(*start, controls, np.tile(step, times), drawn)
-        flow = done.moved / dynamics.network.episode.control_interval
+        flow = done.moved_mass / dynamics.network.episode.control_interval
         return self._measure(np.concatenate([dynamics.rows.stocks(done.stock), flow]))
 
 
@@ -223,14 +223,14 @@ def _complementary(slope: Floats, lacking: Floats, supply: Floats, most: Floats,
     # more of what does not arrive is not supplied
     arrives = np.diagonal(slope, axis1=1, axis2=2) > TINY * min(1.0, interval)
     if len(lacking) == 1:
-        return _swept(slope, short, now, high, arrives).T
-    found, solved = _at_once(slope, short, now, high, arrives)
+        return _gauss_seidel(slope, short, now, high, arrives).T
+    found, solved = _active_set(slope, short, now, high, arrives)
     if not solved.all():
-        found = np.where(solved[:, None], found, _swept(slope, short, now, high, arrives))
+        found = np.where(solved[:, None], found, _gauss_seidel(slope, short, now, high, arrives))
     return np.ascontiguousarray(found.T)
 
 
-def _at_once(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arrives: Bools) -> tuple[Floats, Bools]:
+def _active_set(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arrives: Bools) -> tuple[Floats, Bools]:
     """Return V as ``_complementary`` does, shape (B, services), and in which copies it is found.
 
     All supplies between their bounds are solved for together; then it is changed which these are. A copy for which that
@@ -241,7 +241,7 @@ def _at_once(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arriv
     free, held = arrives & (most > 0), np.where(arrives, 0.0, supply)
     found, solved, unit = supply.copy(), np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
     for _ in range(CHANGES):
-        tried = _solved(np.where(free[..., None], slope, unit), np.where(free, wanted, held))
+        tried = _solve(np.where(free[..., None], slope, unit), np.where(free, wanted, held))
         excess = wanted - (slope * tried[:, None]).sum(axis=2)  # what lacks still
         under, over = free & (tried < 0), free & (tried > most)
         back = ~free & arrives & (most > 0) & np.where(held > 0, excess < 0, excess > 0)
@@ -255,18 +255,18 @@ def _at_once(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arriv
     return found, solved
 
 
-def _solved(matrix: Floats, wanted: Floats) -> Floats:
+def _solve(matrix: Floats, wanted: Floats) -> Floats:
     """Return the solutions of linear systems, shape (B, services); NaN where one is singular."""
     try:
         found: Floats = np.asarray(np.linalg.solve(matrix, wanted[..., None])[..., 0], dtype=np.float64)
     except np.linalg.LinAlgError:
         if len(matrix) == 1:
             return np.full_like(wanted, np.nan)
-        return np.concatenate([_solved(matrix[i : i + 1], wanted[i : i + 1]) for i in range(len(matrix))])
+        return np.concatenate([_solve(matrix[i : i + 1], wanted[i : i + 1]) for i in range(len(matrix))])
     return found
 
 
-def _swept(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arrives: Bools) -> Floats:
+def _gauss_seidel(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arrives: Bools) -> Floats:
     """Return V as ``_complementary`` does, shape (B, services), by projected Gauss-Seidel sweeps."""
     count, found = lacking.shape[1], supply.copy()
     open_ = np.ones(len(lacking), dtype=bool)

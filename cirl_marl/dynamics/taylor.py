@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from cirl_marl.dynamics.kron_reduction import KronReduction
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.routing import Routed
-from cirl_marl.dynamics.shortcut import Shortcut
+from cirl_marl.dynamics.routing import IntervalRoutes
 from cirl_marl.network import Floats, RowSum
 from cirl_marl.network.elements import Law
 
@@ -29,13 +29,13 @@ class Taylor:
         self._laws, self._substep = laws, substep
         self.terms = self._number()
         factors = [substep / k for k in range(self.terms, 1, -1)]
-        self._pulls = any(arc.law is Law.RECIPIENT for arc in laws.inside.arcs)
-        self._horner = [laws.incidence.scaled(factor) for factor in factors]
-        self._shortcut = Shortcut(laws, factors) if laws.routing.nodes else None
-        network, routing, stores = laws.inside, laws.routing, laws.rows.nodes.stop
+        self._pulls = any(arc.law is Law.RECIPIENT for arc in laws.staged_network.arcs)
+        self._horner = [laws.incidence.scaled_by(factor) for factor in factors]
+        self._shortcut = KronReduction(laws, factors) if laws.routing.nodes else None
+        network, routing, stores = laws.staged_network, laws.routing, laws.rows.nodes.stop
         # throughputs stand below the masses, and drive what leaves nodes without stock
         self._driver = laws.driver.copy()
-        self._driver[routing.arcs] = laws.rows.masses + routing.found
+        self._driver[routing.arcs] = laws.rows.masses + routing.throughput_rows
         self._entering = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
         entered = routing.places[network.recipients[self._entering] - stores]
         self._into = RowSum(entered, range(len(entered)), 1.0, (routing.nodes, len(entered)))
@@ -47,17 +47,19 @@ class Taylor:
         What is split, or enters a node that stores nothing, is taken to go where it drives most.
         """
         laws, stores = self._laws, self._laws.rows.nodes.stop
-        donors = laws.inside.donors[laws.driven]
+        donors = laws.staged_network.donors[laws.driven_arcs]
         reach, term, k = np.ones(stores), 1.0, 0
         while term > TRUNCATION or k < 2:
             k += 1
             ends = np.append(reach, reach.max(initial=0.0))[laws.driven_to]
             moved = laws.driven_rate * (reach[donors] + ends) * self._substep
-            reach = np.bincount(laws.driver[laws.driven], weights=moved, minlength=stores) / (k + 1)
+            reach = np.bincount(laws.driver[laws.driven_arcs], weights=moved, minlength=stores) / (k + 1)
             term = float(reach.max(initial=0.0))
         return k
 
-    def moved(self, stock: Floats, routes: Routed | None, rate: Floats, settled: Floats | None = None) -> Floats:
+    def moved_mass(
+        self, stock: Floats, routes: IntervalRoutes | None, rate: Floats, settled: Floats | None = None
+    ) -> Floats:
         """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep, shape (arcs, B).
 
         Flows given in ``settled``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
@@ -71,7 +73,7 @@ class Taylor:
             np.maximum(moved, 0.0, out=moved)  # the mean of an overdrawn stock may be negative
         return moved
 
-    def flow(self, masses: Floats, routes: Routed | None, rate: Floats) -> Floats:
+    def flow(self, masses: Floats, routes: IntervalRoutes | None, rate: Floats) -> Floats:
         """Return the flows at ``masses``, those that are passed on too, shape (arcs, B)."""
         laws = self._laws
         if routes is None:
@@ -83,7 +85,7 @@ class Taylor:
         flow *= rate
         return flow
 
-    def _mean_flow(self, stock: Floats, routes: Routed | None, rate: Floats, settled: Floats | None) -> Floats:
+    def _mean_flow(self, stock: Floats, routes: IntervalRoutes | None, rate: Floats, settled: Floats | None) -> Floats:
         """Return r∘ȳ[driver], with the flows of all arcs in each term."""
         laws, flow, mean = self._laws, np.empty_like(rate), stock.copy()
         for incidence in (*self._horner, None):

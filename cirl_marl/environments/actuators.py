@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.rowsum import narrowed, spans
+from cirl_marl.network.rowsum import single_column, spans
 
 BOUND = 1.0 + 1e-6
 """Largest action taken: wrappers that rescale actions do so in single precision and may land a rounding beyond 1."""
@@ -38,7 +38,7 @@ class Actuators:
         self.acting: Integers = np.array(acting, dtype=np.intp)
         self.spaces = {a: Box(-1.0, 1.0, (each.stop - each.start,), np.float32) for a, each in rows.items()}
         self._all_act = self.acting.tolist() == list(range(len(laws.neutral)))
-        low, neutral, high = (narrowed(each) for each in (laws.control_low, laws.neutral, laws.control_high))
+        low, neutral, high = (single_column(each) for each in (laws.control_low, laws.neutral, laws.control_high))
         low, high = low[self.acting], high[self.acting]
         tables: tuple[Floats, ...] = (low, (high + low) / 2, (high - low) / 2, high, neutral)
         self._varying = any(bool((each != each[:, :1]).any()) for each in tables)

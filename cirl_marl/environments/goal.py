@@ -15,7 +15,7 @@ from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.environments.state import Snapshot
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
-from cirl_marl.network.model import GoalTask
+from cirl_marl.network.compartment_model import GoalTask
 
 Goals = dict[str, NDArray[np.float32]]
 PARTS = ("observation", "achieved_goal", "desired_goal")

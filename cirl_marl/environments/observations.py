@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import OBSERVE, Arc
@@ -64,7 +64,7 @@ class ObservationLayout:
         inner, batches = dynamics.inner, dynamics.batches
         self.signals = signals = Signals(dynamics)
         first = signals.states.start
-        self._inner = {owner: [first + row for row in rows] for owner, rows in inner.observed.items()}
+        self._inner = {owner: [first + row for row in rows] for owner, rows in inner.observed_rows.items()}
         self._measures = inner.measure_names
         for row, name in enumerate(inner.measure_names, signals.measures.start):
             self._inner[name.split(".")[0]].append(row)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cirl_marl.dynamics.motion import Dynamics, Transition
+from cirl_marl.dynamics.integrator import Dynamics, Transition
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.scoring import Scoring
 from cirl_marl.environments.state import State
@@ -62,10 +62,10 @@ class Credit:
         Batches that leave at the start of the interval count in its mean, those of its end do not.
         """
         network = self._dynamics.network
-        if transition.batched is None:
+        if transition.batch_mass is None:
             return network.circularity(transition.flow), network.circularity(flow), state.batched
-        during = state.batched + transition.batched[0]
-        after = during + transition.batched[1]
+        during = state.batched + transition.batch_mass[0]
+        after = during + transition.batch_mass[1]
         return network.circularity(transition.flow, after), network.circularity(flow, during), after
 
     def pay(
@@ -130,6 +130,6 @@ class Credit:
         held = self._supply(stock, inner, imagined, step, idle, drawn)
         transition = dynamics.advance(stock, inner, held, step, drawn)
         imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
-        flow = transition.moved / dynamics.network.episode.control_interval
+        flow = transition.moved_mass / dynamics.network.episode.control_interval
         end, mean, _ = self.circularity(imagined_state, transition, flow)
         return (end if self._measure == "end" else mean).reshape(count, batch)

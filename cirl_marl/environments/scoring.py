@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cirl_marl.dynamics.factors import Scaled
+from cirl_marl.dynamics.uncertain_factors import RowFactors
 from cirl_marl.environments.observations import ObservationLayout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.rowsum import RowSum
@@ -41,11 +41,13 @@ class Scoring:
         self._measure = _measurement(network, layout)
         self._varying = any(isinstance(band, Series) for s in services for band in (s.low, s.high))
         width = network.episode.horizon if self._varying else 1
-        bands = [np.array([network.held(getattr(s, end))[:width] for s in services]) for end in ("low", "high")]
+        bands = [
+            np.array([network.interval_means(getattr(s, end))[:width] for s in services]) for end in ("low", "high")
+        ]
         self._low, self._high = (each.reshape(len(services), width) for each in bands)
         drawn = [numbers_of(network, "services", end) for end in ("low", "high")]
         self._drawn = [
-            Scaled({row: numbers[each.id] for row, each in enumerate(services) if each.id in numbers})
+            RowFactors({row: numbers[each.id] for row, each in enumerate(services) if each.id in numbers})
             for numbers in drawn
         ]
         self._bounded = bool(np.isfinite(self._high).any())
@@ -58,7 +60,7 @@ class Scoring:
         columns = np.array([*tracked, *(term for _, term, _ in debts), *inner], dtype=np.intp)
         weights = np.array([*[1.0] * len(tracked), *(weight for _, _, weight in debts), *[-1.0] * len(modelled)])
         self._everyone = RowSum(owners, columns, -weights, (len(compartments), terms))
-        self._agents = self._everyone.chosen([position[agent] for agent in agents])
+        self._agents = self._everyone.select_rows([position[agent] for agent in agents])
         sums = self._everyone.column_sums()
         counted = np.flatnonzero(sums)
         self._all = RowSum(np.zeros(len(counted), dtype=np.intp), counted, sums[counted], (1, terms))
@@ -126,7 +128,7 @@ def _measurement(network: Network, layout: ObservationLayout) -> RowSum:
     rows, columns = [], []
     for row, service in enumerate(network.services):
         if service.quantity == "outflow":
-            read = [layout.signals.flows.start + int(k) for k in network.metered(service)]
+            read = [layout.signals.flows.start + int(k) for k in network.service_arcs(service)]
         else:
             read = [layout.row(each, service.quantity, service.measure) for each in service.providers]
         rows += [row] * len(read)

@@ -132,7 +132,7 @@ def _scenario_of(network: Network, scenario: str | None, agent: str | None) -> s
     """Return ``scenario`` or, if there is none of that name, the ``scenario_…`` in which ``agent`` alone acts."""
     if scenario is None or scenario == network.scenario_name or scenario in network.scenarios:
         return scenario
-    alone = [name for name, other in network.scenarios.items() if other.acting == (agent,)]
+    alone = [name for name, other in network.scenarios.items() if other.default_agents == (agent,)]
     fitting = [name for name in alone if name.startswith(f"{scenario}_")]
     if len(fitting) > 1:
         raise CirlError(f"network '{network.name}': '{agent}' has scenarios {', '.join(fitting)}: give one of them")

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.errors import ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.ages import spread
-from cirl_marl.network.model import DiscreteTimeModel, GoalTask
+from cirl_marl.network.compartment_model import DiscreteTimeModel, GoalTask
+from cirl_marl.network.initial_ages import age_shares
 
 
 class Starts:
@@ -38,12 +38,12 @@ class Starts:
         self._stages = {network.stores[i].id: stages for i, stages in rows.stages.items()}
         self._rows |= self._stages
         interval = network.episode.control_interval
-        self._spread = {id_: spread(network.stores[network.node_index[id_]], interval) for id_ in self._stages}
+        self._spread = {id_: age_shares(network.stores[network.node_index[id_]], interval) for id_ in self._stages}
         inseparable = {name for names in self._wholes.values() for name in names}
         self._array_order = () if inseparable & set(order) else tuple(order)
         self._physical, self._stocks, self._inner = dynamics.physical, rows.nodes.stop, inner
         stores = len(network.stores)
-        self._drawn = np.concatenate([np.arange(stores), self._stocks + inner.ranged])
+        self._drawn = np.concatenate([np.arange(stores), self._stocks + inner.range_rows])
         self._own = np.setdiff1d(np.arange(self._stocks, len(self.names)), self._drawn)
         self._spreads = tuple(network.uncertain.values())
         self._low = np.concatenate([network.initial[0], inner.low])
@@ -89,7 +89,7 @@ class Starts:
         """Draw factors on the uncertain numbers in some copies, each from its own stream, (numbers, len(which))."""
         shares = np.array([self.streams[i].random(len(self._spreads)) for i in which])
         shares = np.ascontiguousarray(shares.reshape(len(which), len(self._spreads)).T)
-        drawn = [spread.at(share) for spread, share in zip(self._spreads, shares, strict=True)]
+        drawn = [age_shares.at(share) for age_shares, share in zip(self._spreads, shares, strict=True)]
         return np.array(drawn).reshape(shares.shape)
 
     def saved_streams(self) -> tuple[Mapping[str, Any], ...]:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class State:
     """The physical state of B environments, which observations follow from, and the sums that an episode reports."""
@@ -43,7 +43,7 @@ class State:
         return State(*(np.where(ended, getattr(fresh, each.name), getattr(self, each.name)) for each in fields(self)))
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """Everything needed to go on from here, bit for bit."""
@@ -65,7 +65,7 @@ class Snapshot:
             raise ControlError(f"the snapshot does not fit: it is of another definition of {ours}")
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What one control interval brought, agents stacked along axis 0."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.dynamics.motion import Dynamics, Transition
+from cirl_marl.dynamics.integrator import Dynamics, Transition
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.observations import ObservationLayout
@@ -355,7 +355,7 @@ class MultiAgentVectorEnv:
         signals, dynamics = self.layout.signals, self.dynamics
         quantities = np.empty((signals.quantities, self.num_envs))
         flow = quantities[signals.flows]
-        np.divide(transition.moved, self.network.episode.control_interval, out=flow)
+        np.divide(transition.moved_mass, self.network.episode.control_interval, out=flow)
         quantities[signals.stocks] = self.rows.stocks(transition.stock)
         if signals.passing.start < signals.passing.stop:
             quantities[signals.passing] = self.network.throughput(flow)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.uncertainty import drawn
+from cirl_marl.network.uncertainty import draw_network
 from cirl_marl.optimum import Bound, Envelope, bound, envelope
 
 STEP = 1e-4
@@ -115,7 +115,7 @@ def bounds_of_draws(
     """
     found = np.empty((len(services), len(starts)))
     for i, (start, row) in enumerate(zip(starts, factors.tolist(), strict=True)):
-        certain, near = drawn(network, row), None
+        certain, near = draw_network(network, row), None
         for k, levels in enumerate(services):
             near = bound(certain, start, min_service=levels_to_demand(levels[i]), agents=agents or None, near=near)
             found[k, i] = near.objective

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from cirl_marl.controllers.rollout import Rollout
-from cirl_marl.definitions.writing import fingerprint
+from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import SHARE, over_episodes
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.staged import CIRO_FACTOR
+from cirl_marl.network.batch_circularity import CIRO_FACTOR
 from cirl_marl.optimum.bounds import relative
 from cirl_marl.records.machine import versions
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.network import Floats
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.bounds import relative
 
 ROUND_OFF = 1e-12
@@ -27,7 +27,7 @@ NAMES: Mapping[QuantityKind, str] = {
 """What quantities are called, {} standing for the id of the service, arc or node."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class ComparedQuantity:
     """A figure of a whole episode in each of A alternatives."""

@@ -12,7 +12,7 @@ from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.registry import named_controller
 
 FEWEST = 70
@@ -21,7 +21,7 @@ RESAMPLES = 200
 """Bootstrap resamples of their intervals."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class SampledEpisodes:
     """Episodes of networks whose uncertain numbers were drawn; everything else is the same."""
@@ -35,7 +35,7 @@ class SampledEpisodes:
     flow: Annotated[Floats, "mean flows of each interval, shape (samples, steps, arcs), mass/time"]
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
     """How much of the spread of a figure each uncertain number causes by itself: first-order Sobol indices."""

@@ -20,12 +20,12 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.registry import SETTABLE, named_controller
 from cirl_marl.records.files import write_atomically, write_table
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Simulation:
     """One episode of a network under one scenario and one controller."""

@@ -18,9 +18,9 @@ from cirl_marl.errors import CirlError, unknown
 from cirl_marl.importing.balances import Change, Processes, ProcessKind, Residual
 from cirl_marl.importing.definition import ImportedFiles, definition_files, identifiers
 from cirl_marl.importing.flow_table import FlowTable, read_flows, read_stocks
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Role
-from cirl_marl.records.files import published, write_table
+from cirl_marl.records.files import publish_folder, write_table
 
 MOST_LINES = 10
 """Most residuals that a message lists."""
@@ -31,7 +31,7 @@ Ask = Callable[[str, ProcessKind], Role]
 """Returns the role of a source or a sink."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class ImportReport:
     """What an import found and wrote."""
@@ -111,7 +111,7 @@ def import_flows(
         title=title or name,
         source=source or f"imported from {flows.name}",
     )
-    with published(out.parent) as partial:
+    with publish_folder(out.parent) as partial:
         files = _write(partial, out.name, name, made, changes)
         error = _largest_error(partial / out.name, table, made, progress)
     mistakes = processes.stock_mistakes(known_stocks)

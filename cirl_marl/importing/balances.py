@@ -12,7 +12,7 @@ import numpy as np
 from cirl_marl.errors import CirlError
 from cirl_marl.importing.flow_table import Connection, FlowTable
 from cirl_marl.network import Floats
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 
 ROUNDING = 1e-6
 """Part of the largest flow of a region by which a process may fail to balance, as tables are rounded."""
@@ -32,7 +32,7 @@ class ProcessKind(StrEnum):
     STORE = "store"
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Residual:
     """What entered a process and did not leave it, though it is no store."""
@@ -49,7 +49,7 @@ class Residual:
         return f"'{self.process}' ({where}): {self.entered:g} enter, {self.left:g} leave"
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Change:
     """A flow that was adjusted."""

@@ -14,11 +14,11 @@ import numpy as np
 from cirl_marl.importing.balances import Processes, ProcessKind
 from cirl_marl.importing.flow_table import Connection, FlowTable
 from cirl_marl.network import Floats
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Role
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class ImportedFiles:
     """The files of an imported network."""

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from filelock import Timeout
 
-from cirl_marl.definitions.permission import is_code_allowed
+from cirl_marl.definitions.code_permission import is_code_allowed
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.jobs.places import Worker, Workplace, place_of
 from cirl_marl.jobs.work import Job, JobFiles, Work, do

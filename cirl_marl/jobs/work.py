@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from filelock import FileLock, Timeout
 
-from cirl_marl.definitions.permission import code_allowed
+from cirl_marl.definitions.code_permission import code_allowed
 from cirl_marl.errors import RunError
 from cirl_marl.records.files import write_json
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.definitions.reading import write_network
+from cirl_marl.definitions.reader import write_network
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.agent_env import AgentVecEnv
@@ -27,7 +27,7 @@ from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory
 from cirl_marl.learners.trainer import Progress, Training, run_together
 from cirl_marl.network import Network
-from cirl_marl.records.files import published
+from cirl_marl.records.files import publish_folder
 
 
 def train(
@@ -326,7 +326,7 @@ def export(run: str | Path | RunDirectory, folder: str | Path) -> list[Path]:
     if (target := Path(folder)).exists() and not target.is_dir():
         raise RunError(f"{target}: is no folder")
     env, written = found.make_env(found.config.envs), list[Path]()
-    with published(target) as partial:
+    with publish_folder(target) as partial:
         for group in found.groups():
             learner = Learner(
                 AgentVecEnv(env, group.name, group.view(env), wait), group.spec, found.config.seed

@@ -21,9 +21,9 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from cirl_marl.definitions.catalogue import recipe_path
-from cirl_marl.definitions.mistakes import mistakes_of
+from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.definitions.quantities import Number
-from cirl_marl.definitions.reading import read_toml
+from cirl_marl.definitions.reader import read_toml
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import DefinitionError, RecipeError, unknown
 from cirl_marl.learners.views import CENTRAL_CRITIC, Scheme, View, view_of
@@ -299,7 +299,7 @@ class Recipe(Settings):
         try:
             Options.model_validate(self.environment)
         except ValidationError as error:
-            yield from (f"environment.{mistake}" for mistake in mistakes_of(error, Options))
+            yield from (f"environment.{mistake}" for mistake in validation_mistakes(error, Options))
         for i, match in enumerate(self.match):
             if match.kind is None and match.role is None and match.agents is None:
                 yield f"match.{i}: fits every agent; give kind, role or agents"
@@ -337,7 +337,7 @@ def load_recipe(name: str | Path) -> Recipe:
     try:
         recipe = Recipe.model_validate(document)
     except ValidationError as error:
-        mistakes += mistakes_of(error, Recipe)
+        mistakes += validation_mistakes(error, Recipe)
         recipe = _sound_part(document, {str(item["loc"][0]) for item in error.errors()})
     mistakes += recipe.mistakes(recipe.run.steps)
     if mistakes:

@@ -37,7 +37,7 @@ from filelock import FileLock, Timeout
 from pydantic import Field, StrictInt, ValidationError, field_validator
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.definitions.mistakes import mistakes_of
+from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError, unknown
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
@@ -163,7 +163,7 @@ class RunDirectory:
         try:
             return RunConfig.model_validate(plain)
         except ValidationError as error:
-            found = "; ".join(mistakes_of(error, RunConfig))
+            found = "; ".join(validation_mistakes(error, RunConfig))
             raise RunError(f"{self.path / 'config.json'}: is not a run configuration: {found}") from error
 
     @property

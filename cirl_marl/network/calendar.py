@@ -11,11 +11,11 @@ from datetime import date, datetime, timedelta
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.network.parts import Parts
 from cirl_marl.network.rowsum import Floats
+from cirl_marl.network.specification import Specification
 from cirl_marl.network.units import factor
 
-When = float | date
+YearOrDate = float | date
 """A calendar year such as 2000 or 2000.5, or a date."""
 
 YEAR = 365.25
@@ -28,7 +28,7 @@ def in_years(unit: str) -> bool:
     return factor(unit, "day") > 28
 
 
-def year(moment: When) -> float:
+def year(moment: YearOrDate) -> float:
     """Return a moment as a calendar year with its fraction.
 
     >>> year(date(2020, 7, 1)) == 2020 + 182 / 365.25
@@ -39,7 +39,7 @@ def year(moment: When) -> float:
     return float(moment)
 
 
-def elapsed(moment: When, start: When, unit: str) -> float:
+def elapsed_time(moment: YearOrDate, start: YearOrDate, unit: str) -> float:
     """Return the time from ``start`` to ``moment``, in ``unit``; negative if it lies before.
 
     >>> elapsed(2001.5, 2000, "year"), elapsed(date(2020, 3, 1), 2020, "day")
@@ -50,7 +50,7 @@ def elapsed(moment: When, start: When, unit: str) -> float:
     return (year(moment) - year(start)) * factor("year", unit)
 
 
-def years(network: Parts, time: ArrayLike) -> Floats:
+def years(network: Specification, time: ArrayLike) -> Floats:
     """Return times since the start of an episode as calendar years; the network must have a start."""
     start = network.episode.start
     assert start is not None
@@ -58,7 +58,7 @@ def years(network: Parts, time: ArrayLike) -> Floats:
     return found
 
 
-def labels(network: Parts, time: ArrayLike) -> tuple[list[str], list[list[str]]]:
+def labels(network: Specification, time: ArrayLike) -> tuple[list[str], list[list[str]]]:
     """Return the headers and the columns of a table for times on the calendar: one each, or none without a start."""
     start = network.episode.start
     if start is None:
@@ -71,7 +71,7 @@ def labels(network: Parts, time: ArrayLike) -> tuple[list[str], list[list[str]]]
     return ["date"], [[each.isoformat(" ", "minutes")[: 10 if whole else None] for each in dates]]
 
 
-def _clock(moment: When) -> datetime:
+def _clock(moment: YearOrDate) -> datetime:
     """Return a moment on a clock without zones; the fraction of a year is one of 365.25 days."""
     if isinstance(moment, date):
         return datetime(moment.year, moment.month, moment.day)

@@ -12,23 +12,23 @@ from datetime import date
 from enum import StrEnum
 from typing import Annotated, Literal, get_args
 
-from cirl_marl.network.declared import (
+from cirl_marl.network.compartment_model import CompartmentModel
+from cirl_marl.network.declarations import (
     Amount,
     CalendarTime,
-    Checked,
-    Declared,
+    CheckedRecord,
+    Declaration,
     Kinds,
-    Nested,
     NotNegative,
     Numbers,
     Positive,
     Quantity,
     Share,
+    Subtable,
     Word,
-    frozen,
+    frozen_record,
 )
 from cirl_marl.network.lifetimes import SURVIVALS, Chain, chain_of
-from cirl_marl.network.model import CompartmentModel
 from cirl_marl.network.series import Series, Value
 
 
@@ -76,10 +76,12 @@ REWARDS: tuple[str, ...] = get_args(Reward)
 OBSERVE: tuple[str, ...] = get_args(Observe)
 MOMENTS: tuple[str, ...] = get_args(Moment)
 SINKS = frozenset({Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT})
+IDENTIFIER = r"^[a-z][a-z0-9_]*$"
+"""How compartments and services may be called; their names are keys of definition files and names of files."""
 MAX_STEPS = 10_000
 """Solver steps of a control interval, or control intervals of a delay, beyond which a unit is taken for a mistake."""
 
-TAKEN: Mapping[Law, tuple[str, ...]] = {
+LAW_FIELDS: Mapping[Law, tuple[str, ...]] = {
     Law.DONOR: ("rate",),
     Law.RECIPIENT: ("rate",),
     Law.CONTROLLED: (),
@@ -98,8 +100,8 @@ BAND_OF = Kinds("quantity", {"stock": "mass", "measure": "1"}, "flow")
 Pair = tuple[float, float]
 
 
-@frozen
-class Control(Checked):
+@frozen_record
+class Control(CheckedRecord):
     """The actuator of one compartment; a normalised action in [-1, 1] maps linearly onto [low, high]."""
 
     kind: Annotated[
@@ -115,23 +117,23 @@ class Control(Checked):
     high: Annotated[Value, Amount("value at action +1, of each entry of the action")]
 
 
-FIXED = "fixed"
+FIXED_LIFETIME = "fixed"
 """The distribution of a lifetime that is the same for all."""
 
 
-@frozen
-class Lifetime(Checked):
+@frozen_record
+class Lifetime(CheckedRecord):
     """How long what enters a node stays there."""
 
     mean: Annotated[
-        float, Positive("mean; of a folded normal distribution that before it is folded", of="time", shared=True)
+        float, Positive("mean; of a folded normal distribution that before it is folded", of="time", unit_of_table=True)
     ]
     deviation: Annotated[
         float | None,
         Positive(
             "standard deviation, likewise; a fixed lifetime has none, nor need an exponential one",
             of="time",
-            shared=True,
+            unit_of_table=True,
         ),
     ] = None
     distribution: Annotated[
@@ -139,23 +141,23 @@ class Lifetime(Checked):
         Word(
             "``normal`` (what is below 0 leaves at once), ``folded_normal``, ``lognormal``, ``weibull``, ``gamma``, "
             "``exponential``, or ``fixed``, a whole number of control intervals",
-            of=(*SURVIVALS, FIXED),
-            required=True,
+            of=(*SURVIVALS, FIXED_LIFETIME),
+            mandatory=True,
         ),
     ] = "normal"
 
     @property
     def chain(self) -> Chain | None:
         """The stages of which it is made, for a mean of 1; None if it is fixed."""
-        if self.distribution == FIXED:
+        if self.distribution == FIXED_LIFETIME:
             return None
         return chain_of(self.distribution, (self.deviation or self.mean) / self.mean)
 
 
-LIFETIME = Nested("how long what enters stays, for arcs of law ``share`` to split what leaves", of="lifetime")
-CONTROL = Nested("its actuator; None if it cannot act")
-MODEL = Nested("inner physics; None for a plain store or transport", of="model")
-TITLE = Declared("what it is called in tables and pictures; its id if left out")
+LIFETIME = Subtable("how long what enters stays, for arcs of law ``share`` to split what leaves", of="lifetime")
+CONTROL = Subtable("its actuator; None if it cannot act")
+MODEL = Subtable("inner physics; None for a plain store or transport", of="model")
+TITLE = Declaration("what it is called in tables and pictures; its id if left out")
 INNER = Numbers(
     "(low, high) of the initial value of each inner state of the model, drawn uniformly; empty for a model that draws "
     "its own start",
@@ -164,8 +166,8 @@ INNER = Numbers(
 )
 
 
-@frozen
-class Compartment(Checked):
+@frozen_record
+class Compartment(CheckedRecord):
     """What nodes and arcs have in common."""
 
     id: str
@@ -190,7 +192,7 @@ class Compartment(Checked):
         return int(self.control is not None)
 
 
-@frozen
+@frozen_record
 class Node(Compartment):
     """A compartment that stores material, or hands it on at once, with an ``id`` of its own among nodes and arcs.
 
@@ -199,11 +201,11 @@ class Node(Compartment):
     stores nothing.
     """
 
-    role: Annotated[Role, Word("decides which flows count as finite-time sustainable", of=Role, required=True)] = (
+    role: Annotated[Role, Word("decides which flows count as finite-time sustainable", of=Role, mandatory=True)] = (
         Role.TECHNOSPHERE
     )
     stores: Annotated[
-        bool, Declared("whether it holds a stock; what enters one that does not leaves it at once, in shares")
+        bool, Declaration("whether it holds a stock; what enters one that does not leaves it at once, in shares")
     ] = True
     initial: Annotated[
         Pair | None,
@@ -259,7 +261,7 @@ class Node(Compartment):
     ] = 1.0
 
 
-@frozen
+@frozen_record
 class Arc(Compartment):
     """A compartment that moves material from ``donor`` to ``recipient``, with an ``id`` of its own.
 
@@ -269,9 +271,9 @@ class Arc(Compartment):
     it.
     """
 
-    donor: Annotated[str, Declared("id of the node that gives", key="from")]
-    recipient: Annotated[str, Declared("id of the node that receives", key="to")]
-    law: Annotated[Law, Word("how much it carries", of=Law, required=True)] = Law.DONOR
+    donor: Annotated[str, Declaration("id of the node that gives", key="from")]
+    recipient: Annotated[str, Declaration("id of the node that receives", key="to")]
+    law: Annotated[Law, Word("how much it carries", of=Law, mandatory=True)] = Law.DONOR
     rate: Annotated[
         Value,
         NotNegative(
@@ -287,20 +289,22 @@ class Arc(Compartment):
             "s (share law); None, in files ``rest``: what the others leave, or what the control sets. Uncontrolled "
             "shares keep their proportions in what controlled ones leave",
             varies=True,
-            none="rest",
+            none_word="rest",
         ),
     ] = None
     by: Annotated[
-        str, Declared("compartment whose model gives the flow (compartment law) or releases the batches (batch law)")
+        str, Declaration("compartment whose model gives the flow (compartment law) or releases the batches (batch law)")
     ] = ""
-    port: Annotated[str, Declared("what ``by`` releases into this arc, one of the ports of its model (batch law)")] = ""
+    port: Annotated[
+        str, Declaration("what ``by`` releases into this arc, one of the ports of its model (batch law)")
+    ] = ""
     batches: Annotated[
         tuple[Pair, ...],
         Numbers(
             "(time, mass) of batches that leave on schedule (batch law without ``by``)",
             "((time, mass), …)",
             (None, 2),
-            spelled="batches",
+            table_form="batches",
         ),
     ] = ()
     delay: Annotated[
@@ -314,7 +318,7 @@ class Arc(Compartment):
     flow: Annotated[Value, NotNegative("e, mass/time (exogenous law)", of="flow", varies=True)] = 0.0
     makes_up_for: Annotated[
         str,
-        Declared(
+        Declaration(
             "service of which, while nobody acts on it, a controlled flow supplies what would lack in the interval, "
             "within the bounds of its control"
         ),
@@ -323,7 +327,7 @@ class Arc(Compartment):
         float | None,
         Share("part of that supply, of arcs that make up for the same service; they sum to 1; None: all of it"),
     ] = None
-    pollutant: Annotated[bool, Declared("whether material that enters an environment here is a pollutant")] = True
+    pollutant: Annotated[bool, Declaration("whether material that enters an environment here is a pollutant")] = True
     set_point: Annotated[float | None, Quantity("mean flow aimed at, mass/time; None if there is none", of="flow")] = (
         None
     )
@@ -337,8 +341,8 @@ class Arc(Compartment):
     ] = 1.0
 
 
-@frozen
-class Service(Checked):
+@frozen_record
+class Service(CheckedRecord):
     """What the network is there for: a stock or flow to be kept within a band, under an ``id`` of its own.
 
     The level is 1 inside ``[low, high]``, ``q/low`` below it and ``high/q`` above it; the shortfall is 1 - level. A
@@ -347,7 +351,7 @@ class Service(Checked):
 
     id: str
     title: Annotated[str, TITLE] = ""
-    provider: Annotated[str, Declared("compartment at which it is measured")]
+    provider: Annotated[str, Declaration("compartment at which it is measured")]
     quantity: Annotated[
         str,
         Word(
@@ -357,7 +361,8 @@ class Service(Checked):
         ),
     ]
     also: Annotated[
-        tuple[str, ...], Declared("further compartments of which the same quantity is measured and added; no measures")
+        tuple[str, ...],
+        Declaration("further compartments of which the same quantity is measured and added; no measures"),
     ] = ()
     low: Annotated[
         Value, Quantity("lower end of the band: mass, mass/time or the measure's", of=BAND_OF, joint=True, varies=True)
@@ -365,10 +370,11 @@ class Service(Checked):
     high: Annotated[Value, Quantity("upper end, likewise; none if left out", of=BAND_OF, joint=True, varies=True)] = (
         math.inf
     )
-    weight: Annotated[float, NotNegative("factor of the shortfall in the local rewards", required=True)] = 1.0
-    measure: Annotated[str, Declared('name of the measure, for ``quantity = "measure"``')] = ""
+    weight: Annotated[float, NotNegative("factor of the shortfall in the local rewards", mandatory=True)] = 1.0
+    measure: Annotated[str, Declaration('name of the measure, for ``quantity = "measure"``')] = ""
     owed_by: Annotated[
-        tuple[str, ...], Declared("compartments whose local reward bears the shortfall; empty means the provider alone")
+        tuple[str, ...],
+        Declaration("compartments whose local reward bears the shortfall; empty means the provider alone"),
     ] = ()
 
     @property
@@ -382,12 +388,12 @@ class Service(Checked):
         return self.owed_by or (self.provider,)
 
 
-@frozen
-class Episode(Checked):
+@frozen_record
+class Episode(CheckedRecord):
     """Time and solver of an episode."""
 
-    control_interval: Annotated[float, Positive("h, time between two decisions", of="time", required=True)] = 1.0
-    horizon: Annotated[int, Quantity("decisions per episode", of="steps", low=1, high=10_000_000, required=True)] = 50
+    control_interval: Annotated[float, Positive("h, time between two decisions", of="time", mandatory=True)] = 1.0
+    horizon: Annotated[int, Quantity("decisions per episode", of="steps", low=1, high=10_000_000, mandatory=True)] = 50
     solver: Annotated[
         str,
         Word(
@@ -412,27 +418,27 @@ class Episode(Checked):
     ] = None
 
 
-@frozen
-class Objective(Checked):
+@frozen_record
+class Objective(CheckedRecord):
     """How circularity and rewards are read off the network."""
 
-    reference_interval: Annotated[float, Positive("Δ of λ = −(m_fb + Δ·ṁ_fc)", of="time", required=True)] = 1.0
+    reference_interval: Annotated[float, Positive("Δ of λ = −(m_fb + Δ·ṁ_fc)", of="time", mandatory=True)] = 1.0
     net_zero: Annotated[
         str,
         Word(
             "``signed`` counts over-removal from the environment as positive; ``abs`` penalises it like emission",
             of=("signed", "abs"),
-            required=True,
+            mandatory=True,
         ),
     ] = "signed"
-    reward: Annotated[str, Word("default reward mode of the environments", of=REWARDS, required=True)] = "mixed"
-    circularity_scale: Annotated[float, Positive("reference |λ|", of="mass", required=True)] = 1.0
+    reward: Annotated[str, Word("default reward mode of the environments", of=REWARDS, mandatory=True)] = "mixed"
+    circularity_scale: Annotated[float, Positive("reference |λ|", of="mass", mandatory=True)] = 1.0
     circularity_weight: Annotated[
-        float, Share("weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local", required=True)
+        float, Share("weight w of λ in ``mixed`` = w·λ/scale + (1 − w)·local", mandatory=True)
     ] = 0.5
     tracked: Annotated[
         tuple[str, ...],
-        Declared("compartments whose distance to the set-point enters their local reward; empty means all with one"),
+        Declaration("compartments whose distance to the set-point enters their local reward; empty means all with one"),
     ] = ()
     criticality: Annotated[
         float | None,
@@ -440,8 +446,8 @@ class Objective(Checked):
     ] = None
 
 
-@frozen
-class Observation(Checked):
+@frozen_record
+class Observation(CheckedRecord):
     """What agents see by default."""
 
     mode: Annotated[
@@ -450,11 +456,11 @@ class Observation(Checked):
             "``local``, ``neighbours``, ``full``, ``stocks`` (the stocks of ``nodes`` in that order) or ``model`` "
             "(what the agent's own model shows, nothing else)",
             of=OBSERVE,
-            called="observation mode",
-            required=True,
+            label="observation mode",
+            mandatory=True,
         ),
     ] = "local"
     nodes: Annotated[
         tuple[str, ...],
-        Declared("in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``)"),
+        Declaration("in mode ``stocks``, the observed stocks (ids of nodes) and inner states (``compartment.state``)"),
     ] = ()

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import integrate, optimize, special, stats
 
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.rowsum import Floats
 
 CLOSE = 2e-3
@@ -63,7 +63,7 @@ flow analysis; of a normal one what is below 0 leaves at once.
 """
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Chain:
     """The stages of a lifetime with parameter ``mean`` 1."""
@@ -80,11 +80,11 @@ class Chain:
     def survival(self, age: ArrayLike) -> Floats:
         """Return S at ages in units of ``mean``, in their shape."""
         ages = np.asarray(age, dtype=np.float64)
-        left: Floats = _left(self.stages, self.rate, ages.ravel()) @ np.array(self.weights)
+        left: Floats = _survival_terms(self.stages, self.rate, ages.ravel()) @ np.array(self.weights)
         return left.reshape(ages.shape)
 
     @property
-    def entering(self) -> Floats:
+    def inflow_shares(self) -> Floats:
         """Part of what enters that each stage gets, first the one with most to go, shape (K,)."""
         return np.array(self.weights[:0:-1])
 
@@ -93,15 +93,15 @@ class Chain:
         """A of ẋ = A x + ``entering`` · u, u what enters; shape (K, K), first the stage with most to go."""
         return self.rate * (np.eye(self.stages, k=-1) - np.eye(self.stages))
 
-    def grown(self, growth: float) -> Floats:
+    def growing_stock(self, growth: float) -> Floats:
         """Return the stages, shape (K,), of a stock into which u = e^(growth·t) has always flowed, at t = 0.
 
         With ẋ = growth·x, (growth·I − A) x = ``entering``; growth, in 1/``mean``, lies above −μ.
         """
-        return np.asarray(np.linalg.solve(growth * np.eye(self.stages) - self.matrix, self.entering))
+        return np.asarray(np.linalg.solve(growth * np.eye(self.stages) - self.matrix, self.inflow_shares))
 
 
-def _left(stages: int, rate: float, ages: Floats) -> Floats:
+def _survival_terms(stages: int, rate: float, ages: Floats) -> Floats:
     """Return Q(n, rate·age) for n = 0 … stages, shape (ages, stages + 1)."""
     left = np.zeros((len(ages), stages + 1))
     left[:, 1:] = special.gammaincc(np.arange(1, stages + 1), rate * ages[:, None])
@@ -121,27 +121,27 @@ def chain_of(distribution: str, deviation: float) -> Chain:
     survival = SURVIVALS[distribution](deviation)
     ages = np.linspace(0.0, 1.0 + 8.0 * deviation, POINTS)
     wanted, mean = survival(ages), float(integrate.quad(survival, 0.0, 1.0 + 40.0 * deviation, limit=500)[0])
-    best = _fitted(LENGTHS[0], 1.0, ages, wanted, mean)
+    best = _fit_chain(LENGTHS[0], 1.0, ages, wanted, mean)
     for stages in LENGTHS:
-        best = min(best, _closest(stages, ages, wanted, mean), key=lambda chain: chain.error)
+        best = min(best, _closest_chain(stages, ages, wanted, mean), key=lambda chain: chain.error)
         if best.error <= CLOSE:
             break
     return best
 
 
-def _closest(stages: int, ages: Floats, wanted: Floats, mean: float) -> Chain:
+def _closest_chain(stages: int, ages: Floats, wanted: Floats, mean: float) -> Chain:
     """Return the closest chain of so many stages."""
     rates, found = np.geomspace(0.2, 1.0, 12) * stages / mean, []
     for _ in range(2):  # then once more, finer, around the best
-        found += [_fitted(stages, float(rate), ages, wanted, mean) for rate in rates]
+        found += [_fit_chain(stages, float(rate), ages, wanted, mean) for rate in rates]
         best = min(found, key=lambda chain: chain.error)
         rates = np.clip(best.rate * np.geomspace(0.89, 1.12, 9), 0.0, stages / mean)
     return min(found, key=lambda chain: chain.error)
 
 
-def _fitted(stages: int, rate: float, ages: Floats, wanted: Floats, mean: float) -> Chain:
+def _fit_chain(stages: int, rate: float, ages: Floats, wanted: Floats, mean: float) -> Chain:
     """Return the chain of some stages and rate that is closest and has a mean."""
-    left, to_go = _left(stages, rate, ages), np.arange(stages + 1)
+    left, to_go = _survival_terms(stages, rate, ages), np.arange(stages + 1)
     # nothing leaves at once unless the lifetime says so
     used = to_go >= (0 if wanted[0] < 1 else 1)
     firm = FIRM * np.stack([np.ones(stages + 1), to_go / rate])[:, used]
@@ -149,5 +149,5 @@ def _fitted(stages: int, rate: float, ages: Floats, wanted: Floats, mean: float)
     weights = np.zeros(stages + 1)
     weights[used] = found / found.sum()
     rate = float(weights @ to_go) / mean
-    error = float(np.abs(_left(stages, rate, ages) @ weights - wanted).max())
+    error = float(np.abs(_survival_terms(stages, rate, ages) @ weights - wanted).max())
     return Chain(rate, tuple(weights.tolist()), error)

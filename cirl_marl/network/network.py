@@ -24,14 +24,14 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from cirl_marl.errors import CirlError, NetworkError, unknown
-from cirl_marl.network.ages import remaining
-from cirl_marl.network.declared import declarations
+from cirl_marl.network.declarations import declarations
 from cirl_marl.network.elements import SINKS, Arc, Compartment, ControlKind, Law, Node, Role, Service
-from cirl_marl.network.parts import Parts
+from cirl_marl.network.initial_ages import remaining_history
 from cirl_marl.network.rowsum import Floats, Integers, RowSum, spans
 from cirl_marl.network.series import Series
+from cirl_marl.network.specification import Specification
 from cirl_marl.network.uncertainty import highest_factor
-from cirl_marl.network.validate import problems
+from cirl_marl.network.validation import problems
 
 if TYPE_CHECKING:
     import networkx
@@ -41,7 +41,7 @@ RESERVE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Network(Parts):
+class Network(Specification):
     """A thermodynamical material network under one scenario; its attributes are those of ``Parts``."""
 
     def __post_init__(self) -> None:
@@ -113,13 +113,13 @@ class Network(Parts):
         """
         own = self.compartments[compartment]
         places = {own.donor, own.recipient} if isinstance(own, Arc) else {own.id}
-        for region, nodes in self._copied.items():
+        for region, nodes in self._nodes_of_copies.items():
             if own.id.startswith(f"{region}_") and places & nodes:
                 return own.id.removeprefix(f"{region}_")
         return None
 
     @cached_property
-    def _copied(self) -> Mapping[str, frozenset[str]]:
+    def _nodes_of_copies(self) -> Mapping[str, frozenset[str]]:
         return {region: frozenset(nodes) for region, nodes in self.copies.items()}
 
     @cached_property
@@ -138,17 +138,17 @@ class Network(Parts):
         initial = np.array(ranges, dtype=float).reshape(-1, 2).T.copy()
         for i, node in enumerate(self.stores):
             if node.initial is None and node.history is not None:
-                initial[:, i] = remaining(node, self.episode.control_interval).sum()
+                initial[:, i] = remaining_history(node, self.episode.control_interval).sum()
         unknown_ = {node.id for node in self.stores if node.initial is None and node.history is None}
         for arc in self.arcs:
             if arc.donor in unknown_:
                 donor = self.nodes[self.node_index[arc.donor]]
-                base = self.held(arc.flow) * highest_factor(self, f"arcs.{arc.id}.flow")
+                base = self.interval_means(arc.flow) * highest_factor(self, f"arcs.{arc.id}.flow")
                 base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
                 # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
                 sets = [c.control for c in (arc, donor) if c.control is not None]
                 acting = (c for c in sets if c.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
-                factors = [self.held(control.high) for control in acting]
+                factors = [self.interval_means(control.high) for control in acting]
                 asked = np.prod([base, *factors], axis=0).sum() * self.episode.control_interval
                 initial[:, self.node_index[arc.donor]] += asked * (1 + RESERVE)
         return _read_only(initial)
@@ -193,15 +193,16 @@ class Network(Parts):
         if not any(isinstance(value, Series) for triple in triples for value in triple):
             constant = np.array(triples, dtype=float).reshape(-1, 3).T
             return np.broadcast_to(constant[:, :, None], shape)
-        return _read_only(np.array([[self.held(value) for value in side] for side in zip(*triples, strict=True)]))
+        bounds = [[self.interval_means(value) for value in side] for side in zip(*triples, strict=True)]
+        return _read_only(np.array(bounds))
 
     @cached_property
     def agents(self) -> tuple[str, ...]:
         """Compartments that act by default."""
-        return self.acting or self.controllable
+        return self.default_agents or self.controllable
 
     @cached_property
-    def changing(self) -> tuple[str, ...]:
+    def time_dependent(self) -> tuple[str, ...]:
         """Compartments of which a number, or a bound of the control, changes in time."""
         parts = [(c.id, part) for c in self.compartments.values() for part in (c, c.control) if part is not None]
         found = (i for i, p in parts if any(isinstance(getattr(p, name), Series) for name in declarations(type(p))))
@@ -301,7 +302,7 @@ class Network(Parts):
         shape = (len(self.nodes) - len(self.stores), len(self.arcs))
         return RowSum(self.donors[passing] - len(self.stores), passing, 1.0, shape)
 
-    def metered(self, service: Service) -> Integers:
+    def service_arcs(self, service: Service) -> Integers:
         """Return the arcs whose flows add up to what a service of quantity ``flow`` or ``outflow`` measures."""
         if service.quantity == "outflow":
             nodes = [self.node_index[each] for each in service.providers]

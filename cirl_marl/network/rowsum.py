@@ -17,7 +17,7 @@ from scipy.sparse._sparsetools import csc_matvec, csc_matvecs
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
-NOTHING = 1e-290
+NEGLIGIBLE = 1e-290
 """Stock that gives nothing away: emptied again and again it would become subnormal, which does not round well."""
 
 
@@ -30,14 +30,14 @@ def spans(sizes: Iterable[int]) -> list[slice]:
     return [slice(first, last) for first, last in pairwise(np.cumsum([0, *sizes]).tolist())]
 
 
-def narrowed(table: Floats) -> Floats:
+def single_column(table: Floats) -> Floats:
     """Return the one column of a table over intervals that was broadcast to all of them; others as they are."""
     return table[..., :1] if table.strides[-1] == 0 else table
 
 
 def disposable(stock: Floats, parts: int) -> Floats:
     """Return the mass that a stock can give away in so many parts without their rounding overdrawing it."""
-    return np.where(stock > NOTHING, stock * (1.0 - max(1e-12, 4.0 * np.finfo(float).eps * parts)), 0.0)
+    return np.where(stock > NEGLIGIBLE, stock * (1.0 - max(1e-12, 4.0 * np.finfo(float).eps * parts)), 0.0)
 
 
 class RowSum:
@@ -76,7 +76,7 @@ class RowSum:
         """
         return self.add_to(values, values)
 
-    def scaled(self, factor: float) -> RowSum:
+    def scaled_by(self, factor: float) -> RowSum:
         """Return factor·W."""
         other = object.__new__(RowSum)
         other.shape, other._starts, other._rows = self.shape, self._starts, self._rows
@@ -88,7 +88,7 @@ class RowSum:
         sums: Floats = np.add.reduceat(np.append(self._weights, 0.0), self._starts[:-1])
         return np.where(np.diff(self._starts) > 0, sums, 0.0)
 
-    def chosen(self, rows: list[int]) -> RowSum:
+    def select_rows(self, rows: list[int]) -> RowSum:
         """Return the matrix of the given rows of W."""
         matrix = sparse.csc_array((self._weights, self._rows, self._starts), shape=self.shape)[rows].tocoo()
         return RowSum(matrix.row, matrix.col, matrix.data, (len(rows), self.shape[1]))

@@ -10,12 +10,20 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from cirl_marl.network.declared import Changing, Checked, Declared, Numbers, Quantity, Word, frozen
+from cirl_marl.network.declarations import (
+    CheckedRecord,
+    Declaration,
+    Numbers,
+    Quantity,
+    TimeVarying,
+    Word,
+    frozen_record,
+)
 from cirl_marl.network.rowsum import Floats
 
 
-@frozen
-class Series(Checked, Changing):
+@frozen_record
+class Series(CheckedRecord, TimeVarying):
     """A number that changes in time; within a control interval its mean over the interval holds."""
 
     times: Annotated[
@@ -35,8 +43,8 @@ class Series(Checked, Changing):
             "time up to which the last value is known to hold; None: for good (``step``), or no longer", of="time"
         ),
     ] = None
-    factor: Annotated[Any, Declared("another series, not negative, by which it is multiplied at all times")] = None
-    origin: Annotated[str, Declared("where it was read from, for messages")] = field(default="", compare=False)
+    factor: Annotated[Any, Declaration("another series, not negative, by which it is multiplied at all times")] = None
+    origin: Annotated[str, Declaration("where it was read from, for messages")] = field(default="", compare=False)
 
     @property
     def extremes(self) -> tuple[float, float]:
@@ -78,7 +86,7 @@ class Series(Checked, Changing):
                 mistakes = [f"series: {min(self.factor.values):g} is negative"]
             yield from (f"multiplied_by: {each}" for each in mistakes)
 
-    def uncovered(self, length: float, said: Callable[[float], str] = "{:g}".format) -> str:
+    def coverage_problem(self, length: float, said: Callable[[float], str] = "{:g}".format) -> str:
         """Return what is missing of an episode of some length; nothing if the series covers it.
 
         ``said`` puts times into words.
@@ -90,10 +98,10 @@ class Series(Checked, Changing):
         if self.end < length - slack:
             missing = f"series ends at {said(self.end)}, but the episode at {said(length)}"
             return f"{missing}; give what is missing, or a shorter horizon"
-        other = "" if self.factor is None else self.factor.uncovered(length, said)
+        other = "" if self.factor is None else self.factor.coverage_problem(length, said)
         return other and f"multiplied_by: {other}"
 
-    def unfinished(self, said: Callable[[float], str] = "{:g}".format) -> str:
+    def history_problem(self, said: Callable[[float], str] = "{:g}".format) -> str:
         """Return why it does not tell what was before time 0; nothing if it does."""
         if self.times[0] >= 0:
             return f"series begins at {said(self.times[0])}, not before the episode does"
@@ -104,7 +112,7 @@ class Series(Checked, Changing):
         if self.factor.times[0] > self.times[0]:
             late = f"series begins at {said(self.factor.times[0])}, after what it multiplies at {said(self.times[0])}"
             return f"multiplied_by: {late}; give what is missing"
-        other = self.factor.unfinished(said)
+        other = self.factor.history_problem(said)
         return other and f"multiplied_by: {other}"
 
     def means(self, edges: Floats) -> Floats:

@@ -11,12 +11,12 @@ import numpy as np
 from scipy import special
 
 from cirl_marl.errors import unknown
-from cirl_marl.network.declared import Checked, Positive, Quantity, Word, declarations, frozen
-from cirl_marl.network.elements import FIXED, Arc, Law, Node, Service
-from cirl_marl.network.parts import Parts
+from cirl_marl.network.declarations import CheckedRecord, Positive, Quantity, Word, declarations, frozen_record
+from cirl_marl.network.elements import FIXED_LIFETIME, Arc, Law, Node, Service
 from cirl_marl.network.rowsum import Floats
 from cirl_marl.network.series import Series, extremes, in_intervals
-from cirl_marl.network.splits import proportions, splits
+from cirl_marl.network.specification import Specification
+from cirl_marl.network.split_fractions import proportions, splits
 
 WIDE = 4.0
 """Deviations of a normal distribution up to which every distribution goes that states no range, by probability."""
@@ -25,8 +25,8 @@ KINDS: Mapping[str, type[Any]] = {"nodes": Node, "arcs": Arc, "services": Servic
 """Parts of a network whose numbers may be uncertain, by the key of their table."""
 
 
-@frozen
-class Spread(Checked):
+@frozen_record
+class Spread(CheckedRecord):
     """How a number spreads, as a factor on it: of mean or middle 1, the same at all times of an episode."""
 
     deviation: Annotated[
@@ -89,7 +89,7 @@ class Spread(Checked):
         return np.asarray(np.exp(width * special.ndtri(share) - width**2 / 2))
 
 
-def numbers_of(network: Parts, kind: str, field: str) -> dict[str, int]:
+def numbers_of(network: Specification, kind: str, field: str) -> dict[str, int]:
     """Return the rows of uncertain numbers among the factors, by the id of the part of which they are a field."""
     found = {}
     for row, where in enumerate(network.uncertain):
@@ -99,16 +99,16 @@ def numbers_of(network: Parts, kind: str, field: str) -> dict[str, int]:
     return found
 
 
-def highest_factor(network: Parts, where: str) -> float:
+def highest_factor(network: Specification, where: str) -> float:
     """Return the greatest factor on the number at a path; 1 if it is known exactly."""
     return float(network.uncertain[where].ends[1]) if where in network.uncertain else 1.0
 
 
-def uncertainty_problems(network: Parts) -> Iterator[str]:
+def uncertainty_problems(network: Specification) -> Iterator[str]:
     """Yield why the numbers that are said to be uncertain cannot be drawn."""
     for where, spread in network.uncertain.items():
         try:
-            part, name = _found(network, where)
+            part, name = _uncertain_field(network, where)
         except KeyError as error:
             yield f"{where}: {error.args[0]}"
             continue
@@ -120,11 +120,11 @@ def uncertainty_problems(network: Parts) -> Iterator[str]:
         yield from (f"{where}: {each}" for each in mistakes)
 
 
-def _undrawable(network: Parts, part: Any, name: str, spread: Spread) -> Iterator[str]:
+def _undrawable(network: Specification, part: Any, name: str, spread: Spread) -> Iterator[str]:
     """Yield why no network could have some of the draws."""
     if name == "rate" and isinstance(part, Arc) and part.law is Law.BATCH:
         yield "the mass of what is released in batches cannot be uncertain"
-    elif name == "stretch" and (part.lifetime is None or part.lifetime.distribution == FIXED):
+    elif name == "stretch" and (part.lifetime is None or part.lifetime.distribution == FIXED_LIFETIME):
         yield "only a lifetime with a deviation can be stretched"
     elif name == "stretch" and spread.ends[0] <= 0:
         yield "some draws are 0; give a range above it"
@@ -132,12 +132,12 @@ def _undrawable(network: Parts, part: Any, name: str, spread: Spread) -> Iterato
         low, high = (highest_factor(network, f"services.{part.id}.low"), 1.0)
         if f"services.{part.id}.high" in network.uncertain:
             high = network.uncertain[f"services.{part.id}.high"].ends[0]
-        ends = network.held(part.low) * low, network.held(part.high) * high
+        ends = network.interval_means(part.low) * low, network.interval_means(part.high) * high
         if (ends[0] > ends[1]).any():
             yield "some draws turn the band upside down; give ranges that do not overlap"
 
 
-def drawn(network: Any, factors: Sequence[float]) -> Any:
+def draw_network(network: Any, factors: Sequence[float]) -> Any:
     """Return the network whose numbers are certain: those that were uncertain, times what was drawn.
 
     Shares of a donor stay shares of a whole: those that have no control keep their proportions to each other, and an
@@ -153,17 +153,17 @@ def drawn(network: Any, factors: Sequence[float]) -> Any:
         changed.setdefault(id(part), (part, {}))[1][name] = value
 
     for where, factor in zip(network.uncertain, factors, strict=True):
-        part, name = _found(network, where)
+        part, name = _uncertain_field(network, where)
         value = getattr(part, name)
         if isinstance(value, Series):
             change(part, name, replace(value, values=tuple(each * float(factor) for each in value.values)))
         else:
             change(part, name, value * float(factor))
     for split in splits(network):
-        arcs = [network.arcs[k] for k in split.others]
+        arcs = [network.arcs[k] for k in split.other_arcs]
         told = [changed.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs]
         if any(value is not arc.share for value, arc in zip(told, arcs, strict=True)):
-            given = np.array([network.held(np.nan if value is None else value) for value in told])
+            given = np.array([network.interval_means(np.nan if value is None else value) for value in told])
             left = 1.0 - split.bounds[1].sum(axis=0)
             for arc, shares in zip(arcs, proportions(given, left) * left, strict=True):
                 if arc.share is not None:
@@ -181,7 +181,7 @@ def drawn(network: Any, factors: Sequence[float]) -> Any:
     return replace(network, **groups, uncertain={}, scenarios={})
 
 
-def _found(network: Parts, where: str) -> tuple[Any, str]:
+def _uncertain_field(network: Specification, where: str) -> tuple[Any, str]:
     """Return the part and the name of the field at a path such as ``arcs.mining.rate``.
 
     Raises:

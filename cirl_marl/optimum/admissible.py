@@ -15,7 +15,7 @@ from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node
-from cirl_marl.network.splits import Split, splits
+from cirl_marl.network.split_fractions import Split, splits
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
 
@@ -92,18 +92,18 @@ class Admissible:
             if setter is not None:
                 own[:, :, k] = _range(network, setter, acting)
         for split in divided:
-            arcs = [*split.controlled, *split.others]
-            asked = own[:, :, list(split.controlled)].transpose(0, 2, 1)
+            arcs = [*split.controlled_arcs, *split.other_arcs]
+            asked = own[:, :, list(split.controlled_arcs)].transpose(0, 2, 1)
             (low, high), (neutral, _) = shares(split, asked[[0, 2]]), shares(split, asked[[1, 1]])
             own[:, :, arcs] = np.stack([low.T, neutral.T, high.T])
         share = np.array([arc.law is Law.SHARE for arc in network.arcs], dtype=bool)
-        base = [network.held(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
-        served = [network.held(service.low) for service in network.services]
+        base = [network.interval_means(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
+        served = [network.interval_means(service.low) for service in network.services]
         return cls(
             network=network,
             lifetimes=lifetimes,
             agents=acting,
-            driver=np.where(laws.scheduled, -1, np.where(share, network.donors, laws.driver)),
+            driver=np.where(laws.is_scheduled, -1, np.where(share, network.donors, laws.driver)),
             base=np.array(base, dtype=float).reshape(-1, steps).T,
             own=own[::2],
             valve=valve[::2],
@@ -158,7 +158,7 @@ class Admissible:
         released = np.zeros((2, len(self.network.nodes)))
         for split in self.splits:
             i = self.network.node_index[split.donor]
-            released[:, i] = self.valve[:, step, i] * self.base[step, split.others[0]]
+            released[:, i] = self.valve[:, step, i] * self.base[step, split.other_arcs[0]]
         return released
 
     def exits(self, step: int) -> Floats:
@@ -175,7 +175,7 @@ class Admissible:
     def divided(self, step: int) -> list[Split]:
         """Return the splits in which some share can be chosen in an interval."""
         free = self.own[0, step] < self.own[1, step]
-        return [split for split in self.splits if free[[*split.controlled, *split.others]].any()]
+        return [split for split in self.splits if free[[*split.controlled_arcs, *split.other_arcs]].any()]
 
 
 def shares(split: Split, asked: Floats) -> Floats:

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.dynamics.rows import Rows
-from cirl_marl.dynamics.stages import inside
+from cirl_marl.dynamics.stages import simulated_network
+from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
@@ -163,7 +163,7 @@ class Envelope:
         nodes = len(first.initial)
         demanded = _demanded(first, min_service)
         shape = np.broadcast_shapes(starts.shape[:-1], () if demanded is None else demanded.shape[:-1])
-        names = Rows(inside(first.network)).start_names
+        names = StateLayout(simulated_network(first.network)).start_names
         programs = Programs(Admissible.of(first.network, first.agents or None), first.degree, first.service_weight)
         starts = np.broadcast_to(starts, (*shape, nodes))
         levels = None if demanded is None else np.broadcast_to(demanded, (*shape, demanded.shape[-1]))
@@ -265,7 +265,7 @@ def envelope(
     levels = None if min_service is None else demanded_levels(admissible.network, min_service, (len(starts),))
     programs = Programs(admissible, degree, service_weight)
 
-    names = Rows(inside(network_)).start_names
+    names = StateLayout(simulated_network(network_)).start_names
 
     def solved(start: Floats, demanded: Floats | None, basis: Basis | None) -> Bound:
         check_stocks(names, start)

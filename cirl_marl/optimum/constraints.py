@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.network import Floats, Integers
-from cirl_marl.network.splits import Split
+from cirl_marl.network.split_fractions import Split
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.matrices import Layout, ProgramRows
 from cirl_marl.optimum.reach import Reach
@@ -106,7 +106,7 @@ def throughputs(admissible: Admissible, layout: Layout, step: int, rows: Program
     rows.put(row[:, stores:], layout.stock(moment) + np.arange(stores, nodes), -1.0)
     for split in admissible.divided(step):
         donor = network.node_index[split.donor]
-        out = np.array([*split.controlled, *split.others])
+        out = np.array([*split.controlled_arcs, *split.other_arcs])
         total = rows.add(2, moment, 1, donor)
         rows.put(total, layout.flow(moment) + out, 1.0)
         rows.put(total, *_released(admissible, layout, step, donor, int(out[0])))
@@ -130,7 +130,11 @@ def leader(split: Split, step: int) -> tuple[int, Integers, Floats]:
     proportions = split.proportions[:, step]
     first = int(proportions.argmax())
     rest = np.arange(len(proportions)) != first
-    return split.others[first], np.array(split.others, dtype=np.intp)[rest], proportions[rest] / proportions[first]
+    return (
+        split.other_arcs[first],
+        np.array(split.other_arcs, dtype=np.intp)[rest],
+        proportions[rest] / proportions[first],
+    )
 
 
 def followers(admissible: Admissible, step: int) -> Integers:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from cirl_marl.controllers.rollout import Rollout
-from cirl_marl.dynamics.motion import Dynamics
+from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.network import Floats
@@ -101,7 +101,7 @@ def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
     rows, nodes = dynamics.rows, dynamics.rows.nodes.stop
     stock = _path(bound, dynamics)
     inputs = np.concatenate([stock[:-1], bound.actions], axis=1)
-    scale = np.array([node.scale for node in dynamics.inside.stores])
+    scale = np.array([node.scale for node in dynamics.staged_network.stores])
     width = np.concatenate([np.maximum(stock.max(axis=0), scale), np.ones(entries)]) * DIFFERENCE
     # forward in stocks, which may be 0; inward in actions, which may be at a bound
     # one batch simulates all difference quotients of all intervals: column (t, j) has input j of interval t shifted
@@ -115,7 +115,7 @@ def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
     stocks, supply = dynamics.extend(flat[:nodes]), Supply(dynamics)
     controls = supply(stocks, inner, actuators.controls(flat[nodes:], when), when, supply.idle(actuators.agents))
     done = dynamics.advance(stocks, inner, controls, when)
-    outputs = np.concatenate([done.stock[rows.nodes], done.moved / network.episode.control_interval])
+    outputs = np.concatenate([done.stock[rows.nodes], done.moved_mass / network.episode.control_interval])
     shaped = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
     slopes = (shaped[:, :, :-1] - shaped[:, :, -1:]) / shift[:, None]
     return slopes[:, :, :nodes], slopes[:, :, nodes:], stock[1:]
@@ -161,7 +161,7 @@ def _step(
     dynamics = Dynamics(network)
     measure, imbalances = _measures(bound, dynamics)
     realised = np.concatenate([stocks, run.flow], axis=1)
-    low = np.array([network.held(service.low) for service in network.services]).reshape(services, steps)
+    low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)
     # low·level − δq ≤ q, and ±(φ + δφ) ≤ imbalance, with q and φ those of the simulated episode
     rows = np.zeros((steps, services + 2, size))
     rows[:, :services, :outputs] = -measure
@@ -190,7 +190,7 @@ def _step(
         high=high,
     )
     # states and flows change by shares of their largest values, the others by shares of 1
-    parts = (*dynamics.inside.stores, *network.arcs)
+    parts = (*dynamics.staged_network.stores, *network.arcs)
     largest = np.maximum(np.abs(realised).max(axis=0), [part.scale for part in parts])
     net = max(float(np.abs(realised @ imbalances).max()), network.objective.circularity_scale)
     sizes = np.concatenate([largest, np.ones(entries + services), [net]])
@@ -212,7 +212,7 @@ def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats]:
             for place in (network.node_index[each] for each in service.providers):
                 measure[s, dynamics.rows.stages.get(place, place)] = 1.0
         else:
-            measure[s, nodes + network.metered(service)] = 1.0
+            measure[s, nodes + network.service_arcs(service)] = 1.0
     return measure, np.concatenate([np.zeros(nodes), -network.circularity_weights[1]])
 
 

@@ -34,7 +34,7 @@ class Kernel:
         shape = (pieces, moments, pieces, moments)
         self.known, self.low, self.high = np.zeros((pieces, moments, stages)), np.zeros(shape), np.zeros(shape)
         unit = chain.matrix / chain.rate
-        motions = {each: _Motion(unit, each * length, chain.entering, degree) for each in np.unique(rate).tolist()}
+        motions = {each: _Motion(unit, each * length, chain.inflow_shares, degree) for each in np.unique(rate).tolist()}
         parts = [motions[each] for each in rate.tolist()]
         gathered, passed = np.empty((0, moments, stages)), np.eye(stages)
         for p, motion in enumerate(parts):
@@ -74,7 +74,7 @@ def released(chain: Chain, rate: Floats, length: float, degree: int) -> Floats:
     held = np.zeros((chain.stages, len(rate)))
     for p, each in enumerate(rate.tolist()):
         means, whole = parts[each]
-        held[:, p] = chain.entering / chain.entering.sum()
+        held[:, p] = chain.inflow_shares / chain.inflow_shares.sum()
         found[:, p] = (each * means[:, -1] @ held).T
         held = whole @ held
     return found

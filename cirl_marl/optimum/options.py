@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.dynamics.rows import Rows
-from cirl_marl.dynamics.stages import inside
+from cirl_marl.dynamics.stages import simulated_network
+from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.ages import spread
+from cirl_marl.network.initial_ages import age_shares
 
 DEGREE = 2
 """Degree of the test polynomials; docs/bound.md has the gap against it."""
@@ -38,7 +38,7 @@ def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike |
         if start.ndim != 1:
             raise CirlError(f"initial has shape {start.shape}, expected {(len(stores),)}")
     start = by_stage(network, start)
-    check_stocks(Rows(inside(network)).start_names, start)
+    check_stocks(StateLayout(simulated_network(network)).start_names, start)
     return start
 
 
@@ -66,7 +66,7 @@ def by_stage(network: Network, stocks: ArrayLike) -> Floats:
     Raises:
         CirlError: for another shape.
     """
-    given, rows = np.asarray(stocks, dtype=float), Rows(inside(network))
+    given, rows = np.asarray(stocks, dtype=float), StateLayout(simulated_network(network))
     count = len(network.stores)
     if given.shape[-1:] == (rows.nodes.stop,):
         return given.copy()
@@ -75,7 +75,7 @@ def by_stage(network: Network, stocks: ArrayLike) -> Floats:
     whole = np.zeros((*given.shape[:-1], rows.nodes.stop))
     whole[..., :count] = given
     for i, stages in rows.stages.items():
-        whole[..., stages] = given[..., i, None] * spread(network.stores[i], network.episode.control_interval)
+        whole[..., stages] = given[..., i, None] * age_shares(network.stores[i], network.episode.control_interval)
     return whole
 
 

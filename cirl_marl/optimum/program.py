@@ -261,7 +261,7 @@ def measures(layout: Layout, low: Floats, rows: ProgramRows) -> None:
             for store in (store for each in service.providers for store in stages.get(each, (each,))):
                 rows.put(row, layout.end(-1) + network.node_index[store], -1.0)
         else:
-            rows.put(row, layout.flow(layout.moment_column) + network.metered(service), -1.0 / count)
+            rows.put(row, layout.flow(layout.moment_column) + network.service_arcs(service), -1.0 / count)
     weights = -network.circularity_weights[1]
     counted = np.flatnonzero(weights)
     row = rows.add(1, len(network.services), [0, 1])

@@ -197,7 +197,7 @@ def end_laws(admissible: Admissible, layout: Layout, step: int, equal: ProgramRo
     equal.put(row[:, network.recipients[entering]], layout.end_flow(piece) + entering, 1.0)
     equal.put(row[:, stores:], layout.end(piece) + passing, -1.0)
     for split in admissible.divided(step):
-        donor, out = network.node_index[split.donor], np.array([*split.controlled, *split.others])
+        donor, out = network.node_index[split.donor], np.array([*split.controlled_arcs, *split.other_arcs])
         least, most = admissible.valve[:, step, donor]
         if least == most:
             row = equal.add(3, piece, 3, donor)

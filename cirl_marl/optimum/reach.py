@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 from scipy.sparse.linalg import splu
 
-from cirl_marl.dynamics.motion import Dynamics
-from cirl_marl.dynamics.passes import Passes
+from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, NoCertificate
 
@@ -92,7 +92,9 @@ class RouteBounds:
         visits: V, shape (nodes, nodes).
     """
 
-    def __init__(self, admissible: Admissible, passes: Passes, step: int, wider: RouteBounds | None = None) -> None:
+    def __init__(
+        self, admissible: Admissible, passes: VisitBounds, step: int, wider: RouteBounds | None = None
+    ) -> None:
         """Take the ranges of shares in interval ``step``; the visits of ``wider`` ranges are where to begin from."""
         network = admissible.network
         stores, nodes = len(network.stores), len(network.nodes)
@@ -201,7 +203,7 @@ class ComparisonSystem:
         self.admissible, self.network = admissible, admissible.network
         dynamics = Dynamics(admissible.network)
         self.substeps, self.substep = dynamics.substeps, dynamics.substep
-        self._passes = Passes(admissible.network)
+        self._passes = VisitBounds(admissible.network)
         self._routes: dict[bytes, RouteBounds] = {}
         self._passed_on = self.network.donors >= len(self.network.stores)
         kinds = np.unique(admissible.kinds).tolist()

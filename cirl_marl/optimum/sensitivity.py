@@ -134,7 +134,7 @@ def of_stocks(proven: Bound, programs: Programs) -> Floats:
     stages = getattr(planned, "stages", {})
     for i, node in enumerate(lifetimes.network.stores):
         if len(stages.get(node.id, ())) > 1 and node.lifetime is not None and node.lifetime.chain is not None:
-            entering = node.lifetime.chain.entering
+            entering = node.lifetime.chain.inflow_shares
             columns = [planned.node_index[stage] for stage in stages[node.id]]
             of_nodes[:, i] = worth[:, columns] @ (entering / entering.sum())
     return of_nodes

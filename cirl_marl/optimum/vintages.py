@@ -26,8 +26,8 @@ import numpy as np
 from scipy import sparse
 
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.rows import Rows
-from cirl_marl.dynamics.stages import StagedNetwork, inside, staged
+from cirl_marl.dynamics.stages import StagedNetwork, simulated_network, staged_network
+from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Node
 from cirl_marl.optimum.kernels import Kernel, released
@@ -86,10 +86,10 @@ class Lifetimes:
         living = [node for node in network.stores if node.lifetime is not None]
         whole = [node for node in living if not (node.id in acting and node.control is not None)]
         fixed = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
-        self.planned: Network = staged(network, {node.id for node in whole}) if living else network
-        self.reached: Network = staged(network, fixed) if living else network
-        self._written = inside(network)
-        rows = Rows(self._written)
+        self.planned: Network = staged_network(network, {node.id for node in whole}) if living else network
+        self.reached: Network = staged_network(network, fixed) if living else network
+        self._written = simulated_network(network)
+        rows = StateLayout(self._written)
         self.stocks = rows.nodes.stop
         neutral = network.control_bounds[1]
         self.lived: list[PassiveLifetime] = []
@@ -98,20 +98,20 @@ class Lifetimes:
             place, chain, planned = network.node_index[node.id], node.lifetime.chain, self.planned
             rate = np.zeros(0)
             if chain is not None:
-                rate = chain.rate / node.lifetime.mean / network.held(node.stretch)
+                rate = chain.rate / node.lifetime.mean / network.interval_means(node.stretch)
                 if node.control is not None:
                     rate = rate / neutral[network.control_rows[node.id].start]
             self.lived.append(
                 PassiveLifetime(
                     node=node,
                     rows=rows.stages.get(place, np.array([place])),
-                    leaving=planned.arc_index[planned.leaving[node.id]],
+                    leaving=planned.arc_index[planned.release_arcs[node.id]],
                     entering=np.flatnonzero(planned.recipients == planned.node_index[node.id]),
                     rate=rate,
                     at_once=0.0 if chain is None else chain.weights[0],
                     reached_entry=self.reached.node_index[node.id if chain is None else f"{node.id}.entry"],
                     reached_node=self.reached.node_index[node.id],
-                    reached_arc=self.reached.arc_index[planned.leaving[node.id]],
+                    reached_arc=self.reached.arc_index[planned.release_arcs[node.id]],
                 )
             )
         self._known: dict[tuple[str, bytes, int], Kernel] = {}

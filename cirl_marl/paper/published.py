@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from cirl_marl.definitions.reading import read_toml
+from cirl_marl.definitions.reader import read_toml
 from cirl_marl.errors import CirlError, unknown
 
 SOURCE = "Zocco, Corti, Malvezzi: CiRL, arXiv 2505.21536"

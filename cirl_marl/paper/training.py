@@ -18,7 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.definitions.writing import fingerprint
+from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.errors import CirlError, RecipeError, RunError
 from cirl_marl.learners import Progress, Recipe, load_recipe, train
 from cirl_marl.learners.algorithms import build

@@ -196,10 +196,10 @@ def service_levels(network: Network, course: PlannedEpisode) -> Floats:
     """Return the level min(1, q/low) of each service in each interval, shape (steps, services)."""
     found = np.ones((len(course.flow), len(network.services)))
     for s, service in enumerate(network.services):
-        low = network.held(service.low)
+        low = network.interval_means(service.low)
         if service.quantity == "stock":
             measured = course.stock[:, [network.node_index[each] for each in service.providers]].sum(axis=1)
         else:
-            measured = course.flow[:, network.metered(service)].sum(axis=1)
+            measured = course.flow[:, network.service_arcs(service)].sum(axis=1)
         found[:, s] = np.minimum(1.0, np.divide(measured, low, out=np.ones_like(measured), where=low > 0))
     return found

@@ -40,7 +40,7 @@ def write_json(path: Path, value: object) -> None:
 
 
 @contextmanager
-def published(folder: Path) -> Iterator[Path]:
+def publish_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder; its files move to ``folder`` if all goes well, and are forgotten if not."""
     made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)

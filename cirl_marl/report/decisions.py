@@ -17,7 +17,7 @@ from cirl_marl.controllers.schedule import Schedule
 from cirl_marl.drawing.style import SERIES, axis_time, number, save, style_axes, time_axis
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Arc, ControlKind, Node, Role
 from cirl_marl.records.files import write_atomically
 from cirl_marl.report.curves import WIDTH
@@ -27,7 +27,7 @@ SHOWN = 10
 """Largest number of levers in a table on screen."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Lever:
     """What one agent sets in an episode, beside what it would be if nobody acted."""
@@ -58,7 +58,7 @@ class Lever:
         return f"{number(value)} {self.unit}{change}".rstrip()
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Setting:
     """One thing that an agent sets."""

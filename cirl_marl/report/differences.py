@@ -16,7 +16,7 @@ from cirl_marl.evaluation.quantities import ComparedQuantity
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import defined
 from cirl_marl.network import Floats, Network
-from cirl_marl.records.files import published, write_table
+from cirl_marl.records.files import publish_folder, write_table
 from cirl_marl.report.curves import WIDTH
 
 ROWS = 12
@@ -64,7 +64,7 @@ def write_alternatives(
     header = ["quantity", "unit", found[0].name]
     for each in found[1:]:
         header += [each.name, f"difference of {each.name}", f"relative difference of {each.name}"]
-    with published(folder) as partial:
+    with publish_folder(folder) as partial:
         for stem, each in files.items():
             write_table(partial / f"{stem}.csv", *each.table())
         write_table(partial / f"{name}.csv", header, map(_row, quantities))

@@ -29,7 +29,7 @@ from cirl_marl.reasons.sentences import (
     paragraphs,
     signal_text,
 )
-from cirl_marl.records.files import published, write_json, write_table
+from cirl_marl.records.files import publish_folder, write_json, write_table
 from cirl_marl.report.curves import WIDTH
 
 FOLDER, FILE = "reasons", "reasons.json"
@@ -51,7 +51,7 @@ def write_reasons(found: Explanation, folder: Path, **options: Any) -> list[Path
     """
     written = ["reasons.txt", FILE]
     told = [(heading, tuple(said)) for heading, said in paragraphs(found)]
-    with published(folder) as partial:
+    with publish_folder(folder) as partial:
         text = "\n\n".join("\n".join([heading, *said]) for heading, said in told)
         (partial / "reasons.txt").write_text(text + "\n", encoding="utf-8")
         about = {"about": found.about, "checkpoint": found.checkpoint, "sections": told}

@@ -14,7 +14,7 @@ from cirl_marl.evaluation.comparison import FIGURES, Comparison
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.pareto import ParetoFront
 from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, defined, interquartile_mean
-from cirl_marl.records.files import published, write_json, write_table
+from cirl_marl.records.files import publish_folder, write_json, write_table
 from cirl_marl.report.curves import PointSeries, save_fronts
 
 COMPARISON_FILES = ("episodes.csv", "summary.csv", "summary.json", "comparison.png")
@@ -91,7 +91,7 @@ def write_comparison(comparison: Comparison, folder: Path, **options: Any) -> li
     units = _units(comparison)
     episodes = ["name", "training seed", "run", "episode", *units, "start seed"]
     rows = ["name", "training seeds", *(f"{name}{end}" for name in units for end in ("", ", low", ", high"))]
-    with published(folder) as partial:
+    with publish_folder(folder) as partial:
         write_table(partial / COMPARISON_FILES[0], episodes, _episodes(comparison))
         write_table(partial / COMPARISON_FILES[1], rows, _summary(comparison))
         write_json(partial / COMPARISON_FILES[2], summary_of(comparison, **options))
@@ -151,7 +151,7 @@ def write_front(sweep: ParetoFront, folder: Path, **options: Any) -> list[Path]:
     header = ["kind", "least service level", f"circularity ({mass})", "circularity weight", "training seed"]
     plain = [[each.kind, each.service, each.circularity, each.weight, each.seed] for each in sweep.points]
     about = {"provenance": provenance(sweep.network, sweep.runs, **options), "no_bound": sweep.reason or None}
-    with published(folder) as partial:
+    with publish_folder(folder) as partial:
         write_table(partial / PARETO_FILES[0], header, plain)
         write_json(partial / PARETO_FILES[1], about | {"columns": header, "points": plain})
         save_pareto(partial / PARETO_FILES[2], sweep)

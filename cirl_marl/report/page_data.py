@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from cirl_marl.controllers.rollout import interval_ends
-from cirl_marl.definitions.sources import Stated, stated
-from cirl_marl.definitions.writing import fingerprint
+from cirl_marl.definitions.sources import StatedNumber, stated_numbers
+from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.drawing.flow_diagram import FlowDiagram, lines
 from cirl_marl.drawing.grouping import flow_diagrams
 from cirl_marl.errors import CirlError
@@ -97,7 +97,7 @@ def _clock(scenes: Sequence[PageEpisode]) -> dict[str, Any]:
 def _network(network: Network, story: ReportPage) -> dict[str, Any]:
     scenes = [each for each in story.scenes if each.network == network]
     peaks = np.max([np.abs(np.nan_to_num(each.flow)).max(axis=0) for each in scenes], axis=0)
-    told = stated(network)
+    told = stated_numbers(network)
     nodes = [
         {
             "id": node.id,
@@ -143,10 +143,10 @@ def _network(network: Network, story: ReportPage) -> dict[str, Any]:
 
 
 def _law(network: Network, arc: Arc) -> str:
-    return f"Law {arc.law.value}" + ("" if arc.id in network.changing else f": {law_text(network, arc)}")
+    return f"Law {arc.law.value}" + ("" if arc.id in network.time_dependent else f": {law_text(network, arc)}")
 
 
-def _service(network: Network, service: Service, told: Iterable[Stated]) -> dict[str, Any]:
+def _service(network: Network, service: Service, told: Iterable[StatedNumber]) -> dict[str, Any]:
     label = service.title or service.id.replace("_", " ")
     providers = ", ".join(network.compartments[each].label for each in service.providers)
     measured = f"{service.measure or service.quantity} of {providers}"
@@ -157,7 +157,7 @@ def _service(network: Network, service: Service, told: Iterable[Stated]) -> dict
     }  # fmt: skip
 
 
-def _told(found: Iterable[Stated]) -> list[list[str]]:
+def _told(found: Iterable[StatedNumber]) -> list[list[str]]:
     return [[each.key, each.value, each.source] for each in found]
 
 

@@ -21,7 +21,7 @@ from cirl_marl.evaluation.sampling import SampledEpisodes
 from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.evaluation.statistics import SHARE, Aggregate, over_episodes
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.mpc import SERVICE_FIRST, Optimum
 
 QUANTILES = (0.025, 0.5, 0.975)
@@ -30,7 +30,7 @@ CONFIDENCE = "mean of {} episodes, with its 95 % interval"
 SAMPLES = "median of {} samples, and what 95 % of them lie within"
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Band:
     """A figure over time, with the ends of an interval if there is one."""
@@ -40,7 +40,7 @@ class Band:
     high: Annotated[Floats | None, "likewise"] = None
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class PageEpisode:
     """One course of a network: who acts, and what became of it."""
@@ -60,7 +60,7 @@ class PageEpisode:
     )
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class PlanePoint:
     """A point in the plane of service and circularity."""
@@ -71,7 +71,7 @@ class PlanePoint:
     about: Annotated[str, "what it is, further"] = ""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class ReportPage:
     """All that one page shows."""

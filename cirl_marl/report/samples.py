@@ -16,7 +16,7 @@ from cirl_marl.evaluation.sampling import SampledEpisodes, Sensitivity
 from cirl_marl.evaluation.statistics import defined
 from cirl_marl.network import Floats
 from cirl_marl.network.calendar import labels
-from cirl_marl.records.files import published, write_table
+from cirl_marl.records.files import publish_folder, write_table
 from cirl_marl.report.curves import WIDTH
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -62,7 +62,7 @@ def write_samples(
     header = [f"time ({network.time_unit})", *(f"{each} at the end" for each in labels(network, 0.0)[0])]
     header += ["quantity", "unit", "mean", *(f"quantile {each:g}" for each in QUANTILES)]
     files = [f"{name}_bands.csv", f"{name}_draws.csv", *([f"{name}_causes.csv"] if causes else []), f"{name}_bands.png"]
-    with published(folder) as partial:
+    with publish_folder(folder) as partial:
         rows = []
         for quantity, unit, values in _quantities(found):
             bands = [values.mean(axis=0), *np.quantile(values, QUANTILES, axis=0)]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.definitions.writing import fingerprint
+from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.errors import RunError
 from cirl_marl.evaluation import compare
 from cirl_marl.evaluation.statistics import SHARE, over_episodes

@@ -10,9 +10,9 @@ from pydantic import BeforeValidator, Field, StrictBool, StrictInt, StrictStr, V
 from pydantic_core import PydanticCustomError
 
 from cirl_marl.definitions.catalogue import file_and_region, load_network, networks, recipes
-from cirl_marl.definitions.mistakes import mistakes_of
+from cirl_marl.definitions.error_messages import validation_mistakes
 from cirl_marl.definitions.quantities import Number
-from cirl_marl.definitions.reading import read_toml
+from cirl_marl.definitions.reader import read_toml
 from cirl_marl.errors import CirlError, DefinitionError, unknown
 from cirl_marl.learners.recipe import Count, EngineName, Recipe, Settings, load_recipe
 from cirl_marl.network import Network
@@ -89,7 +89,7 @@ def load_sweep(path: Path) -> SweepFile:
     try:
         SweepFile.model_validate(document)
     except ValidationError as error:
-        mistakes += mistakes_of(error, SweepFile)
+        mistakes += validation_mistakes(error, SweepFile)
         faulty = {str(item["loc"][0]) for item in error.errors()}
     sound = {key: _several(value) for key, value in document.items() if key in _NAMES and key not in faulty}
     sound = {key: [_from(path.parent, str(name)) for name in names] for key, names in sound.items()}

@@ -11,16 +11,16 @@ from typing import Any
 from cirl_marl import load_network
 from cirl_marl.compartments import kind_of, models
 from cirl_marl.definitions.catalogue import families
-from cirl_marl.network.declared import Quantity, declarations
-from cirl_marl.network.model import (
+from cirl_marl.network.compartment_model import (
     CompartmentModel,
     ContinuousModel,
     DiscreteTimeModel,
-    Measuring,
+    MeasuringModel,
     OwnStepModel,
-    Releasing,
+    ReleasingModel,
     Vehicle,
 )
+from cirl_marl.network.declarations import Quantity, declarations
 from docs.site.markdown import ROOT, GeneratedPage, sections_about, table
 
 MOTION = {
@@ -63,13 +63,13 @@ def _reasons(kind: str) -> str:
 def _rows(model: CompartmentModel) -> Iterator[tuple[str, ...]]:
     """Yield names, which end in their unit, and the bounds within which the equations hold."""
     for name in model.state_names:
-        yield f"`{name}`", "state", *_bounds(model, name), "its agent" if name in model.observed else "nobody"
+        yield f"`{name}`", "state", *_bounds(model, name), "its agent" if name in model.observed_states else "nobody"
     for name in model.input_names:
         yield f"`{name}`", "input", *_bounds(model, name), ""
-    if isinstance(model, Measuring):
+    if isinstance(model, MeasuringModel):
         for name in model.measure_names:
             yield f"`{name}`", "measure", "", "", "its agent, and services"
-    if isinstance(model, Releasing):
+    if isinstance(model, ReleasingModel):
         for name in model.ports:
             yield f"`{name}`", "port of batches", "", "", ""
     if isinstance(model, Vehicle):

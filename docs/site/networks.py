@@ -15,13 +15,13 @@ from cirl_marl import MultiAgentVectorEnv, Network, load_network
 from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.controllers.schedule import Schedule
-from cirl_marl.definitions.sources import stated, stated_settings
+from cirl_marl.definitions.sources import stated_numbers, stated_settings
 from cirl_marl.drawing.digraph import save_network
 from cirl_marl.drawing.folding import fold_copies as folded_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.declared import Changing
+from cirl_marl.network.declarations import TimeVarying
 from cirl_marl.network.elements import Law, Service
 from cirl_marl.optimum import gap
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table, settings
@@ -140,7 +140,7 @@ def _service(network: Network, service: Service) -> tuple[str, ...]:
 
 def _value(value: object) -> str:
     """Write a number, or the ends of one that changes in time."""
-    if not isinstance(value, Changing):
+    if not isinstance(value, TimeVarying):
         return f"{value:g}"
     low, high = value.extremes
     return f"{low:.5g} … {high:.5g} in time"
@@ -283,7 +283,7 @@ def check_study(name: str, folder: Path = STUDY) -> None:
 
 
 def _sources(network: Network) -> Iterator[str]:
-    told = stated(network)
+    told = stated_numbers(network)
     rows = [("", each) for each in stated_settings(network)]
     rows += [(f"`{id_}`", each) for part in told.values() for id_, found in part.items() for each in found]
     own = [(where, each) for where, each in rows if _is_own(network, where.strip("`"))]

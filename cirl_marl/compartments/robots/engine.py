@@ -16,7 +16,7 @@ from typing import Any, ClassVar, TypeVar
 import mujoco
 import numpy as np
 
-from cirl_marl.network.model import DiscreteTimeModel, RewardState
+from cirl_marl.network.compartment_model import DiscreteTimeModel, RewardState
 from cirl_marl.network.rowsum import Floats
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.compartments.robots.engine import Engine, Robot, one_per_thread
-from cirl_marl.network.model import GoalTask
+from cirl_marl.network.compartment_model import GoalTask
 from cirl_marl.network.rowsum import Floats
 
 with redirect_stderr(StringIO()):  # the package prints a notice about its robot hands, which are not used here
@@ -78,7 +78,7 @@ class Fetch(Robot, GoalTask):
     input_names: ClassVar[tuple[str, ...]] = ("move_x", "move_y", "move_z", "fingers")
     engine = staticmethod(one_per_thread(FetchEngine))
     interval: ClassVar[float] = 0.04
-    observed: ClassVar[tuple[str, ...]] = (*OBSERVATION, *ACHIEVED, *DESIRED)
+    observed_states: ClassVar[tuple[str, ...]] = (*OBSERVATION, *ACHIEVED, *DESIRED)
     observation_names: ClassVar[tuple[str, ...]] = OBSERVATION
     achieved_names: ClassVar[tuple[str, ...]] = ACHIEVED
     desired_names: ClassVar[tuple[str, ...]] = DESIRED

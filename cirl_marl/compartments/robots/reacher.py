@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.compartments.robots.engine import Engine, Robot, one_per_thread
-from cirl_marl.network.declared import Quantity, frozen
-from cirl_marl.network.model import Task
+from cirl_marl.network.compartment_model import Task
+from cirl_marl.network.declarations import Quantity, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 OBSERVED = tuple(
@@ -33,7 +33,7 @@ class ReacherEngine(Engine):
         return np.array([*self.env._get_obs(), np.linalg.norm(apart)])
 
 
-@frozen
+@frozen_record
 class Reacher(Robot, Task):
     """Gymnasium's Reacher-v5, unchanged, as in the paper.
 
@@ -51,7 +51,7 @@ class Reacher(Robot, Task):
     input_names: ClassVar[tuple[str, ...]] = ("torque_0_n_m", "torque_1_n_m")
     engine = staticmethod(one_per_thread(ReacherEngine))
     interval: ClassVar[float] = 0.02
-    observed: ClassVar[tuple[str, ...]] = OBSERVED
+    observed_states: ClassVar[tuple[str, ...]] = OBSERVED
 
     reach_m: Annotated[float, Quantity("distance that counts as a success [published]")] = 0.04
     torque_n_m: Annotated[float, Quantity("torque below which the arm counts as at rest [published]")] = 0.005

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from cirl_marl.compartments.robots.fetch import Fetch
 from cirl_marl.compartments.robots.reacher import Reacher
 from cirl_marl.errors import CirlError
-from cirl_marl.network.declared import Positive, Quantity, Word, frozen
-from cirl_marl.network.model import DiscreteTimeModel, Releasing, RewardState
+from cirl_marl.network.compartment_model import DiscreteTimeModel, ReleasingModel, RewardState
+from cirl_marl.network.declarations import Positive, Quantity, Word, frozen_record
 from cirl_marl.network.rowsum import Floats
 
 ROBOTS: dict[str, Fetch | Reacher] = {"fetch": Fetch(), "reacher": Reacher()}
@@ -19,8 +19,8 @@ BOOKS = ("busy", "attempt_step", "done_in_batch", "sorted_now", "missed_now", "c
 BUSY, STEP, DONE, SORTED, MISSED, COMPLETE, KEY, ATTEMPT = range(len(BOOKS))
 
 
-@frozen
-class SortingStation(DiscreteTimeModel, Releasing):
+@frozen_record
+class SortingStation(DiscreteTimeModel, ReleasingModel):
     """A robot makes one attempt at each item; what it does not finish in time is missed.
 
     While the node holds an item and the robot is free, one control interval presents the item: the robot takes the
@@ -78,9 +78,9 @@ class SortingStation(DiscreteTimeModel, Releasing):
         return self.robot.input_names
 
     @property
-    def observed(self) -> tuple[str, ...]:
+    def observed_states(self) -> tuple[str, ...]:
         """Whether the robot works, and what it sees."""
-        return ("busy", *self.robot.observed)
+        return ("busy", *self.robot.observed_states)
 
     @property
     def interval(self) -> float:
@@ -120,7 +120,7 @@ class SortingStation(DiscreteTimeModel, Releasing):
         books[BUSY] = (busy & ~ended) | presented
         return after
 
-    def released(self, state: Floats) -> Floats:
+    def released_units(self, state: Floats) -> Floats:
         """Return the items sorted and missed in the last interval, shape (2, B)."""
         return state[[SORTED, MISSED]]
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.errors import NetworkError
-from cirl_marl.network.declared import Word, bound_problems, settle
+from cirl_marl.network.declarations import Word, bound_problems, check_types
 from cirl_marl.network.rowsum import Floats
 
 RewardState = Literal["before", "after"]
@@ -55,7 +55,7 @@ class CompartmentModel(ABC):
 
     def __post_init__(self) -> None:
         """Refuse parameters of another kind, or out of other bounds, than declared; a ``NetworkError`` names all."""
-        settle(self.kind, self)
+        check_types(self.kind, self)
         if found := list(bound_problems(self)):
             raise NetworkError(self.kind, found)
 
@@ -74,7 +74,7 @@ class CompartmentModel(ABC):
         """Return the reward of a step, shape (B,)."""
 
     @property
-    def observed(self) -> tuple[str, ...]:
+    def observed_states(self) -> tuple[str, ...]:
         """States that an agent sees; by default all."""
         return self.state_names
 
@@ -98,7 +98,7 @@ class CompartmentModel(ABC):
         return state
 
 
-class Outflowing(CompartmentModel):
+class OutflowModel(CompartmentModel):
     """A model whose output drives flows of law ``compartment``."""
 
     __slots__ = ()
@@ -118,7 +118,7 @@ class ContinuousModel(CompartmentModel):
         """Return dz/dt, shape (k, B), per ``time_unit``; a model names the ``context`` that it takes."""
 
 
-class OwnStepModel(Outflowing):
+class OwnStepModel(OutflowModel):
     """Continuous in time, with a step of its own, for physics that Runge-Kutta cannot follow.
 
     If it has a ``derivative`` too, solver ``euler`` takes that, as the published environments do.
@@ -155,7 +155,7 @@ class DiscreteTimeModel(CompartmentModel):
         """Return the state one step later, shape (k, B)."""
 
 
-class Measuring(CompartmentModel):
+class MeasuringModel(CompartmentModel):
     """A model of which services and observers may read more than states: ``measure_names``, with units, in order."""
 
     __slots__ = ()
@@ -189,7 +189,7 @@ class GoalTask(Task):
         """Return the reward, shape (...), for goals of shape (..., entries of a goal)."""
 
 
-class Releasing(CompartmentModel):
+class ReleasingModel(CompartmentModel):
     """A model that releases units of its node's stock into batch arcs, of which each of its ``ports`` has one."""
 
     __slots__ = ()
@@ -206,7 +206,7 @@ class Releasing(CompartmentModel):
         return None
 
     @abstractmethod
-    def released(self, state: Floats) -> Floats:
+    def released_units(self, state: Floats) -> Floats:
         """Return the units released in the last step, shape (ports, B)."""
 
     @abstractmethod
@@ -220,7 +220,7 @@ class Vehicle(CompartmentModel):
     __slots__ = ()
 
     @abstractmethod
-    def boarding(self, state: Floats) -> Bools:
+    def can_board(self, state: Floats) -> Bools:
         """Return where it can be loaded, shape (B,)."""
 
     @abstractmethod
@@ -228,7 +228,7 @@ class Vehicle(CompartmentModel):
         """Return the state, shape (k, B), after it was loaded ``where``, shape (B,)."""
 
     @abstractmethod
-    def arrived(self, state: Floats) -> Bools:
+    def has_arrived(self, state: Floats) -> Bools:
         """Return where it is at the recipient with its load, shape (B,)."""
 
     @abstractmethod
@@ -239,7 +239,7 @@ class Vehicle(CompartmentModel):
 MOTIONS = (ContinuousModel, OwnStepModel, DiscreteTimeModel)
 """How a model moves."""
 
-OFFERS = (*MOTIONS, Outflowing, Measuring, Task, GoalTask, Releasing, Vehicle)
+OFFERS = (*MOTIONS, OutflowModel, MeasuringModel, Task, GoalTask, ReleasingModel, Vehicle)
 """All that a model may inherit from."""
 
 

@@ -15,7 +15,7 @@ from cirl_marl.network.series import Series, Value
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parts:
+class Specification:
     """What a network under one scenario is made of, before anything is known to be wrong with it.
 
     Attributes:
@@ -51,7 +51,7 @@ class Parts:
     objective: Objective = field(default_factory=Objective)
     observation: Observation = field(default_factory=Observation)
     uncertain: Mapping[str, Any] = field(default_factory=dict)
-    acting: tuple[str, ...] = ()
+    default_agents: tuple[str, ...] = ()
     mass_unit: str = "kg"
     time_unit: str = "day"
     title: str = ""
@@ -70,7 +70,7 @@ class Parts:
         """What loads it again: its definition file, with the region if there is one; empty if it has no file."""
         return "" if self.source is None else ":".join(filter(None, (str(self.source), self.region)))
 
-    def held(self, value: Value) -> Floats:
+    def interval_means(self, value: Value) -> Floats:
         """Return a value in each control interval, its mean over the interval, shape (horizon,)."""
         horizon = self.episode.horizon
         if not isinstance(value, Series):

@@ -15,15 +15,15 @@ import numpy as np
 
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Law, Role
 from cirl_marl.network.rowsum import RowSum, spans
 from cirl_marl.network.series import extremes
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
-class Line:
+class BatchLine:
     """One batch arc and its rows."""
 
     id: Annotated[str, "the arc"]
@@ -46,7 +46,7 @@ class Line:
         return range(self.collecting, self.first + max(self.slots, 1))
 
 
-class Rows:
+class StateLayout:
     """The rows of masses and inner states of a network, and their names.
 
     Attributes:
@@ -118,7 +118,7 @@ def _totals(rows: int, stages: Mapping[int, Integers]) -> RowSum:
     return RowSum(places, np.concatenate([*parts.values()]), 1.0, (len(own), rows))
 
 
-def _line(network: Network, k: int, nodes: int, names: list[str]) -> Line:
+def _line(network: Network, k: int, nodes: int, names: list[str]) -> BatchLine:
     """Lay out the rows of one batch arc after the nodes and those that have ``names``, and name them."""
     arc = network.arcs[k]
     start = nodes + len(names)
@@ -128,7 +128,7 @@ def _line(network: Network, k: int, nodes: int, names: list[str]) -> Line:
     sign = float(network.sustainability[k])
     donor = network.nodes[network.node_index[arc.donor]]
     early = donor.role in (Role.NONRENEWABLE_RESERVOIR, Role.ENVIRONMENT)
-    return Line(
+    return BatchLine(
         id=arc.id,
         by=arc.by,
         port=arc.port,

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from heapq import heapify, heappop, heappush
 
-from cirl_marl.dynamics.elimination import Elimination
+from cirl_marl.dynamics.elimination import EliminationOrder
 from cirl_marl.network import RowSum
 
-Onward = dict[int, float]
+SparseRow = dict[int, float]
 """End → part of what a node passes on. Node j is end j, stock s is end nodes + s."""
 
 THRIFT = 4
@@ -25,7 +25,7 @@ SERIES = 12
 """Throughputs for each elimination: the usual number of terms of the solver's series."""
 
 
-class Detours:
+class StaticElimination:
     """The constant nodes that are eliminated beforehand, and the nodes that are kept.
 
     Attributes:
@@ -37,7 +37,7 @@ class Detours:
         elimination: order of elimination of the kept nodes, by their place in ``kept``.
     """
 
-    def __init__(self, nodes: int, constant: Iterable[int], gives: Mapping[int, Onward]) -> None:
+    def __init__(self, nodes: int, constant: Iterable[int], gives: Mapping[int, SparseRow]) -> None:
         """Eliminate ``constant`` of so many nodes; of the others the ends that each ``gives`` to matter, not how much.
 
         Args:
@@ -54,15 +54,15 @@ class Detours:
                     self._gets[j].add(i)
         self.order: list[int] = []
         self.inverse: list[float] = []
-        self.out: list[Onward] = []
-        self.into: list[Onward] = []
+        self.out: list[SparseRow] = []
+        self.into: list[SparseRow] = []
         self._eliminate(set(constant))
 
-    def reach(self) -> dict[int, Onward]:
+    def reach(self) -> dict[int, SparseRow]:
         """Return in which parts what enters each of ``order`` gets to kept nodes, and past them, end −1."""
-        found: dict[int, Onward] = {}
+        found: dict[int, SparseRow] = {}
         for i, out in zip(reversed(self.order), reversed(self.out), strict=True):
-            mine: Onward = {}
+            mine: SparseRow = {}
             for end, part in out.items():
                 for j, further in found.get(end, {end if end < self._nodes else -1: 1.0}).items():
                     mine[j] = mine.get(j, 0.0) + part * further
@@ -74,7 +74,7 @@ class Detours:
         queue = [(self._cost(i), i) for i in constant]
         heapify(queue)
         most = entries = 0
-        ways: list[tuple[float, int, list[int], Elimination]] = []
+        ways: list[tuple[float, int, list[int], EliminationOrder]] = []
         while queue:
             cost, i = heappop(queue)
             if i not in constant or cost != self._cost(i):
@@ -88,7 +88,7 @@ class Detours:
             for j in near & constant:
                 heappush(queue, (self._cost(j), j))
         ways.append(self._way(entries))
-        _, count, self.kept, self.elimination = min(ways, key=lambda way: way[:2])
+        _, count, self.kept_nodes, self.elimination = min(ways, key=lambda way: way[:2])
         for each in (self.order, self.inverse, self.out, self.into):
             del each[count:]
         early = set(self.order)
@@ -97,12 +97,12 @@ class Detours:
     def _cost(self, i: int) -> int:
         return len(self._gets[i]) * len(self._gives[i])
 
-    def _way(self, entries: int) -> tuple[float, int, list[int], Elimination]:
+    def _way(self, entries: int) -> tuple[float, int, list[int], EliminationOrder]:
         """Return what it costs to stop here, how many are eliminated then, who is kept, and in which order."""
         kept = sorted(self._gives)
         place = {i: n for n, i in enumerate(kept)}
         pairs = [(place[i], place[j]) for i in kept for j in self._gives[i] if j in place and j != i]
-        order = Elimination(len(kept), pairs)
+        order = EliminationOrder(len(kept), pairs)
         passing, making = order.work
         # factors that differ from copy to copy are gathered, multiplied and added: three passes over memory, not one
         return 2 * entries + 3 * passing + 4 * making / SERIES + ROUND * len(order.rounds), len(self.order), kept, order
@@ -112,7 +112,7 @@ class Detours:
         out, sources = self._gives.pop(i), self._gets.pop(i)
         inverse = 1.0 / sum(out.values())
         parts = {end: share * inverse for end, share in out.items()}
-        into: Onward = {}
+        into: SparseRow = {}
         for j in sources:
             given = self._gives[j].pop(i)
             into[j] = given * inverse
@@ -131,7 +131,7 @@ class Detours:
         return near | sources
 
 
-def contracted(gives: dict[int, Onward], hubs: Iterable[int]) -> list[int]:
+def contract_hubs(gives: dict[int, SparseRow], hubs: Iterable[int]) -> list[int]:
     """Take hubs out of an acyclic graph, in place, where the ways past them are no more than the ways to and from them.
 
     Args:
@@ -161,7 +161,7 @@ def contracted(gives: dict[int, Onward], hubs: Iterable[int]) -> list[int]:
     return [hub for hub in hubs if hub in gets]
 
 
-def woven(gives: Mapping[int, Onward], row: Mapping[int, int], size: int) -> RowSum:
+def square_matrix(gives: Mapping[int, SparseRow], row: Mapping[int, int], size: int) -> RowSum:
     """Return the square matrix of the parts whose source and end have a ``row``; the others are left out."""
     ways = [(row[j], row[i], part) for i, parts in gives.items() if i in row for j, part in parts.items() if j in row]
     return RowSum([i for i, _, _ in ways], [j for _, j, _ in ways], [part for _, _, part in ways], (size, size))

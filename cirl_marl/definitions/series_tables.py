@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 
-from cirl_marl.definitions.columns import DataFiles
+from cirl_marl.definitions.data_files import DataFiles
 from cirl_marl.definitions.quantities import AmountColumn, AmountSeries
 from cirl_marl.errors import CirlError
-from cirl_marl.network.calendar import When, elapsed
+from cirl_marl.network.calendar import YearOrDate, elapsed_time
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.units import factor
 
@@ -18,10 +18,10 @@ from cirl_marl.network.units import factor
 class Clock:
     """What times of a definition count from: the ``start`` of its episode, if it has one, in the network's ``unit``."""
 
-    start: When | None
+    start: YearOrDate | None
     unit: str
 
-    def times(self, given: Sequence[When], time_unit: str | None) -> tuple[float, ...]:
+    def times(self, given: Sequence[YearOrDate], time_unit: str | None) -> tuple[float, ...]:
         """Return times since the start; given as such in ``time_unit``, or without it as years or dates."""
         if time_unit is not None:
             tick = factor(time_unit, self.unit)
@@ -32,7 +32,7 @@ class Clock:
         if self.start is None:
             remedy = "give a time_unit, in which times count from the start, or the start of the [episode]"
             raise CirlError(f"times are years or dates only if the episode has a start; {remedy}")
-        return tuple(elapsed(each, self.start, self.unit) for each in given)
+        return tuple(elapsed_time(each, self.start, self.unit) for each in given)
 
 
 def inline_series(table: AmountSeries, unit: float, clock: Clock) -> Series:

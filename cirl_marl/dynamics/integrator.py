@@ -11,37 +11,37 @@ from typing import Annotated
 import numpy as np
 
 from cirl_marl.dynamics.batches import BatchTransport
-from cirl_marl.dynamics.inner import InnerPhysics
+from cirl_marl.dynamics.inner_physics import InnerPhysics
 from cirl_marl.dynamics.laws import FlowLaws
-from cirl_marl.dynamics.routing import Routed
+from cirl_marl.dynamics.routing import IntervalRoutes
 from cirl_marl.dynamics.stages import FixedLifetimes, StagedNetwork
 from cirl_marl.dynamics.taylor import Taylor
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import MAX_STEPS, Law
 from cirl_marl.network.rowsum import RowSum, disposable
 
 MAX_TURNOVER = 1.0
 """Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
 
-Passing = Callable[..., Floats]
+Transfer = Callable[..., Floats]
 """``(rate, settled) → moved``: mass that a substep moves along each arc; flows in ``settled`` hold, but for NaN."""
 
 RUNGE_KUTTA = {"rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), "euler": ((0.0,), (1.0,))}
 """Nodes and weights of the explicit schemes; each stage starts from the slope of the one before."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Transition:
     """What one control interval did."""
 
     stock: Annotated[Floats, "stocks after the interval with batch rows and unit row, shape (masses, B), mass"]
     inner: Annotated[Floats, "inner states of the models after the interval, shape (states, B)"]
-    moved: Annotated[Floats, "mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass"]
+    moved_mass: Annotated[Floats, "mass moved along each arc, by a batch arc delivered, shape (arcs, B), mass"]
     flow: Annotated[Floats, "realised continuous flows at the end of the interval, shape (arcs, B), mass/time"]
-    batched: Annotated[
+    batch_mass: Annotated[
         Floats | None, "m_fb of its start and of its end, as in ``Network.circularity``, shape (2, 2, B), mass, if any"
     ] = None
 
@@ -65,7 +65,7 @@ class Dynamics(FlowLaws):
     def __init__(self, network: Network, *, uncertain: bool = False) -> None:
         """Compile ``network``."""
         super().__init__(network, uncertain=uncertain)
-        rows, network = self.rows, self.inside
+        rows, network = self.rows, self.staged_network
         self.slots = FixedLifetimes(network) if isinstance(network, StagedNetwork) and network.lines else None
         self.inner, self.batches = InnerPhysics(network, rows), BatchTransport(network, rows)
         episode = network.episode
@@ -86,7 +86,7 @@ class Dynamics(FlowLaws):
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
-        self._timed = (*self.timed, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
+        self._timed = (*self.time_dependent, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
         self._compile_orders()
 
     def _check_turnover(self, turnover: Floats) -> None:
@@ -95,7 +95,7 @@ class Dynamics(FlowLaws):
         if not self.physical or not len(turnover):
             return
         node = int(turnover.argmax())
-        id_ = self.inside.nodes[node].id.partition(".")[0]
+        id_ = self.staged_network.nodes[node].id.partition(".")[0]
         rate = f"{turnover[node]:.4g}/{self.network.time_unit}"
         where = f"network '{self.network.name}': node '{id_}' turns over {rate}"
         if turnover[node] * episode.control_interval > MAX_STEPS * MAX_TURNOVER:
@@ -112,8 +112,8 @@ class Dynamics(FlowLaws):
 
     def _compile_orders(self) -> None:
         """Find the donors of scheduled flows, and their outflows by schedule and in proportion to their stock."""
-        network = self.inside
-        self._order_arcs: Integers = np.flatnonzero(self.scheduled)
+        network = self.staged_network
+        self._order_arcs: Integers = np.flatnonzero(self.is_scheduled)
         self._order_donors, order_slot = np.unique(network.donors[self._order_arcs], return_inverse=True)
         self._order_slot: Integers = order_slot
         slot = {int(node): i for i, node in enumerate(self._order_donors)}
@@ -159,7 +159,7 @@ class Dynamics(FlowLaws):
         for _ in range(self.substeps):
             realised = self._limit_orders(stock, rate) if self.physical else rate
             if self._taylor is not None:
-                stock, moved, realised = self._settle(stock, realised, partial(self._taylor.moved, stock, routes))
+                stock, moved, realised = self._settle(stock, realised, partial(self._taylor.moved_mass, stock, routes))
             else:
                 stock, inner, moved, realised = self._explicit_step(stock, inner, realised, routes, controls)
             total = moved if total is None else total + moved
@@ -206,12 +206,14 @@ class Dynamics(FlowLaws):
             self.routing.pass_on(flow, routes)
         return flow[:arcs]
 
-    def _flow_at(self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: Routed | None) -> Floats:
+    def _flow_at(
+        self, stock: Floats, inner: Floats, controls: Floats, rate: Floats, routes: IntervalRoutes | None
+    ) -> Floats:
         if self._taylor is not None:
             return self._taylor.flow(stock, routes, rate)
         return self._forward(self.flow(self.inner.extend(stock, inner, controls), rate), routes)
 
-    def _forward(self, flow: Floats, routes: Routed | None) -> Floats:
+    def _forward(self, flow: Floats, routes: IntervalRoutes | None) -> Floats:
         """Stop, in place, flows that a model or the stage of a solver would reverse, and pass on what is left."""
         if self.physical:
             np.maximum(flow, 0.0, out=flow)
@@ -220,7 +222,7 @@ class Dynamics(FlowLaws):
         return flow
 
     def _explicit_step(
-        self, stock: Floats, inner: Floats, rate: Floats, routes: Routed | None, controls: Floats
+        self, stock: Floats, inner: Floats, rate: Floats, routes: IntervalRoutes | None, controls: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Take one Runge-Kutta step of stocks and inner states together; models with a step of their own go ahead."""
         h = self.substep
@@ -249,7 +251,7 @@ class Dynamics(FlowLaws):
         else:
             moved = passing(rate)
             after = self.incidence.add_to(stock.copy(), moved)
-        return after, self.inner.moved(ahead, change), moved, rate
+        return after, self.inner.after_change(ahead, change), moved, rate
 
     def _limit_orders(self, stock: Floats, rate: Floats) -> Floats:
         """Cut scheduled flows so that no donor is overdrawn.
@@ -272,7 +274,7 @@ class Dynamics(FlowLaws):
         rate[self._order_arcs] *= factor.take(self._order_slot, axis=0)
         return rate
 
-    def _settle(self, stock: Floats, rate: Floats, passing: Passing) -> tuple[Floats, Floats, Floats]:
+    def _settle(self, stock: Floats, rate: Floats, passing: Transfer) -> tuple[Floats, Floats, Floats]:
         """Move mass; where a flow that does not heed its donor asked for more than that held, send what was there.
 
         Proportional and scheduled flows never overdraw. A recipient or a model that asks for more than there is gets

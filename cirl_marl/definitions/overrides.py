@@ -8,17 +8,17 @@ from typing import Any
 
 from cirl_marl.errors import unknown
 
-FIXED = ("name", "regions", "scenarios")
+COMMON_KEYS = ("name", "regions", "scenarios")
 """What is the same in every scenario."""
 
 
-def laid_over(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+def overlay(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``base`` with the tables of ``override`` laid over it, key by key, where they do not take its place."""
     merged = {key: value for key, value in base.items() if key != "scenarios"}
     for key, value in override.items():
         old = merged.get(key)
         if isinstance(old, Mapping) and isinstance(value, Mapping) and not _takes_its_place(value, old):
-            merged[key] = laid_over(old, value)
+            merged[key] = overlay(old, value)
         else:
             merged[key] = value
     return merged
@@ -32,7 +32,7 @@ def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
     return any(isinstance(old.get(key), str | list) for key in ("source", "file", "times"))
 
 
-def left_out(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+def without_paths(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of ``document`` less the tables at the dotted paths in ``override["without"]``, which exist."""
     kept = copy.deepcopy(dict(document))
     for path in override.get("without", []):
@@ -44,7 +44,7 @@ def left_out(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[s
     return kept
 
 
-def lost(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
+def path_mistakes(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
     """Yield what is wrong with the dotted paths of a scenario's ``without``."""
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
         yield f"{where}without: must be a list of dotted paths, such as ['nodes.digester.model']"
@@ -52,7 +52,7 @@ def lost(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
     if len(set(paths)) != len(paths):
         yield f"{where}without: names a path twice"
     for path in paths:
-        if path.partition(".")[0] in FIXED:
+        if path.partition(".")[0] in COMMON_KEYS:
             yield f"{where}without: '{path}': a scenario cannot set it"
         for other in paths:
             if path.startswith(f"{other}."):

@@ -17,8 +17,8 @@ from scipy.sparse.linalg import splu
 
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Floats, Integers, Network
-from cirl_marl.network.declared import itemised
-from cirl_marl.network.splits import Split, splits
+from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.split_fractions import Split, splits
 
 MOST_ROUNDS = 100
 """Policies that are tried; a handful is enough."""
@@ -26,7 +26,7 @@ SLACK = 1e-8
 """Relative widening that makes up for what the solution of the linear systems leaves open."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class _Alike:
     """Splits of as many controlled arcs and as many others, whose choices are made together."""
@@ -49,14 +49,14 @@ class _Alike:
             proportions=np.stack([split.proportions for _, split, _ in found]),
         )
 
-    def valued(self, values: Floats) -> Floats:
+    def end_values(self, values: Floats) -> Floats:
         """Return the values at the ends of the arcs, 0 at stocks, shape (splits, arcs, n)."""
         return np.where(self.ends[..., None] >= 0, values[np.maximum(self.ends, 0)], 0.0)
 
-    def chosen(self, values: Floats, step: int) -> Floats:
+    def best_shares(self, values: Floats, step: int) -> Floats:
         """Return the shares that are best for ``values`` in one interval, shape (splits, arcs, n)."""
         low, high, proportions = (each[:, :, step, None] for each in (self.low, self.high, self.proportions))
-        gains, others = np.split(self.valued(values), [low.shape[1]], axis=1)
+        gains, others = np.split(self.end_values(values), [low.shape[1]], axis=1)
         # what is left to the arcs without control counts as one choice without bounds, of their mean value
         gains = np.concatenate([gains, (others * proportions).sum(axis=1, keepdims=True)], axis=1)
         room = np.ones_like(gains)
@@ -70,7 +70,7 @@ class _Alike:
         return np.concatenate([low + taken[:, :-1], proportions * taken[:, -1:]], axis=1)
 
 
-class Passes:
+class VisitBounds:
     """The splits of nodes that store nothing, as choices.
 
     Attributes:
@@ -85,8 +85,8 @@ class Passes:
         alike: dict[tuple[int, int], list[tuple[int, Split, Integers]]] = {}
         for i, split in found:
             if i >= 0:
-                ends = network.recipients[[*split.controlled, *split.others]] - stores
-                alike.setdefault((len(split.controlled), len(split.others)), []).append((i, split, ends))
+                ends = network.recipients[[*split.controlled_arcs, *split.other_arcs]] - stores
+                alike.setdefault((len(split.controlled_arcs), len(split.other_arcs)), []).append((i, split, ends))
         self._splits = [_Alike.of(each) for each in alike.values()]
         tables = [table for i, split in found if i >= 0 and (table := split.table).shape[1] > 1]
         self.kinds: Sequence[int] = [0]
@@ -97,7 +97,7 @@ class Passes:
         """Return max_s Σ_j s_ij V_j of each node i in one interval, V being 0 at stocks; shapes (nodes, n)."""
         found = np.empty_like(values)
         for each in self._splits:
-            found[each.donors] = (each.chosen(values, step) * each.valued(values)).sum(axis=1)
+            found[each.donors] = (each.best_shares(values, step) * each.end_values(values)).sum(axis=1)
         return found
 
     def total(self, step: int) -> Floats:
@@ -133,5 +133,5 @@ class Passes:
     def _entries(self, values: Floats, step: int) -> Iterator[tuple[Integers, Integers, Floats]]:
         yield np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), np.empty(0)
         for each in self._splits:
-            shares = each.chosen(values[:, None], step)
+            shares = each.best_shares(values[:, None], step)
             yield np.repeat(each.donors, each.ends.shape[1]), each.ends.ravel(), shares.ravel()

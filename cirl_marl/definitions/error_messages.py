@@ -45,7 +45,7 @@ def _bare_word(error: str, line: str, column: int) -> str:
     return word if re.search(r"[^\W\d]", word) else ""
 
 
-def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[str]:
+def validation_mistakes(error: ValidationError, model: type[BaseModel]) -> list[str]:
     """Say each pydantic error in the words of the file: key, value, nearest valid name."""
     return [_mistake(dict(item), model) for item in error.errors()]
 

@@ -29,29 +29,29 @@ Kind = Literal["mass", "time", "rate", "flow", "steps", "1"]
 Part = TypeVar("Part")
 
 
-def itemised(made: type[Part]) -> type[Part]:
+def with_field_docs(made: type[Part]) -> type[Part]:
     """Let the docstring of a dataclass list its fields with what their annotations declare or, as plain text, say."""
     lines = [
         textwrap.fill(f"        {name}: {getattr(told, 'meaning', told)}.", 120, subsequent_indent=" " * 12)
-        for name, told in _annotated(made).items()
+        for name, told in _annotations(made).items()
     ]
     made.__doc__ = "\n".join([str(made.__doc__).rstrip(), "", "    Attributes:", *lines, "    "])
     return made
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
-def frozen(made: type[Part]) -> type[Part]:
+def frozen_record(made: type[Part]) -> type[Part]:
     """Make a dataclass of keywords that cannot be changed, and whose docstring lists them."""
-    return itemised(dataclass(frozen=True, slots=True, kw_only=True)(made))
+    return with_field_docs(dataclass(frozen=True, slots=True, kw_only=True)(made))
 
 
-def _annotated(made: Any) -> dict[str, Any]:
+def _annotations(made: Any) -> dict[str, Any]:
     hints = get_type_hints(made, include_extras=True)
     found = {each.name: getattr(hints[each.name], "__metadata__", ()) for each in fields(made)}
     return {name: told[0] for name, told in found.items() if told}
 
 
-class Changing:
+class TimeVarying:
     """What may stand for a number that is declared to vary: one that changes in time, between two ``extremes``."""
 
     __slots__ = ()
@@ -62,28 +62,28 @@ class Changing:
         raise NotImplementedError
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
-class Declared:
+class Declaration:
     """What is known of a field; by itself, of a text, of ids in a fixed order, or of one that is true or false."""
 
     meaning: Annotated[str, "for docstrings, schema and documents"]
     _: KW_ONLY
     key: Annotated[str, "what definition files call it, if not by its name"] = ""
-    required: Annotated[bool, "whether definition files must give it, though Python has a default"] = False
+    mandatory: Annotated[bool, "whether definition files must give it, though Python has a default"] = False
 
     def problem(self, value: object) -> str:
         """Return what the field must be, and what to write instead, if ``value`` is of another kind; else nothing."""
         return ""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
-class Word(Declared):
+class Word(Declaration):
     """One of some words."""
 
     of: Annotated[type[StrEnum] | tuple[str, ...], "an enumeration, or the words"] = ()
-    called: Annotated[str, "what messages call it, if not by its name"] = ""
+    label: Annotated[str, "what messages call it, if not by its name"] = ""
 
 
 class Kinds(NamedTuple):
@@ -98,9 +98,9 @@ SMALLEST, LARGEST = 1e-50, 1e50
 """Sizes of numbers of which squares and quotients are finite."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
-class Quantity(Declared):
+class Quantity(Declaration):
     """A number with a unit."""
 
     of: Annotated[Kind | Kinds, "kind of quantity"] = "1"
@@ -109,8 +109,8 @@ class Quantity(Declared):
     positive: Annotated[bool, "whether it lies above 0"] = False
     joint: Annotated[bool, "whether its bounds depend on other fields, so that they are checked with these"] = False
     varies: Annotated[bool, "whether it may change in time"] = False
-    none: Annotated[str, "the word that definition files may give for None"] = ""
-    shared: Annotated[bool, "whether its unit and source are those of the table in which it stands"] = False
+    none_word: Annotated[str, "the word that definition files may give for None"] = ""
+    unit_of_table: Annotated[bool, "whether its unit and source are those of the table in which it stands"] = False
     past: Annotated[bool, "whether it is about the time before the episode, and a series"] = False
 
     def kind(self, part: object) -> Kind:
@@ -121,8 +121,8 @@ class Quantity(Declared):
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
         if self.past:
-            return "" if isinstance(value, Changing) else f"a series, of times and values, got {value!r}"
-        return "" if self.varies and isinstance(value, Changing) else _problem(value, "a number", ())
+            return "" if isinstance(value, TimeVarying) else f"a series, of times and values, got {value!r}"
+        return "" if self.varies and isinstance(value, TimeVarying) else _problem(value, "a number", ())
 
     def bound_problem(self, value: float) -> str:
         """Return what a number out of its bounds must be; nothing if it is within."""
@@ -145,28 +145,28 @@ NotNegative = partial(Quantity, low=0.0)
 Share = partial(Quantity, low=0.0, high=1.0)
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
-class Numbers(Declared):
+class Numbers(Declaration):
     """Several numbers, which definition files spell in a table of their own."""
 
     form: Annotated[str, "how they are given in Python"] = ""
     shape: Annotated[tuple[int | None, ...], "their shape, None being any length"] = (None,)
-    spelled: Annotated[str, "which table of definition files holds them; empty if that of another field does"] = ""
+    table_form: Annotated[str, "which table of definition files holds them; empty if that of another field does"] = ""
     of: Annotated[Kind, "kind of quantity; of batches that beside their times"] = "mass"
     varies: Annotated[bool, "whether it may change in time"] = False
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
-        return "" if self.varies and isinstance(value, Changing) else _problem(value, self.form, self.shape)
+        return "" if self.varies and isinstance(value, TimeVarying) else _problem(value, self.form, self.shape)
 
 
-Amount = partial(Numbers, form="a number", shape=(), spelled="amount", varies=True)
+Amount = partial(Numbers, form="a number", shape=(), table_form="amount", varies=True)
 """A number whose unit is that of the table in which it stands."""
 
 
 @dataclass(frozen=True, slots=True)
-class CalendarTime(Declared):
+class CalendarTime(Declaration):
     """A point in time on the calendar, which definition files spell as a number or a date."""
 
     def problem(self, value: object) -> str:
@@ -178,21 +178,21 @@ class CalendarTime(Declared):
 
 
 @dataclass(frozen=True, slots=True)
-class Nested(Declared):
+class Subtable(Declaration):
     """A part of its own, with a table of its own."""
 
     of: Literal["control", "model", "lifetime"] = "control"
 
 
-def declarations(made: type[Any]) -> Mapping[str, Declared]:
+def declarations(made: type[Any]) -> Mapping[str, Declaration]:
     """Return the declared fields of a part by name, in their order."""
     anything: Any = made  # mypy does not know that classes are hashable
     return _declarations(anything)
 
 
 @cache
-def _declarations(made: Any) -> Mapping[str, Declared]:
-    return MappingProxyType({name: told for name, told in _annotated(made).items() if isinstance(told, Declared)})
+def _declarations(made: Any) -> Mapping[str, Declaration]:
+    return MappingProxyType({name: told for name, told in _annotations(made).items() if isinstance(told, Declaration)})
 
 
 def default_of(made: type[Any], name: str) -> Any:
@@ -202,10 +202,10 @@ def default_of(made: type[Any], name: str) -> Any:
 
 def is_required(made: type[Any], name: str) -> bool:
     """Whether definition files must give a field."""
-    return declarations(made)[name].required or default_of(made, name) is MISSING
+    return declarations(made)[name].mandatory or default_of(made, name) is MISSING
 
 
-def settle(owner: str, part_: Any) -> None:
+def check_types(owner: str, part_: Any) -> None:
     """Take words of enumerations as definitions spell them, and refuse what is of another kind than declared.
 
     Raises:
@@ -216,7 +216,7 @@ def settle(owner: str, part_: Any) -> None:
         value = getattr(part_, name)
         if isinstance(declared, Word) and isinstance(declared.of, type):
             if value not in declared.of.__members__.values():
-                raise NetworkError(owner, [unknown(declared.called or name, value, declared.of)])
+                raise NetworkError(owner, [unknown(declared.label or name, value, declared.of)])
             object.__setattr__(part_, name, declared.of(value))
         elif value is not None or default_of(type(part_), name) is not None:
             told = declared.problem(value) or _plain_problem(value, _hints(part_.__class__)[name])
@@ -225,7 +225,7 @@ def settle(owner: str, part_: Any) -> None:
         raise NetworkError(owner, faults)
 
 
-class Checked:
+class CheckedRecord:
     """A part of a network that refuses values of another kind than declared; messages call it by its kind and id."""
 
     __slots__ = ()
@@ -233,7 +233,7 @@ class Checked:
     def __post_init__(self) -> None:
         """Check every field; take words of enumerations as definitions spell them."""
         kind = type(self).__name__.lower()
-        settle(f"{kind} '{self.id}'" if hasattr(self, "id") else kind, self)
+        check_types(f"{kind} '{self.id}'" if hasattr(self, "id") else kind, self)
 
 
 def bound_problems(part_: Any, where: str = "") -> Iterator[str]:
@@ -241,9 +241,9 @@ def bound_problems(part_: Any, where: str = "") -> Iterator[str]:
     for name, declared in declarations(type(part_)).items():
         value = getattr(part_, name)
         if isinstance(declared, Word) and value not in declared.of:
-            yield f"{where}{unknown(declared.called or name, value, declared.of)}"
+            yield f"{where}{unknown(declared.label or name, value, declared.of)}"
         elif isinstance(declared, Quantity) and value is not None:
-            for each in value.extremes if isinstance(value, Changing) else (value,):
+            for each in value.extremes if isinstance(value, TimeVarying) else (value,):
                 if told := declared.bound_problem(each):
                     yield f"{where}{name} {each} {told}"
                     break

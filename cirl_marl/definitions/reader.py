@@ -13,12 +13,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from cirl_marl.definitions.columns import DataFiles
-from cirl_marl.definitions.composition import composed, copied_file
 from cirl_marl.definitions.conversion import Converter
-from cirl_marl.definitions.laying import FIXED, laid_over, left_out, lost
-from cirl_marl.definitions.mistakes import choices, mistakes_of, toml_mistake
+from cirl_marl.definitions.data_files import DataFiles
+from cirl_marl.definitions.error_messages import choices, toml_mistake, validation_mistakes
+from cirl_marl.definitions.overrides import COMMON_KEYS, overlay, path_mistakes, without_paths
 from cirl_marl.definitions.quantities import FORMS
+from cirl_marl.definitions.region_copies import compose_copies, copied_file
 from cirl_marl.definitions.schema import NetworkTable
 from cirl_marl.errors import CirlError, DefinitionError, NetworkError, unknown
 from cirl_marl.network import Network
@@ -62,7 +62,7 @@ class Definition:
         self.regions = self._document.get("regions", {})
         if not isinstance(self.regions, dict):
             raise DefinitionError(str(path), ['regions: must be a table of texts, as japan = "Japan"'])
-        self._built: dict[tuple[str, str], Network] = {}
+        self._networks: dict[tuple[str, str], Network] = {}
 
     def network(self, name: str = DEFAULT, region: str = "") -> Network:
         """Return the network under a scenario; the others hang on it, and are built when they are asked for.
@@ -75,28 +75,30 @@ class Definition:
             example = f"as in {self.path.name}:{next(iter(self.regions), 'japan')}"
             which = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
             raise DefinitionError(str(self.path), [unknown("region", region, self.regions) if region else which])
-        if (name, region) not in self._built and name != DEFAULT and not self._changes(name):
+        if (name, region) not in self._networks and name != DEFAULT and not self._changes(name):
             like = self.network(DEFAULT, region)
-            self._built[name, region] = replace(like, scenario_name=name, scenarios=_Others(self, name, region))
-        if (name, region) not in self._built:
+            self._networks[name, region] = replace(
+                like, scenario_name=name, scenarios=_OtherScenarios(self, name, region)
+            )
+        if (name, region) not in self._networks:
             override, where = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
             document, copies = self._whole(name)
             mistakes = list(_strangers(document, override, where))
             if mistakes:
                 raise DefinitionError(str(self.path), mistakes)
             try:
-                self._built[name, region] = _build(
+                self._networks[name, region] = _build(
                     self._under(name, document),
                     (self.files, region),
                     copies=copies,
                     scenario_name=name,
-                    scenarios=_Others(self, name, region),
+                    scenarios=_OtherScenarios(self, name, region),
                     source=self.path,
                     source_sha256=self.sha256,
                 )
             except NetworkError as error:
                 raise DefinitionError(str(self.path), [where + problem for problem in error.problems]) from None
-        return self._built[name, region]
+        return self._networks[name, region]
 
     def document(self, name: str = DEFAULT) -> dict[str, Any]:
         """Return what the file says under a scenario whose paths are those of the file, copies written out."""
@@ -106,7 +108,7 @@ class Definition:
         """Return a document with what a scenario leaves out and changes."""
         override = self._overrides[name]
         told = {key: value for key, value in override.items() if key not in ("without", "copies")}
-        return laid_over(left_out(document, override), told)
+        return overlay(without_paths(document, override), told)
 
     def _changes(self, name: str) -> bool:
         """Whether a scenario may differ from the default one."""
@@ -117,8 +119,8 @@ class Definition:
         if "copies" not in self._document:
             return self._document, {}
         try:
-            copied = read_toml(self.files.other(copied_file(self._document)))
-            return composed(self._document, copied, name)
+            copied = read_toml(self.files.plain_file(copied_file(self._document)))
+            return compose_copies(self._document, copied, name)
         except NetworkError as error:
             raise DefinitionError(str(self.path), error.problems) from None
         except CirlError as error:
@@ -142,11 +144,11 @@ class Definition:
             raise DefinitionError(str(self.path), mistakes)
 
 
-class _Others(Mapping[str, Network]):
+class _OtherScenarios(Mapping[str, Network]):
     """The scenarios of a definition but one, in a region."""
 
     def __init__(self, definition: Definition, own: str, region: str) -> None:
-        self._definition, self._own, self._region = definition, own, region
+        self._definition, self._scenario, self._region = definition, own, region
 
     def __getitem__(self, name: str) -> Network:
         if name not in set(self):
@@ -154,7 +156,7 @@ class _Others(Mapping[str, Network]):
         return self._definition.network(name, self._region)
 
     def __iter__(self) -> Iterator[str]:
-        return (name for name in self._definition.names if name != self._own)
+        return (name for name in self._definition.names if name != self._scenario)
 
     def __len__(self) -> int:
         return len(self._definition.names) - 1
@@ -162,7 +164,7 @@ class _Others(Mapping[str, Network]):
 
 def write_network(network: Network, path: Path) -> None:
     """Write a network built in Python as a definition file; its other scenarios are not written."""
-    from cirl_marl.definitions.writing import definition_of
+    from cirl_marl.definitions.writer import definition_of
 
     text = definition_of(network)
     write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
@@ -202,7 +204,7 @@ def _too_long(value: Any, where: str) -> Iterator[str]:
 
 def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> Iterator[str]:
     """Yield the compartments and services that a scenario names but the network does not have."""
-    yield from lost(document, override.get("without", []), where)
+    yield from path_mistakes(document, override.get("without", []), where)
     for table in ("nodes", "arcs", "services"):
         known = document.get(table, {})
         given = override.get(table, {})
@@ -212,7 +214,7 @@ def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: 
         for name in given:
             if name not in known:
                 yield f"{where}{table}: {unknown(table[:-1], name, known)}"
-    for key in FIXED:
+    for key in COMMON_KEYS:
         if key in override:
             yield f"{where}{key}: a scenario cannot set it"
 
@@ -223,7 +225,7 @@ def _build(document: Mapping[str, Any], beside: tuple[DataFiles, str], **known: 
     try:
         table = NetworkTable.model_validate(document)
     except ValidationError as error:
-        mistakes = mistakes_of(error, NetworkTable)
+        mistakes = validation_mistakes(error, NetworkTable)
         raise NetworkError(name, [*mistakes, *_further_mistakes(document, error, beside, known)]) from None
     return Converter(table, *beside).network(**known)
 

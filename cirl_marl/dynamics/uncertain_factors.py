@@ -15,7 +15,7 @@ from cirl_marl.network.elements import Law
 from cirl_marl.network.uncertainty import numbers_of
 
 
-class Scaled:
+class RowFactors:
     """Rows of a table that uncertain numbers multiply.
 
     Attributes:
@@ -36,7 +36,7 @@ class Scaled:
         return scaled
 
 
-class DrawnFlows:
+class FlowFactors:
     """The arcs whose flow laws uncertain numbers multiply; shares are not among them (``shares``).
 
     Attributes:

@@ -1,138 +1,29 @@
-"""Every reason why a network cannot be simulated, so that a definition is mended in one go."""
+"""What is wrong with single nodes and arcs of a network: laws, batches, controls and models."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.network.declared import bound_problems, default_of
-from cirl_marl.network.elements import MAX_STEPS, TAKEN, Arc, Compartment, Control, ControlKind, Law, Node
-from cirl_marl.network.model import CompartmentModel, Outflowing, Releasing, Vehicle, model_faults
-from cirl_marl.network.parts import Parts
+from cirl_marl.network.compartment_model import CompartmentModel, OutflowModel, ReleasingModel, Vehicle
+from cirl_marl.network.declarations import bound_problems, default_of
+from cirl_marl.network.elements import LAW_FIELDS, MAX_STEPS, Arc, Compartment, Control, ControlKind, Law, Node
 from cirl_marl.network.series import Series, extremes
-from cirl_marl.network.splits import splits, trap_problems
-from cirl_marl.network.uncertainty import uncertainty_problems
+from cirl_marl.network.specification import Specification
 from cirl_marl.network.units import factor
-from cirl_marl.network.validate_lifetimes import lifetime_problems
-from cirl_marl.network.validate_settings import (
-    calendar_problems,
-    is_whole,
-    repeated,
-    service_problems,
-    setting_problems,
-)
-from cirl_marl.network.validate_storage import series_problems, share_problems, storage_problems
-from cirl_marl.network.validate_supply import supply_problems
+from cirl_marl.network.validation.settings import is_whole
+from cirl_marl.network.validation.stocks import share_problems
 
-IDENTIFIER = r"^[a-z][a-z0-9_]*$"
-"""How compartments and services may be called; their names are keys of definition files and names of files."""
-
-OWN = tuple(dict.fromkeys(name for taken in TAKEN.values() for name in taken))
+OWN = tuple(dict.fromkeys(name for taken in LAW_FIELDS.values() for name in taken))
 """Fields of arcs that only some laws take."""
-
-
 SIDES = ("low", "neutral", "high")
 
 
-def problems(network: Parts) -> Iterator[str]:
-    """Yield every reason why ``network`` cannot be simulated."""
-    if not re.fullmatch(IDENTIFIER, network.name):
-        yield f"name '{network.name}': begins with a letter and has lower-case letters, digits and underscores only"
-    for key, unit, base in (("mass", network.mass_unit, "kg"), ("time", network.time_unit, "s")):
-        try:
-            factor(unit, base)
-        except CirlError as error:
-            yield f"units.{key}: {error}"
-    if not network.nodes:
-        yield "nodes: a network needs at least one"
-    kinds = [(c.id, type(c.model)) for c in (*network.nodes, *network.arcs) if c.model is not None]
-    timeless = [*bound_problems(network.episode), *calendar_problems(network)] or [*series_problems(network)]
-    yield from timeless
-    if timeless:
-        return  # without a clock, or with such series, there are no values to look at
-    strange = [f"'{id_}': model {kind.__name__}: {fault}" for id_, kind in kinds for fault in model_faults(kind)]
-    yield from strange
-    if strange:
-        return  # such models cannot be asked for more
-    yield from _name_problems([*(("node", n.id) for n in network.nodes), *(("arc", a.id) for a in network.arcs)])
-    yield from _name_problems([("service", service.id) for service in network.services])
-    nodes = {node.id: node for node in network.nodes}
-    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
-    outflows: dict[str, list[Arc]] = {}
-    inflows: dict[str, list[Arc]] = {}
-    for arc in network.arcs:
-        outflows.setdefault(arc.donor, []).append(arc)
-        inflows.setdefault(arc.recipient, []).append(arc)
-    for node in network.nodes:
-        yield from _node_problems(network, node)
-        yield from storage_problems(node, outflows.get(node.id, ()))
-        yield from lifetime_problems(network, node, [*inflows.get(node.id, ()), *outflows.get(node.id, ())])
-    lawful = True
-    for arc in network.arcs:
-        found = list(_arc_problems(network, arc, nodes, everyone))
-        yield from found
-        lawful = lawful and not found
-    for node in network.nodes:
-        controlled = [arc for arc in outflows.get(node.id, ()) if arc.law is Law.CONTROLLED]
-        if node.control and node.control.kind is ControlKind.FLOW and len(controlled) != 1:
-            yield f"node '{node.id}': control.kind 'flow' needs one controlled outflow, it has {len(controlled)}"
-        for arc in controlled:
-            setting = sum(c.control is not None and c.control.kind is ControlKind.FLOW for c in (node, arc))
-            if setting != 1:
-                where = f"on the arc or on its donor '{node.id}'; it has {setting}"
-                yield f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', {where}"
-    if lawful:
-        divided = splits(network)
-        crooked = [problem for each in divided for problem in each.problems()]
-        yield from crooked or trap_problems(network, divided)
-    yield from _port_problems(network)
-    yield from service_problems(network)
-    yield from supply_problems(network)
-    yield from setting_problems(network)
-    yield from uncertainty_problems(network)
-    acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
-    for agent in network.acting:
-        if agent in everyone and agent not in acting:
-            yield f"agents: '{agent}' has no control, so that it cannot act"
-        elif agent not in acting:
-            yield f"agents: {unknown('agent', agent, acting)}"
-    yield from repeated("agents", network.acting)
-
-
-def _port_problems(network: Parts) -> Iterator[str]:
-    """Yield ports of models that have two arcs, or none."""
-    carrying: dict[tuple[str, str], str] = {}
-    for arc in network.arcs:
-        if arc.law is Law.BATCH and arc.by:
-            first = carrying.setdefault((arc.by, arc.port), arc.id)
-            if first != arc.id:
-                yield f"arc '{arc.id}': port '{arc.port}' of '{arc.by}' has the arc '{first}' already"
-    for node in network.nodes:
-        for port in node.model.ports if isinstance(node.model, Releasing) else ():
-            if (node.id, port) not in carrying:
-                remedy = f"give it an arc of law 'batch' with by = '{node.id}' and port = '{port}'"
-                yield f"node '{node.id}': what its model releases to port '{port}' would stay; {remedy}"
-
-
-def _name_problems(named: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Yield ids that are none, and those used twice, of what shares one set of names, given as (kind, id)."""
-    kinds: dict[str, list[str]] = {}
-    for kind, id_ in named:
-        kinds.setdefault(id_, []).append(kind)
-    for id_, users in kinds.items():
-        who = f"{' and '.join(dict.fromkeys(users))} '{id_}'"
-        if not re.fullmatch(IDENTIFIER, id_):
-            yield f"{who}: an id begins with a letter and has lower-case letters, digits and underscores only"
-        if len(users) > 1:
-            shared = "; nodes and arcs share one set of names" if len(set(users)) > 1 else ""
-            yield f"{who}: the id is used twice{shared}"
-
-
-def _node_problems(network: Parts, node: Node) -> Iterator[str]:
+def node_problems(network: Specification, node: Node) -> Iterator[str]:
+    """Yield every mistake in a node, but for its stock and lifetime."""
     low, high = node.initial or (0.0, 0.0)
     if not (math.isfinite(low) and math.isfinite(high)) or low > high:
         yield f"node '{node.id}': initial range [{low}, {high}] is empty or not finite"
@@ -141,9 +32,10 @@ def _node_problems(network: Parts, node: Node) -> Iterator[str]:
     yield from _common_problems(f"node '{node.id}'", node, network)
 
 
-def _arc_problems(
-    network: Parts, arc: Arc, nodes: Mapping[str, Node], everyone: Mapping[str, Compartment]
+def arc_problems(
+    network: Specification, arc: Arc, nodes: Mapping[str, Node], everyone: Mapping[str, Compartment]
 ) -> Iterator[str]:
+    """Yield every mistake in an arc."""
     where = f"arc '{arc.id}'"
     for end, node in (("from", arc.donor), ("to", arc.recipient)):
         if node not in nodes:
@@ -152,12 +44,12 @@ def _arc_problems(
         yield f"{where}: a cycle of zero delay: it returns to its own donor '{arc.donor}' without passing a stock"
     for name in OWN:
         given = getattr(arc, name)
-        if name not in TAKEN[arc.law] and given != default_of(Arc, name):
-            taken = ", ".join(TAKEN[arc.law]) or "none of these"
+        if name not in LAW_FIELDS[arc.law] and given != default_of(Arc, name):
+            taken = ", ".join(LAW_FIELDS[arc.law]) or "none of these"
             yield f"{where}: {name} = {given!r}: law '{arc.law}' takes {taken}"
     if arc.law is Law.COMPARTMENT:
         ends = (arc.donor, arc.recipient, arc.id)
-        giving = [end for end in ends if end in everyone and isinstance(everyone[end].model, Outflowing)]
+        giving = [end for end in ends if end in everyone and isinstance(everyone[end].model, OutflowModel)]
         if arc.by not in giving:
             yield f"{where}: by: {unknown('compartment at this arc whose model gives a flow', arc.by, giving)}"
     if arc.law is Law.BATCH and isinstance(arc.rate, Series):
@@ -174,7 +66,7 @@ def _arc_problems(
     yield from _common_problems(where, arc, network)
 
 
-def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, Node]) -> Iterator[str]:
+def _batch_problems(where: str, arc: Arc, network: Specification, nodes: Mapping[str, Node]) -> Iterator[str]:
     interval = network.episode.control_interval
     vehicle = _has_vehicle(arc)
     if vehicle == (arc.delay != 0):
@@ -205,7 +97,7 @@ def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, No
         yield f"{where}: law 'batch' takes no control of kind 'rate'"
     donor = nodes.get(arc.donor)
     if arc.by and donor is not None:
-        ports = donor.model.ports if isinstance(donor.model, Releasing) else ()
+        ports = donor.model.ports if isinstance(donor.model, ReleasingModel) else ()
         if arc.by != donor.id or not ports:
             yield f"{where}: by: batches are released by the model of the donor '{donor.id}', which has ports {ports}"
         elif arc.port not in ports:
@@ -218,7 +110,7 @@ def _batch_problems(where: str, arc: Arc, network: Parts, nodes: Mapping[str, No
 
 def _unit_problems(where: str, arc: Arc, mass_unit: str, donor: Node) -> Iterator[str]:
     """Yield it if a model that knows the mass of what it releases knows another than its arc."""
-    unit_kg = donor.model.unit_kg if isinstance(donor.model, Releasing) else None
+    unit_kg = donor.model.unit_kg if isinstance(donor.model, ReleasingModel) else None
     try:
         carried_kg = extremes(arc.rate)[0] * factor(mass_unit, "kg")
     except CirlError:
@@ -231,7 +123,7 @@ def _has_vehicle(arc: Arc) -> bool:
     return arc.law is Law.BATCH and isinstance(arc.model, Vehicle)
 
 
-def _common_problems(where: str, compartment: Compartment, network: Parts) -> Iterator[str]:
+def _common_problems(where: str, compartment: Compartment, network: Specification) -> Iterator[str]:
     yield from bound_problems(compartment, f"{where}: ")
     states = compartment.model.ranged_states if compartment.model is not None else ()
     if len(compartment.inner) != len(states):
@@ -245,11 +137,13 @@ def _common_problems(where: str, compartment: Compartment, network: Parts) -> It
         yield from _control_problems(where, compartment, compartment.control, network)
 
 
-def _control_problems(where: str, compartment: Compartment, control: Control, network: Parts) -> Iterator[str]:
+def _control_problems(where: str, compartment: Compartment, control: Control, network: Specification) -> Iterator[str]:
     if control.kind is ControlKind.INPUT and not (compartment.model and compartment.model.input_names):
         yield f"{where}: control.kind 'input' needs a model with inputs"
     unit = f" {network.mass_unit}/{network.time_unit}" if control.kind is ControlKind.FLOW else ""
-    low, neutral, high = (np.array(network.held(each)) for each in (control.low, control.neutral, control.high))
+    low, neutral, high = (
+        np.array(network.interval_means(each)) for each in (control.low, control.neutral, control.high)
+    )
     if not np.isfinite([low, neutral, high]).all():
         yield f"{where}: control bounds must be finite"
     elif not ((low <= neutral) & (neutral <= high)).all() or control.low == control.high:
@@ -290,3 +184,18 @@ def _model_problems(where: str, compartment: Compartment, model: CompartmentMode
         if name in ranges and not (low <= ranges[name][0] and ranges[name][1] <= high):
             given = f"[{ranges[name][0]:g}, {ranges[name][1]:g}]"
             yield f"{where} holds for {name} in [{low:g}, {high:g}], not for {given}"
+
+
+def port_problems(network: Specification) -> Iterator[str]:
+    """Yield ports of models that have two arcs, or none."""
+    carrying: dict[tuple[str, str], str] = {}
+    for arc in network.arcs:
+        if arc.law is Law.BATCH and arc.by:
+            first = carrying.setdefault((arc.by, arc.port), arc.id)
+            if first != arc.id:
+                yield f"arc '{arc.id}': port '{arc.port}' of '{arc.by}' has the arc '{first}' already"
+    for node in network.nodes:
+        for port in node.model.ports if isinstance(node.model, ReleasingModel) else ():
+            if (node.id, port) not in carrying:
+                remedy = f"give it an arc of law 'batch' with by = '{node.id}' and port = '{port}'"
+                yield f"node '{node.id}': what its model releases to port '{port}' would stay; {remedy}"

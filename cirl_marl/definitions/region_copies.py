@@ -8,22 +8,22 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from cirl_marl.definitions.laying import laid_over, left_out, lost
-from cirl_marl.definitions.mistakes import mistakes_of
+from cirl_marl.definitions.error_messages import validation_mistakes
+from cirl_marl.definitions.overrides import overlay, path_mistakes, without_paths
 from cirl_marl.definitions.schema import CopiesTable
 from cirl_marl.errors import NetworkError, unknown
-from cirl_marl.network.declared import Kinds, Quantity, declarations
+from cirl_marl.network.declarations import Kinds, Quantity, declarations
 from cirl_marl.network.elements import Arc, Node
 
 REGION = "{region}"
 """What stands for the text of a region in the tables of its copy."""
-NAMING: Mapping[str, tuple[str, ...]] = {
+NAME_KEYS: Mapping[str, tuple[str, ...]] = {
     "nodes": (),
     "arcs": ("from", "to", "by", "makes_up_for"),
     "services": ("provider", "also", "owed_by"),
 }
 """The tables that are copied, and their keys that name nodes, arcs or services."""
-MADE = {"nodes": Node, "arcs": Arc}
+COMPARTMENTS = {"nodes": Node, "arcs": Arc}
 Document = Mapping[str, Any]
 
 
@@ -36,7 +36,9 @@ def copied_file(document: Document) -> str:
     return str(_table(document["copies"], "copies").of)
 
 
-def composed(document: Document, copied: Document, scenario: str) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
+def compose_copies(
+    document: Document, copied: Document, scenario: str
+) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
     """Return ``document`` under a scenario with the copies of ``copied`` in it, and the nodes of each by region.
 
     A copy is what the copied file says, then what ``[copies]`` changes, then what the scenario of the same name changes
@@ -56,7 +58,7 @@ def composed(document: Document, copied: Document, scenario: str) -> tuple[dict[
     nodes: dict[str, tuple[str, ...]] = {}
     for region in [] if mistakes else table.regions or known:
         made = _copy(pattern, region, str(known[region]))
-        for part in NAMING:
+        for part in NAME_KEYS:
             own, more = merged.setdefault(part, {}), made.get(part, {})
             mistakes += [f"{part}.{id_}: a copy of '{table.of}' has the same name" for id_ in more if id_ in own]
             own.update(more)
@@ -72,7 +74,7 @@ def _table(given: Any, where: str) -> Any:
     try:
         return CopiesTable.model_validate(given)
     except ValidationError as error:
-        raise NetworkError("copies", [f"{where}.{each}" for each in mistakes_of(error, CopiesTable)]) from None
+        raise NetworkError("copies", [f"{where}.{each}" for each in validation_mistakes(error, CopiesTable)]) from None
 
 
 def _pattern(document: Document, copied: Document, scenario: str) -> dict[str, Any]:
@@ -90,10 +92,10 @@ def _pattern(document: Document, copied: Document, scenario: str) -> dict[str, A
     for where, change in changes:
         still = {key: _still(value, key, gone) for key, value in change.items() if key != "without"}
         paths = [path for path in change.get("without", []) if not _in(path, gone)]
-        mistakes = [*lost(pattern, paths, where), *_strangers(pattern, still, where)]
+        mistakes = [*path_mistakes(pattern, paths, where), *_strangers(pattern, still, where)]
         if mistakes:
             raise NetworkError(of, mistakes)
-        pattern = laid_over(left_out(pattern, {"without": paths}), still)
+        pattern = overlay(without_paths(pattern, {"without": paths}), still)
         gone |= set(paths)
     return pattern
 
@@ -104,11 +106,11 @@ def _in(path: str, gone: set[str]) -> bool:
 
 def _still(value: Any, key: str, gone: set[str]) -> Any:
     """Return a table of changes less what has gone before."""
-    return {id_: each for id_, each in value.items() if f"{key}.{id_}" not in gone} if key in NAMING else value
+    return {id_: each for id_, each in value.items() if f"{key}.{id_}" not in gone} if key in NAME_KEYS else value
 
 
 def _strangers(pattern: Document, change: Document, where: str) -> Iterator[str]:
-    for part in NAMING:
+    for part in NAME_KEYS:
         for id_ in change.get(part, {}):
             if id_ not in pattern.get(part, {}):
                 yield f"{where}{part}: {unknown(part[:-1], id_, pattern.get(part, {}))}"
@@ -116,7 +118,7 @@ def _strangers(pattern: Document, change: Document, where: str) -> Iterator[str]
 
 def _copy(pattern: Document, region: str, text: str) -> dict[str, Any]:
     """Return nodes, arcs, services and agents of a region's copy, whose names begin with the region."""
-    ids = {id_ for part in NAMING for id_ in pattern.get(part, {})}
+    ids = {id_ for part in NAME_KEYS for id_ in pattern.get(part, {})}
 
     def named(value: Any) -> Any:
         if isinstance(value, list):
@@ -124,24 +126,24 @@ def _copy(pattern: Document, region: str, text: str) -> dict[str, Any]:
         return f"{region}_{value}" if value in ids else value
 
     made: dict[str, Any] = {"agents": named(pattern.get("agents", []))}
-    for part, keys in NAMING.items():
+    for part, keys in NAME_KEYS.items():
         made[part] = {}
         for id_, table in pattern.get(part, {}).items():
-            own = _placed(table, text)
+            own = _with_region(table, text)
             own |= {key: named(own[key]) for key in keys if key in own}
             own["title"] = f"{text}: {own.get('title', id_)}"
-            if part in MADE and "scale" not in own:
-                own["scale"] = _placed(pattern["scales"][_scale(MADE[part], own)], text)
+            if part in COMPARTMENTS and "scale" not in own:
+                own["scale"] = _with_region(pattern["scales"][_scale(COMPARTMENTS[part], own)], text)
             made[part][f"{region}_{id_}"] = own
     return made
 
 
-def _placed(value: Any, text: str) -> Any:
+def _with_region(value: Any, text: str) -> Any:
     """Return a copy of a table with the text of the region in its place."""
     if isinstance(value, Mapping):
-        return {key: _placed(each, text) for key, each in value.items()}
+        return {key: _with_region(each, text) for key, each in value.items()}
     if isinstance(value, list):
-        return [_placed(each, text) for each in value]
+        return [_with_region(each, text) for each in value]
     return value.replace(REGION, text) if isinstance(value, str) else value
 
 

@@ -16,11 +16,11 @@ from typing import Annotated
 
 import numpy as np
 
-from cirl_marl.network.declared import itemised
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Law
-from cirl_marl.network.parts import Parts
-from cirl_marl.network.rowsum import Floats, narrowed
+from cirl_marl.network.rowsum import Floats, single_column
 from cirl_marl.network.series import Series
+from cirl_marl.network.specification import Specification
 
 ROUNDING = 1e-12
 """By how much lowest shares may exceed 1 together, as sums of decimals round."""
@@ -30,46 +30,48 @@ SUMS = 1e-6
 """Distance from 1 at which given shares count as summing to it; they are then scaled to do so."""
 
 
-@itemised
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Split:
     """The arcs that share what leaves one node; where nothing changes its tables are views of one column."""
 
     donor: Annotated[str, "the node"]
-    controlled: Annotated[tuple[int, ...], "arcs whose shares controls set, by position"]
-    others: Annotated[tuple[int, ...], "arcs that share what is left"]
+    controlled_arcs: Annotated[tuple[int, ...], "arcs whose shares controls set, by position"]
+    other_arcs: Annotated[tuple[int, ...], "arcs that share what is left"]
     bounds: Annotated[Floats, "low, neutral and high share of each controlled arc, shape (3, controlled, horizon)"]
-    given: Annotated[Floats, "share of each other arc under neutral control, NaN for the rest, shape (others, horizon)"]
+    stated_shares: Annotated[
+        Floats, "share of each other arc under neutral control, NaN for the rest, shape (others, horizon)"
+    ]
 
     @property
     def proportions(self) -> Floats:
         """Return π of the other arcs, which sum to 1, shape (others, horizon)."""
-        bounds, given = narrowed(self.bounds), narrowed(self.given)
-        return np.broadcast_to(proportions(given, 1.0 - bounds[1].sum(axis=0)), self.given.shape)
+        bounds, given = single_column(self.bounds), single_column(self.stated_shares)
+        return np.broadcast_to(proportions(given, 1.0 - bounds[1].sum(axis=0)), self.stated_shares.shape)
 
     @property
     def table(self) -> Floats:
         """Return what there is to know of each interval, one column if nothing changes, shape (numbers, intervals)."""
-        bounds, proportions = narrowed(self.bounds), narrowed(self.proportions)
+        bounds, proportions = single_column(self.bounds), single_column(self.proportions)
         return np.concatenate([bounds.reshape(-1, bounds.shape[-1]), proportions])
 
     def least(self, leaving: Sequence[bool], step: int) -> float:
         """Return the least that the arcs ``leaving``, one truth value for each arc, get together in an interval."""
         flags = np.asarray(leaving, dtype=bool)
-        out, other = flags[: len(self.controlled)], flags[len(self.controlled) :]
+        out, other = flags[: len(self.controlled_arcs)], flags[len(self.controlled_arcs) :]
         low, _, high = self.bounds[:, :, step]
         sure = float(low[out].sum())
         left = max(0.0, 1.0 - sure - float(high[~out].sum()))
-        parts = proportions(self.given[:, step], 1.0 - self.bounds[1, :, step].sum(axis=0))
+        parts = proportions(self.stated_shares[:, step], 1.0 - self.bounds[1, :, step].sum(axis=0))
         return sure + left * float(parts[other].sum())
 
     def problems(self) -> Iterator[str]:
         """Yield why these are no shares of a whole in some interval."""
-        low, neutral, _ = narrowed(self.bounds).sum(axis=1)
-        given = np.nansum(narrowed(self.given), axis=0)
-        rests = int(np.isnan(self.given[:, 0]).sum())
+        low, neutral, _ = single_column(self.bounds).sum(axis=1)
+        given = np.nansum(single_column(self.stated_shares), axis=0)
+        rests = int(np.isnan(self.stated_shares[:, 0]).sum())
         where = f"node '{self.donor}'"
-        if not self.others:
+        if not self.other_arcs:
             yield f"{where}: all its shares have controls; one arc without a control has to take what they leave"
         elif rests > 1:
             yield f"{where}: {rests} arcs of law 'share' state no share; only one can take the rest"
@@ -101,7 +103,7 @@ def proportions(given: Floats, left: Floats) -> Floats:
     return found
 
 
-def splits(network: Parts) -> list[Split]:
+def splits(network: Specification) -> list[Split]:
     """Return the splits of a network, in the order of their nodes."""
     arcs: dict[str, list[int]] = {}
     for k, arc in enumerate(network.arcs):
@@ -118,23 +120,25 @@ def splits(network: Parts) -> list[Split]:
             shares = [np.nan if share is None else share for _, share in others]
             values = [*(value for side in sides for value in side), *shares]
             columns = horizon if any(isinstance(value, Series) for value in values) else 1
-            bounds = [[network.held(value)[:columns] for value in side] for side in sides]
-            given = [network.held(share)[:columns] for share in shares]
+            bounds = [[network.interval_means(value)[:columns] for value in side] for side in sides]
+            given = [network.interval_means(share)[:columns] for share in shares]
             found.append(
                 Split(
                     donor=node.id,
-                    controlled=tuple(k for k, arc in mine if arc.control is not None),
-                    others=tuple(k for k, _ in others),
+                    controlled_arcs=tuple(k for k, arc in mine if arc.control is not None),
+                    other_arcs=tuple(k for k, _ in others),
                     bounds=np.broadcast_to(
                         np.array(bounds, dtype=float).reshape(3, -1, columns), (3, len(controls), horizon)
                     ),
-                    given=np.broadcast_to(np.array(given, dtype=float).reshape(-1, columns), (len(others), horizon)),
+                    stated_shares=np.broadcast_to(
+                        np.array(given, dtype=float).reshape(-1, columns), (len(others), horizon)
+                    ),
                 )
             )
     return found
 
 
-def trap_problems(network: Parts, divided: Sequence[Split]) -> Iterator[str]:
+def trap_problems(network: Specification, divided: Sequence[Split]) -> Iterator[str]:
     """Yield a loop of nodes without stock that could keep mass for ever, in the first interval in which there is one.
 
     Of all such nodes those are removed whose least share leaving the set is positive, again and again; mass leaves
@@ -146,7 +150,7 @@ def trap_problems(network: Parts, divided: Sequence[Split]) -> Iterator[str]:
     width = max((table.shape[1] for table in tables), default=1)
     columns = np.concatenate([np.empty((0, width)), *(np.broadcast_to(t, (len(t), width)) for t in tables)])
     for step in np.unique(columns, axis=1, return_index=True)[1].tolist() if len(columns) else ():
-        if trapped := _trapped(network, by_donor, step):
+        if trapped := _trapping_nodes(network, by_donor, step):
             loop = _loop(network, by_donor, trapped)
             when = "" if (columns == columns[:, :1]).all() else f" in interval {step}"
             yield (
@@ -156,31 +160,31 @@ def trap_problems(network: Parts, divided: Sequence[Split]) -> Iterator[str]:
             return
 
 
-def _trapped(network: Parts, by_donor: dict[str, Split], step: int) -> set[str]:
+def _trapping_nodes(network: Specification, by_donor: dict[str, Split], step: int) -> set[str]:
     """Return the largest set of nodes without stock that can keep all they get, in one interval."""
     held = set(by_donor)
     feeding: dict[str, set[str]] = {}
     for donor, split in by_donor.items():
-        for k in (*split.controlled, *split.others):
+        for k in (*split.controlled_arcs, *split.other_arcs):
             feeding.setdefault(network.arcs[k].recipient, set()).add(donor)
     waiting = sorted(held)
     while waiting:
         node = waiting.pop()
         if node in held:
             split = by_donor[node]
-            leaving = [network.arcs[k].recipient not in held for k in (*split.controlled, *split.others)]
+            leaving = [network.arcs[k].recipient not in held for k in (*split.controlled_arcs, *split.other_arcs)]
             if split.least(leaving, step) > LEAST:
                 held.discard(node)
                 waiting += sorted(feeding.get(node, set()) & held)
     return held
 
 
-def _loop(network: Parts, by_donor: dict[str, Split], trapped: set[str]) -> list[str]:
+def _loop(network: Specification, by_donor: dict[str, Split], trapped: set[str]) -> list[str]:
     """Return nodes of ``trapped`` in the order in which mass passes round them."""
     path = [min(trapped)]
     while True:
         split = by_donor[path[-1]]
-        recipients = [network.arcs[k].recipient for k in (*split.controlled, *split.others)]
+        recipients = [network.arcs[k].recipient for k in (*split.controlled_arcs, *split.other_arcs)]
         following = next(each for each in recipients if each in trapped)
         if following in path:
             return path[path.index(following) :]

@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.dynamics.rows import Rows
+from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.elements import ControlKind
-from cirl_marl.network.model import (
+from cirl_marl.network.compartment_model import (
     ContinuousModel,
     DiscreteTimeModel,
-    Measuring,
-    Outflowing,
+    MeasuringModel,
+    OutflowModel,
     OwnStepModel,
-    Releasing,
+    ReleasingModel,
     Task,
     Vehicle,
 )
+from cirl_marl.network.elements import ControlKind
 from cirl_marl.network.units import factor
 
 
@@ -39,7 +39,7 @@ class InnerPhysics:
         high: upper ends.
     """
 
-    def __init__(self, network: Network, rows: Rows) -> None:
+    def __init__(self, network: Network, rows: StateLayout) -> None:
         """Compile the models of ``network``, whose states have the rows of ``rows``."""
         owners = [c for c in network.compartments.values() if c.model is not None]
         self.owners, self.names, self.rows = rows.owners, rows.state_names, rows.states
@@ -47,19 +47,19 @@ class InnerPhysics:
         self._states = list(self.rows.values())
         placed = list(enumerate(self._models))
         named = dict(zip(self.owners, self._models, strict=True))
-        self._outflowing = [(i, model) for i, model in placed if isinstance(model, Outflowing)]
-        self._measuring = [(i, model) for i, model in placed if isinstance(model, Measuring)]
+        self._outflowing = [(i, model) for i, model in placed if isinstance(model, OutflowModel)]
+        self._measuring = [(i, model) for i, model in placed if isinstance(model, MeasuringModel)]
         self._tasks = [(i, model) for i, model in placed if isinstance(model, Task)]
-        self._releasing = {owner: model for owner, model in named.items() if isinstance(model, Releasing)}
+        self._releasing = {owner: model for owner, model in named.items() if isinstance(model, ReleasingModel)}
         self._vehicles = {owner: model for owner, model in named.items() if isinstance(model, Vehicle)}
         self.measure_names = tuple(
             f"{self.owners[i]}.{name}" for i, model in self._measuring for name in model.measure_names
         )
-        self.observed = {
-            owner: tuple(self.rows[owner].start + model.state_names.index(name) for name in model.observed)
+        self.observed_rows = {
+            owner: tuple(self.rows[owner].start + model.state_names.index(name) for name in model.observed_states)
             for owner, model in named.items()
         }
-        self.visible = np.array([row for seen in self.observed.values() for row in sorted(seen)], dtype=np.intp)
+        self.visible = np.array([row for seen in self.observed_rows.values() for row in sorted(seen)], dtype=np.intp)
         euler = network.episode.solver == "euler"
         self._discrete = [(i, model) for i, model in placed if isinstance(model, DiscreteTimeModel)]
         own = ((i, model) for i, model in placed if isinstance(model, OwnStepModel))
@@ -70,7 +70,7 @@ class InnerPhysics:
         every = np.arange(len(self.names))
         self._moving = np.concatenate([every[:0], *(every[self._states[i]] for i, _ in self._continuous)])
         ranged = (name in model.ranged_states for model in self._models for name in model.state_names)
-        self.ranged = np.flatnonzero(np.fromiter(ranged, dtype=bool))
+        self.range_rows = np.flatnonzero(np.fromiter(ranged, dtype=bool))
         ranges = [span for owner in owners for span in owner.inner]
         self.low: Floats = np.array([low for low, _ in ranges], dtype=float)
         self.high: Floats = np.array([high for _, high in ranges], dtype=float)
@@ -95,7 +95,7 @@ class InnerPhysics:
             slope[rows] = model.derivative(inner[rows], controls[self._inputs[i]], **context) * self._speed[i]
         return slope
 
-    def moved(self, inner: Floats, change: Floats) -> Floats:
+    def after_change(self, inner: Floats, change: Floats) -> Floats:
         """Return the states after continuous models changed by ``change``; states of the others keep their bits."""
         if len(self._moving) == len(inner):
             return inner + change
@@ -159,10 +159,10 @@ class InnerPhysics:
             self.owners[i]: model.success(inner[self._states[i]], controls[self._inputs[i]]) for i, model in self._tasks
         }
 
-    def released(self, owner: str, port: str, inner: Floats) -> Floats:
+    def released_units(self, owner: str, port: str, inner: Floats) -> Floats:
         """Return the units that a model released into a port in the last interval, shape (B,)."""
         model = self._releasing[owner]
-        units: Floats = model.released(inner[self.rows[owner]])[model.ports.index(port)]
+        units: Floats = model.released_units(inner[self.rows[owner]])[model.ports.index(port)]
         return units
 
     def complete(self, owner: str, inner: Floats) -> NDArray[np.bool_]:
@@ -172,14 +172,14 @@ class InnerPhysics:
     def arrive(self, arc: str, inner: Floats) -> NDArray[np.bool_]:
         """Return where the vehicle of ``arc`` is at the recipient; it turns back, in place."""
         rows, vehicle = self.rows[arc], self._vehicles[arc]
-        arrived = vehicle.arrived(inner[rows])
+        arrived = vehicle.has_arrived(inner[rows])
         inner[rows] = vehicle.turn_back(inner[rows], arrived)
         return arrived
 
     def board(self, arc: str, inner: Floats, waiting: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return where the vehicle of ``arc`` takes the waiting load; it departs, in place."""
         rows, vehicle = self.rows[arc], self._vehicles[arc]
-        leaves = vehicle.boarding(inner[rows]) & waiting
+        leaves = vehicle.can_board(inner[rows]) & waiting
         inner[rows] = vehicle.depart(inner[rows], leaves)
         return leaves
 

@@ -48,7 +48,7 @@ def format_guide() -> str:
 def _part(name: str, table: type[BaseModel], place: str) -> str:
     keys = "".join(_key(field.alias or key, field) for key, field in table.model_fields.items())
     summary = str(table.__doc__).partition("\n")[0].replace("``", "`")
-    return f"\n## {name}\n\n{_wrapped(f'{place}. {summary}', indent=0)}\n{keys}"
+    return f"\n## {name}\n\n{_wrap(f'{place}. {summary}', indent=0)}\n{keys}"
 
 
 def _key(key: str, field: FieldInfo) -> str:
@@ -58,10 +58,10 @@ def _key(key: str, field: FieldInfo) -> str:
     taken = [name for name, (table, _) in PARTS.items() if {table, *table.__bases__} & set(kinds)]
     needed = "required" if field.is_required() else "may be left out"
     about = f": {field.description.replace('``', '`')}" if field.description else ""
-    return _wrapped(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in taken), needed])}){about}.")
+    return _wrap(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in taken), needed])}){about}.")
 
 
-def _wrapped(line: str, indent: int = 2) -> str:
+def _wrap(line: str, indent: int = 2) -> str:
     return (
         textwrap.fill(line, 120, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False) + "\n"
     )

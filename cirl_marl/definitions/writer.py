@@ -16,7 +16,15 @@ import tomlkit
 from cirl_marl.compartments import kind_of
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Network
-from cirl_marl.network.declared import CalendarTime, Nested, Numbers, Quantity, declarations, default_of, is_required
+from cirl_marl.network.declarations import (
+    CalendarTime,
+    Numbers,
+    Quantity,
+    Subtable,
+    declarations,
+    default_of,
+    is_required,
+)
 from cirl_marl.network.elements import Arc, Compartment, Control, ControlKind, Law
 from cirl_marl.network.series import Series, Value
 from cirl_marl.network.uncertainty import Spread
@@ -32,7 +40,7 @@ def definition_of(network: Network) -> str:
     Raises:
         NetworkError: if a model has parameters other than numbers and its form.
     """
-    return tomlkit.dumps(_laid_out(_Writer(network).document()))
+    return tomlkit.dumps(_toml_tables(_Writer(network).document()))
 
 
 def fingerprint(network: Network) -> str:
@@ -45,7 +53,7 @@ def fingerprint(network: Network) -> str:
     return hashlib.sha256(json.dumps(document, default=str).encode()).hexdigest()
 
 
-def _laid_out(document: dict[str, Any]) -> tomlkit.TOMLDocument:
+def _toml_tables(document: dict[str, Any]) -> tomlkit.TOMLDocument:
     """Lay settings and compartments out as tables with a line for each key."""
     laid = tomlkit.document()
     for key, value in document.items():
@@ -86,7 +94,7 @@ class _Writer:
             "title": network.title,
             "material": network.material,
             **({"references": list(network.references)} if network.references else {}),
-            "agents": list(network.acting),
+            "agents": list(network.default_agents),
             "units": {"mass": network.mass_unit, "time": network.time_unit},
             "scales": {"stock": self._quantity(1.0, "mass"), "flow": self._quantity(1.0, "flow")},
             "episode": self._part(network.episode),
@@ -103,21 +111,21 @@ class _Writer:
         table: dict[str, Any] = {}
         for name, declared in declarations(type(part)).items():
             value, key = getattr(part, name), declared.key or name
-            needed = is_required(type(part), name) or name == _needed(part)
+            needed = is_required(type(part), name) or name == _law_field(part)
             needed = needed or f"{where}.{name}" in self._network.uncertain
             if not needed and value == default_of(type(part), name):
                 continue
             if isinstance(declared, CalendarTime):
                 table[key] = value if isinstance(value, date) else float(value)
-            elif isinstance(declared, Quantity) and declared.shared:
+            elif isinstance(declared, Quantity) and declared.unit_of_table:
                 table |= {key: float(value), "unit": self._units[declared.kind(part)], "source": SOURCE}
             elif isinstance(declared, Quantity):
                 spread = self._network.uncertain.get(f"{where}.{name}")
-                table[key] = self._quantity(value, declared.kind(part)) | _told(spread, value)
+                table[key] = self._quantity(value, declared.kind(part)) | _spread_keys(spread, value)
             elif isinstance(declared, Numbers):
                 table |= self._numbers(part, value, declared, key)
-            elif isinstance(declared, Nested):
-                table[key] = self._nested(part, value, declared)
+            elif isinstance(declared, Subtable):
+                table[key] = self._subtable(part, value, declared)
             else:
                 table[key] = (
                     value if isinstance(value, bool) else list(value) if isinstance(value, tuple) else str(value)
@@ -125,7 +133,7 @@ class _Writer:
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
 
-    def _nested(self, part: Any, value: Any, declared: Nested) -> dict[str, Any]:
+    def _subtable(self, part: Any, value: Any, declared: Subtable) -> dict[str, Any]:
         if declared.of == "lifetime":
             return self._part(value)
         return self._control(part) if declared.of == "control" else self._model(part)
@@ -133,10 +141,10 @@ class _Writer:
     def _numbers(self, part: Any, value: Any, declared: Numbers, key: str) -> dict[str, Any]:
         """Return the table, or tables, that definition files spell several numbers in."""
         time, unit = self._units["time"], self._units.get(declared.of, "1")
-        if declared.spelled == "range":
+        if declared.table_form == "range":
             low, high = map(float, value)
             return {key: {"low": low, "high": high, "unit": unit, "source": SOURCE}}
-        if declared.spelled == "batches":
+        if declared.table_form == "batches":
             times, masses = ([float(pair[column]) for pair in value] for column in (0, 1))
             units = {"time_unit": time, "unit": unit, "source": SOURCE}
             return {key: {"times": times, "masses": masses, **units}}
@@ -186,7 +194,7 @@ class _Writer:
         return {**told, "time_unit": self._units["time"]}
 
 
-def _told(spread: Spread | None, value: Value) -> dict[str, Any]:
+def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
     """Return the keys that say how a number spreads."""
     if spread is None:
         return {}
@@ -204,7 +212,7 @@ def _percent(part: float) -> str:
     return f"{Decimal(repr(float(part))) * 100:f} %"
 
 
-def _needed(part: Any) -> str:
+def _law_field(part: Any) -> str:
     """Return the field that the law of an arc needs even where it is as by default."""
     if not isinstance(part, Arc):
         return ""

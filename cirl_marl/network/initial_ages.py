@@ -20,7 +20,7 @@ def slots(lifetime: Lifetime, interval: float) -> int:
     return round(lifetime.mean / interval)
 
 
-def remaining(node: Node, interval: float) -> Floats:
+def remaining_history(node: Node, interval: float) -> Floats:
     """Return what is left of a node's history at the start of the episode, by stage or slot, mass.
 
     What enters is spread evenly over each interval before the start. Before the history it had grown by e^(g·t), so
@@ -31,20 +31,20 @@ def remaining(node: Node, interval: float) -> Floats:
     lifetime, history, growth = node.lifetime, node.history, node.growth
     assert lifetime is not None and history is not None
     if (chain := lifetime.chain) is None:
-        return np.append(entered(node, interval, slots(lifetime, interval)), 0.0)
+        return np.append(past_inflows(node, interval, slots(lifetime, interval)), 0.0)
     edges = np.append(np.arange(history.times[0], -1e-9 * interval, interval), 0.0)
     stages = np.zeros(chain.stages)
     if growth is not None:
-        stages = chain.grown(growth * lifetime.mean) * _first(node, interval) * lifetime.mean
-    whole = held_for(chain, interval / lifetime.mean)
+        stages = chain.growing_stock(growth * lifetime.mean) * _first(node, interval) * lifetime.mean
+    whole = propagator(chain, interval / lifetime.mean)
     for begin, end, inflow in zip(edges[:-1], edges[1:], history.means(edges), strict=True):
         shorter = end - begin < interval * (1 - 1e-9)
-        kept, got = held_for(chain, (end - begin) / lifetime.mean) if shorter else whole
+        kept, got = propagator(chain, (end - begin) / lifetime.mean) if shorter else whole
         stages = kept @ stages + got * inflow * lifetime.mean
     return stages
 
 
-def spread(node: Node, interval: float) -> Floats:
+def age_shares(node: Node, interval: float) -> Floats:
     """Return the part of its initial stock that is in each stage, or slot; they sum to 1.
 
     They are those of the history, or of a stock into which always more has flowed by e^(g·t); g is ``growth`` or 0.
@@ -52,28 +52,28 @@ def spread(node: Node, interval: float) -> Floats:
     lifetime, growth = node.lifetime, node.growth or 0.0
     assert lifetime is not None
     if node.history is not None:
-        parts = remaining(node, interval)
+        parts = remaining_history(node, interval)
     elif lifetime.chain is not None:
-        parts = lifetime.chain.grown(growth * lifetime.mean)
+        parts = lifetime.chain.growing_stock(growth * lifetime.mean)
     else:
         parts = np.append(np.exp(-growth * interval * np.arange(slots(lifetime, interval))), 0.0)
     whole: Floats = parts / parts.sum()
     return whole
 
 
-def held_for(chain: Chain, time: float) -> tuple[Floats, Floats]:
+def propagator(chain: Chain, time: float) -> tuple[Floats, Floats]:
     """Return what e^(A·t) does to the stages, shape (K, K), and what they get of an inflow of 1 in that time, (K,).
 
     Time is in units of the chain's ``mean``, and so is that of the inflow.
     """
     size = chain.stages
     system = np.zeros((size + 1, size + 1))
-    system[:size, :size], system[:size, size] = chain.matrix, chain.entering
+    system[:size, :size], system[:size, size] = chain.matrix, chain.inflow_shares
     moved = expm(system * time)
     return moved[:size, :size], moved[:size, size]
 
 
-def entered(node: Node, interval: float, count: int) -> Floats:
+def past_inflows(node: Node, interval: float, count: int) -> Floats:
     """Return the mass that entered in each of some intervals before the start, last first, shape (count,).
 
     Without a history it is relative to that of the last one.
@@ -118,5 +118,5 @@ def age_problems(node: Node, interval: float) -> Iterator[str]:
             f"growth {node.growth:g}: no stock has a lifetime of {lifetime.mean:g} and shrinks so fast; it must be "
             f"above {-chain.rate / lifetime.mean:.4g}"
         )
-    elif history is not None and remaining(node, interval).sum() <= 0:
+    elif history is not None and remaining_history(node, interval).sum() <= 0:
         yield "history: nothing is left of it at the start of the episode"

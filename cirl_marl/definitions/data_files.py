@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cirl_marl.errors import CirlError, unknown
-from cirl_marl.network.calendar import When
+from cirl_marl.network.calendar import YearOrDate
 
 T = TypeVar("T")
 LARGEST = 200_000_000
@@ -26,7 +26,7 @@ YEAR = "year"
 class Column:
     """Numbers of a column, with the times of the rows as the file has them; a single number without times if None."""
 
-    times: Sequence[When] | None
+    times: Sequence[YearOrDate] | None
     values: Sequence[float]
     origin: str
 
@@ -38,31 +38,31 @@ class DataFiles:
         """Look for files in ``folder``, that of the definition, and below it."""
         self._folder = folder.resolve()
         self._tables: dict[str, _Table] = {}
-        self._others: dict[str, str] = {}
+        self._plain_files: dict[str, str] = {}
         self._stamps: dict[Path, int] = {}
 
     @property
-    def edited(self) -> bool:
+    def has_changed(self) -> bool:
         """Whether a file has changed, or is gone, since it was read."""
         return any(not path.is_file() or path.stat().st_mtime_ns != stamp for path, stamp in self._stamps.items())
 
     def sha256(self, name: str) -> str:
         """Return the hash of a file as it was read."""
-        return self._others.get(name) or self._table(name).sha256
+        return self._plain_files.get(name) or self._table(name).sha256
 
     @property
-    def others(self) -> tuple[str, ...]:
+    def plain_files(self) -> tuple[str, ...]:
         """The files that are no tables."""
-        return tuple(self._others)
+        return tuple(self._plain_files)
 
-    def other(self, name: str) -> Path:
+    def plain_file(self, name: str) -> Path:
         """Return where a file is that is no table, and note its hash.
 
         Raises:
             CirlError: naming the file and what is wrong with it.
         """
-        path = self._refusing(name, self._found)
-        self._others[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        path = self._with_file_errors(name, self._path_of)
+        self._plain_files[name] = hashlib.sha256(path.read_bytes()).hexdigest()
         return path
 
     def column(self, name: str, column: str, where: Mapping[str, str], times: str | None) -> Column:
@@ -76,9 +76,9 @@ class DataFiles:
         return self._table(name).column(column, where, times)
 
     def _table(self, name: str) -> _Table:
-        return self._refusing(name, self._read)
+        return self._with_file_errors(name, self._read)
 
-    def _refusing(self, name: str, read: Callable[[str], T]) -> T:
+    def _with_file_errors(self, name: str, read: Callable[[str], T]) -> T:
         try:
             return read(name)
         except CirlError:
@@ -88,10 +88,10 @@ class DataFiles:
 
     def _read(self, name: str) -> _Table:
         if name not in self._tables:
-            self._tables[name] = _Table(name, self._found(name).read_bytes())
+            self._tables[name] = _Table(name, self._path_of(name).read_bytes())
         return self._tables[name]
 
-    def _found(self, name: str) -> Path:
+    def _path_of(self, name: str) -> Path:
         """Return where a file is, which is not read again unless it is edited."""
         path, told = self._folder / name, f"file '{name}'"
         if Path(name).is_absolute() or ".." in Path(name).parts or not path.resolve().is_relative_to(self._folder):
@@ -137,10 +137,10 @@ class _Table:
             if each not in self.place:
                 told = f"file '{self.name}': {unknown('column', each, self.header)}"
                 raise CirlError(told + ("" if len(self.header) > 1 else " Separate columns with commas."))
-        chosen = self._chosen(where)
+        chosen = self._matching_rows(where)
         lines = [self.rows[i][0] for i in chosen]
         values = [self._number(*self.rows[i], column) for i in chosen]
-        origin = f"{self.name}, column '{column}'" + (f", where {_told(where)}" if where else "")
+        origin = f"{self.name}, column '{column}'" + (f", where {_conditions(where)}" if where else "")
         if times is not None:
             return Column(self._times(chosen, times), values, origin)
         if len(chosen) > 1:
@@ -148,7 +148,7 @@ class _Table:
             raise CirlError(f"{origin}: lines {lines[0]} and {lines[1]} both match; {remedy}")
         return Column(None, values, origin)
 
-    def _chosen(self, where: Mapping[str, str]) -> list[int]:
+    def _matching_rows(self, where: Mapping[str, str]) -> list[int]:
         """Return the rows that match, by an index of the columns in ``where``: many series name the same ones."""
         keys = tuple(self.place[each] for each in where)
         if keys not in self._indices:
@@ -158,10 +158,10 @@ class _Table:
             self._indices[keys] = index
         chosen = self._indices[keys].get(tuple(where.values()))
         if not chosen:
-            raise CirlError(f"file '{self.name}': {self._unmatched(where)}")
+            raise CirlError(f"file '{self.name}': {self._mismatch(where)}")
         return chosen
 
-    def _unmatched(self, where: Mapping[str, str]) -> str:
+    def _mismatch(self, where: Mapping[str, str]) -> str:
         """Say which entry of ``where`` leaves no row, with the nearest value that would leave one."""
         rows, before = [row for _, row in self.rows], ""
         for key, value in where.items():
@@ -183,7 +183,7 @@ class _Table:
             raise CirlError(f"file '{self.name}', line {line}, column '{column}': '{text}' {remedy}")
         return value
 
-    def _times(self, chosen: Iterable[int], column: str) -> list[When]:
+    def _times(self, chosen: Iterable[int], column: str) -> list[YearOrDate]:
         """Return the times of rows, which increase; all numbers or all dates, as the first is."""
         dated = _date(self.rows[next(iter(chosen))][1][self.place[column]]) is not None
         seen: dict[Any, int] = {}
@@ -211,5 +211,5 @@ def _date(text: str) -> date | None:
         return None
 
 
-def _told(where: Mapping[str, str]) -> str:
+def _conditions(where: Mapping[str, str]) -> str:
     return " and ".join(f"{key} = '{value}'" for key, value in where.items())

@@ -1,0 +1,145 @@
+"""What is wrong with the services of a network, and with arcs that make up for them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from cirl_marl.errors import unknown
+from cirl_marl.network.compartment_model import MeasuringModel
+from cirl_marl.network.declarations import bound_problems
+from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Node, Service
+from cirl_marl.network.series import extremes
+from cirl_marl.network.specification import Specification
+from cirl_marl.network.split_fractions import SUMS
+from cirl_marl.network.validation.settings import repetitions
+
+
+def service_problems(network: Specification) -> Iterator[str]:
+    """Yield every mistake in the services of ``network``."""
+    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
+    providers = _providers(network)
+    for service in network.services:
+        yield from _service_problems(network, service, everyone, providers)
+        yield from _outflow_problems(service, network.arcs)
+
+
+def _providers(network: Specification) -> dict[str, dict[str, None]]:
+    """Return the compartments that may provide a service of each quantity."""
+    nodes, everyone = network.nodes, (*network.nodes, *network.arcs)
+    found = {
+        "flow": [arc.id for arc in network.arcs],
+        "stock": [
+            *(node.id for node in nodes if node.stores),
+            *(arc.id for arc in network.arcs if arc.law is Law.BATCH),
+        ],
+        "measure": [c.id for c in everyone if isinstance(c.model, MeasuringModel)],
+        "outflow": [node.id for node in nodes],
+    }
+    return {quantity: dict.fromkeys(ids) for quantity, ids in found.items()}
+
+
+def _service_problems(
+    network: Specification,
+    service: Service,
+    everyone: Mapping[str, Compartment],
+    providers: Mapping[str, Mapping[str, None]],
+) -> Iterator[str]:
+    where = f"service '{service.id}'"
+    yield from bound_problems(service, f"{where}: ")
+    known = providers.get(service.quantity, providers["outflow"])
+    if service.provider in known and service.quantity == "measure":
+        model = everyone[service.provider].model
+        if isinstance(model, MeasuringModel) and service.measure not in model.measure_names:
+            yield f"{where}: {unknown('measure', service.measure, model.measure_names)}"
+    for place, each in enumerate(service.providers):
+        key, provider = "also" if place else "provider", everyone.get(each)
+        if isinstance(provider, Node) and not provider.stores and service.quantity == "stock":
+            yield f"{where}: {key}: '{provider.id}' stores nothing; ask for its outflow"
+        elif each not in known:
+            kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
+            yield f"{where}: {key}: {unknown(kind, each, known)}"
+    yield from repetitions(f"{where}: also", service.providers)
+    if service.also and service.quantity == "measure":
+        yield f"{where}: also: measures of several compartments do not add up; give each a service"
+    if service.measure and service.quantity != "measure":
+        yield f"{where}: measure '{service.measure}': quantity '{service.quantity}' takes none"
+    yield from repetitions(f"{where}: owed_by", service.owed_by)
+    for debtor in service.owed_by:
+        if debtor not in everyone:
+            yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
+    low, high = (np.array(network.interval_means(each)) for each in (service.low, service.high))
+    if extremes(service.low)[0] < 0:
+        yield f"{where}: low {extremes(service.low)[0]:g} must not be negative"
+    elif not ((low >= 0) & (low <= high) & (high > 0)).all():
+        worst = int(np.argmin((low >= 0) & (low <= high) & (high > 0)))
+        yield f"{where}: the band [{low[worst]}, {high[worst]}] must not be negative or empty"
+    elif (low == 0).all() and np.isinf(high).all():
+        yield f"{where}: the band from 0 without an upper end asks for nothing"
+
+
+def _outflow_problems(service: Service, arcs: tuple[Arc, ...]) -> Iterator[str]:
+    """Yield batches among the outflows that a service adds up: they count on arrival, not when they leave."""
+    batches = [arc.id for arc in arcs if arc.law is Law.BATCH and arc.donor in service.providers]
+    if service.quantity == "outflow" and batches:
+        donors = ", ".join(service.providers)
+        yield (
+            f"service '{service.id}': quantity 'outflow': '{donors}' gives batches to {', '.join(batches)}, "
+            "which count on arrival; ask for the 'flow' of that arc (what arrives) or its 'stock' (what is on the way)"
+        )
+
+
+def supply_problems(network: Specification) -> Iterator[str]:
+    """Yield why arcs cannot make up for what a service lacks."""
+    services = {service.id: service for service in network.services}
+    supplying: dict[str, list[Arc]] = {}
+    passing: dict[str, list[Arc]] = {node.id: [] for node in network.nodes if not node.stores}
+    for arc in network.arcs:
+        passing.get(arc.donor, []).append(arc)
+    for arc in network.arcs:
+        where, kind = f"arc '{arc.id}'", arc.control.kind if arc.control else None
+        if not arc.makes_up_for:
+            if arc.weight is not None:
+                yield f"{where}: weight: it makes up for no service; leave it out"
+        elif arc.makes_up_for not in services:
+            yield f"{where}: makes_up_for: {unknown('service', arc.makes_up_for, services)}"
+        elif arc.law is not Law.CONTROLLED or kind is not ControlKind.FLOW:
+            yield f"{where}: makes_up_for needs law 'controlled' and a control of kind 'flow' of its own"
+        else:
+            supplying.setdefault(arc.makes_up_for, []).append(arc)
+            yield from _reach_problems(passing, arc, services[arc.makes_up_for])
+    for service, arcs in supplying.items():
+        weights = [arc.weight for arc in arcs]
+        ids = ", ".join(arc.id for arc in arcs)
+        if len(arcs) > 1 and None in weights:
+            yield f"service '{service}': {ids} make up for it; each needs a weight, and they sum to 1"
+        elif len(arcs) > 1 or weights != [None]:
+            total = math.fsum(weight or 0.0 for weight in weights)
+            if abs(total - 1) > SUMS:
+                yield f"service '{service}': the weights of {ids}, which make up for it, sum to {total:g}, not to 1"
+
+
+def _reach_problems(passing: Mapping[str, Sequence[Arc]], arc: Arc, service: Service) -> Iterator[str]:
+    """Yield it if what an arc carries does not reach a service at once, past the outflows of nodes without stock."""
+    where = f"arc '{arc.id}': makes_up_for '{service.id}'"
+    if service.quantity == "measure":
+        yield f"{where}: it asks for a measure of a model, which no flow makes up for at once"
+        return
+    reached, waiting = {arc.recipient}, [arc.recipient]
+    flows = {arc.id}
+    while waiting:
+        node = waiting.pop()
+        if node in passing:
+            out = passing[node]
+            flows |= {each.id for each in out}
+            new = {each.recipient for each in out} - reached
+            reached |= new
+            waiting += sorted(new)
+    known = (
+        flows if service.quantity == "flow" else reached if service.quantity == "stock" else reached & passing.keys()
+    )
+    if known.isdisjoint(service.providers):
+        between = "only nodes that store nothing may lie between them"
+        yield f"{where}: what it carries does not reach '{service.provider}' at once; {between}"

@@ -1,0 +1,155 @@
+"""What is wrong with stocks, lifetimes, shares and series of a network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from cirl_marl.network.calendar import labels
+from cirl_marl.network.declarations import Quantity, bound_problems, declarations
+from cirl_marl.network.elements import (
+    FIXED_LIFETIME,
+    MAX_STEPS,
+    Arc,
+    Compartment,
+    ControlKind,
+    Law,
+    Lifetime,
+    Node,
+    Role,
+)
+from cirl_marl.network.initial_ages import age_problems
+from cirl_marl.network.series import Series, extremes
+from cirl_marl.network.specification import Specification
+from cirl_marl.network.validation.settings import is_whole
+
+NARROWEST, WIDEST = 0.02, 3.0
+"""Deviations of a lifetime, relative to its mean, that stages follow at all."""
+
+
+def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
+    """Yield what does not go with a stock that a node has, has not, or whose start is unknown."""
+    where, shares = f"node '{node.id}'", [arc.id for arc in outflows if arc.law is Law.SHARE]
+    if node.stores:
+        unscheduled = [arc.id for arc in outflows if arc.law not in (Law.CONTROLLED, Law.EXOGENOUS)]
+        if node.initial is None and node.history is None and unscheduled:
+            allowed = "only a node whose outflows are all scheduled may leave it out"
+            yield f"{where}: initial: missing; {allowed}, and '{unscheduled[0]}' is not"
+        if node.lifetime is not None:
+            return
+        if bool(shares) != (extremes(node.rate)[1] > 0):
+            remedy = "give the node a rate, 1/time, a lifetime, or stores = false"
+            told = f"arc '{shares[0]}' shares what it releases; {remedy}" if shares else "it is for arcs of law 'share'"
+            yield f"{where}: rate = {node.rate!r}: {told}"
+        return
+    given_ = {"initial": node.initial, "model": node.model, "rate": node.rate or None, "lifetime": node.lifetime}
+    for name, given in given_.items():
+        if given is not None:
+            yield f"{where}: {name}: it stores nothing, so that it has none"
+    if node.control is not None:
+        remedy = "put controls of kind 'share' on its arcs"
+        yield f"{where}: control: it stores nothing, so that all it gets leaves at once; {remedy}"
+    if node.role is not Role.TECHNOSPHERE:
+        yield f"{where}: role '{node.role}': a node that stores nothing is of the technosphere"
+    if not outflows:
+        yield f"{where}: it stores nothing and no arc leaves it, so that what enters has nowhere to go"
+    for arc in outflows:
+        if arc.law is not Law.SHARE:
+            reason = f"its donor '{node.id}' stores nothing, so that only law 'share' can leave it"
+            yield f"arc '{arc.id}': law '{arc.law}': {reason}"
+
+
+def series_problems(network: Specification) -> Iterator[str]:
+    """Yield series that are none, or that do not cover the episode."""
+    length = network.episode.control_interval * network.episode.horizon
+
+    def said(time: float) -> str:
+        return f"{time:g}" + "".join(f" ({each})" for dates in labels(network, time)[1] for each in dates)
+
+    parts: list[Any] = [*network.nodes, *network.arcs, *network.services]
+    named: list[tuple[str, Any]] = [(f"{type(part).__name__.lower()} '{part.id}': ", part) for part in parts]
+    named += [(f"{where}control.", c.control) for where, c in named if isinstance(c, Compartment) and c.control]
+    for where, part in named:
+        for name, declared in declarations(type(part)).items():
+            value = getattr(part, name)
+            if isinstance(value, Series):
+                past = isinstance(declared, Quantity) and declared.past
+                told = list(value.problems())
+                if not told:
+                    told = [value.history_problem(said) if past else value.coverage_problem(length, said)]
+                origin = f" ({value.origin})" if value.origin else ""
+                yield from (f"{where}{name}: {each}{origin}" for each in told if each)
+
+
+def share_problems(where: str, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
+    """Yield what does not go with shares, or with an end that stores nothing."""
+    kind = arc.control.kind if arc.control else None
+    if kind is ControlKind.SHARE and arc.law is not Law.SHARE:
+        yield f"{where}: control.kind 'share' needs law 'share', not '{arc.law}'"
+    if arc.law is Law.SHARE and kind not in (None, ControlKind.SHARE):
+        remedy = f"a valve on '{arc.donor}' acts on all that it releases"
+        yield f"{where}: law 'share' needs control.kind 'share', not '{kind}'; {remedy}"
+    if kind is ControlKind.SHARE and arc.share is not None:
+        yield f"{where}: share: its control sets it; leave it out"
+    if arc.law in (Law.BATCH, Law.RECIPIENT):
+        for node in (nodes.get(arc.donor), nodes.get(arc.recipient)):
+            if node is not None and not node.stores:
+                yield f"{where}: law '{arc.law}' needs a stock at both ends; '{node.id}' stores nothing"
+
+
+def lifetime_problems(network: Specification, node: Node, arcs: Sequence[Arc]) -> Iterator[str]:
+    """Yield what does not go with a lifetime that a node has or has not; ``arcs`` are those that enter or leave it."""
+    where, kind = f"node '{node.id}': ", node.control.kind if node.control else None
+    if node.lifetime is None:
+        told = {"stretch": node.stretch != 1.0, "history": node.history is not None, "growth": node.growth is not None}
+        for name in (name for name, given in told.items() if given):
+            yield f"{where}{name}: it has no lifetime; give it one, or leave this out"
+        if kind is ControlKind.STRETCH:
+            yield f"{where}control.kind 'stretch' needs a lifetime; a valve is of kind 'rate'"
+        return
+    if not node.stores:
+        return  # told with all else that such a node has not
+    for name, given in (("model", node.model is not None), ("rate", extremes(node.rate)[1] > 0)):
+        if given:
+            yield f"{where}lifetime: it says when what enters leaves, so that there is no {name}"
+    if kind not in (None, ControlKind.STRETCH):
+        yield f"{where}control.kind '{kind}': a node with a lifetime is controlled by kind 'stretch'"
+    yield from _end_problems(node, arcs)
+    mistakes = [*bound_problems(node.lifetime, f"{where}lifetime.")]
+    mistakes = mistakes or [f"{where}lifetime.{each}" for each in _spread_problems(network, node.lifetime)]
+    if node.lifetime.distribution == FIXED_LIFETIME and (kind is ControlKind.STRETCH or node.stretch != 1.0):
+        mistakes.append(f"{where}stretch: a fixed lifetime has none; give it a distribution and a small deviation")
+    yield from mistakes
+    if not mistakes and not [*bound_problems(node)]:
+        yield from (f"{where}{each}" for each in age_problems(node, network.episode.control_interval))
+
+
+def _end_problems(node: Node, arcs: Sequence[Arc]) -> Iterator[str]:
+    if not any(arc.donor == node.id for arc in arcs):
+        yield f"node '{node.id}': lifetime: no arc leaves it, so that what has lived has nowhere to go"
+    for arc in arcs:
+        law = f"arc '{arc.id}': law '{arc.law}'"
+        if arc.donor == node.id and arc.law is not Law.SHARE:
+            yield f"{law}: its donor '{node.id}' has a lifetime, so that only law 'share' can leave it"
+        if arc.recipient == node.id and arc.law in (Law.BATCH, Law.RECIPIENT):
+            yield f"{law}: it cannot enter '{node.id}', which has a lifetime"
+
+
+def _spread_problems(network: Specification, lifetime: Lifetime) -> Iterator[str]:
+    """Yield why a lifetime cannot be followed."""
+    mean, deviation, interval = lifetime.mean, lifetime.deviation, network.episode.control_interval
+    if lifetime.distribution == FIXED_LIFETIME:
+        if deviation is not None:
+            yield f"deviation {deviation:g}: a fixed lifetime has none"
+        if not is_whole(mean / interval) or not 1 <= round(mean / interval) <= MAX_STEPS:
+            whole = f"a whole number, from 1 to {MAX_STEPS:,}, of control intervals of {interval:g}"
+            yield f"mean {mean:g} {network.time_unit}: a fixed lifetime is {whole}"
+    elif lifetime.distribution == "exponential":
+        if deviation not in (None, mean):
+            yield f"deviation {deviation:g}: that of an exponential lifetime is its mean; leave it out"
+    elif deviation is None:
+        yield f"deviation: missing; a {lifetime.distribution} lifetime needs one"
+    elif not NARROWEST <= deviation / mean <= WIDEST:
+        remedy = "take distribution = 'fixed'" if deviation < mean else "is it in the unit of the mean?"
+        known = f"{deviation / mean:.3g} of the mean; from {NARROWEST:g} to {WIDEST:g} can be followed"
+        yield f"deviation {deviation:g} is {known}: {remedy}"
