@@ -19,7 +19,7 @@ from cirl_marl.evaluation.quantities import ComparedQuantity, rank_quantities
 from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
 from cirl_marl.optimum.registry import named_controller
 from cirl_marl.report import differences as report
-from cirl_marl.report import trajectory
+from cirl_marl.report import panels, trajectory
 
 GUIDE = Path(__file__).parent.parent / "envs" / "README.md"
 SCENARIOS = """
@@ -423,7 +423,7 @@ def test_titles(monkeypatch: pytest.MonkeyPatch) -> None:
 def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[Simulation]], Figure]:
     """Return what draws alternatives without writing a file."""
     figures: list[Figure] = []
-    monkeypatch.setattr(report, "save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(panels, "save", lambda figure, path: figures.append(figure))
 
     def draw(found: list[Simulation]) -> Figure:
         report.save_alternatives("x.png", found, rank_quantities(found), title="heading")

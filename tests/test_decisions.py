@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from cirl_marl import MultiAgentVectorEnv
 from cirl_marl.cli import app
 from cirl_marl.controllers import Constant
 from cirl_marl.controllers.schedule import Schedule, schedule
-from cirl_marl.report.decisions import levers, savings, write_decisions
+from cirl_marl.report.decisions import NO_WORKBOOK, levers, savings, write_decisions
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "metal_cycle.toml"
 
@@ -31,13 +32,13 @@ def test_levers_are_said_in_words() -> None:
     found = planned("copper_net", {"mine": -1.0})
     first = levers(found)[0]
     assert first.name == found.network.compartments["mine"].label
-    assert first.said(0) == "flow -100 %" and first.change > 0.3
+    assert first.text(0) == "flow -100 %" and first.change > 0.3
     assert all(lever.change < 1e-9 for lever in levers(found)[1:])
     lives = planned("steel_japan", {"vehicles": 1.0, "old_scrap": 1.0}, "longer_lives")
     by_name = {lever.name: lever for lever in levers(lives)}
-    assert by_name["Vehicles"].said(0) == "lifetime +0 %" and by_name["Vehicles"].said(25) == "lifetime +25 %"
+    assert by_name["Vehicles"].text(0) == "lifetime +0 %" and by_name["Vehicles"].text(25) == "lifetime +25 %"
     share = by_name["collection of old scrap"]
-    assert share.said(25).startswith("88.0 % of Discards (+") and share.said(25).endswith("points)")
+    assert share.text(25).startswith("88.0 % of Discards (+") and share.text(25).endswith("points)")
     np.testing.assert_allclose(share.usual, share.usual[0])
 
 
@@ -96,3 +97,11 @@ def test_the_command_says_what_to_do(tmp_path: Path) -> None:
     assert "what to do, beside business as usual" in run.output and "as usual: λ̄ = " in run.output
     assert "taken from reservoirs" in run.output
     assert sorted(each.name for each in tmp_path.iterdir()) == ["plan.csv", "plan.png", "plan.xlsx"]
+
+
+def test_without_openpyxl_there_is_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CSV and the picture are written, and a line says how to get the workbook."""
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    run = CliRunner().invoke(app, ["plan", str(EXAMPLE), "--control", "random", "--out", str(tmp_path / "plan.csv")])
+    assert run.exit_code == 0 and NO_WORKBOOK in run.output and "pip install 'cirl-marl[excel]'" in NO_WORKBOOK
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["plan.csv", "plan.png"]

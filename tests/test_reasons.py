@@ -120,7 +120,7 @@ def test_a_rule_is_found_again() -> None:
     usual = play_episodes(env, policies, FIRST)
     found = distil_rules(env, policies, usual, FIRST, leaves=4)
     rule, idle = found.rules
-    assert rule.explained > 0.99 and idle.explained == 1.0
+    assert rule.explained_variance > 0.99 and idle.explained_variance == 1.0
     said = rule_sentences(network, rule)
     opened = next(each for each in said if "opens" in each)
     assert opened.startswith("From 2031 on, while stock of Copper in use is above 2") or opened.startswith(

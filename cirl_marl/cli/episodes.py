@@ -190,7 +190,7 @@ def plan(
     the picture (.png) the levers that differ most.
     """
     from cirl_marl.evaluation import plans
-    from cirl_marl.report.decisions import decisions_table, savings_table, write_decisions
+    from cirl_marl.report.decisions import NO_WORKBOOK, decisions_table, savings_table, write_decisions
 
     if out is not None and out.suffix != ".csv":
         raise CirlError(f"--out {out}: needs the name of a .csv file")
@@ -203,6 +203,8 @@ def plan(
     path.parent.mkdir(parents=True, exist_ok=True)
     found.write(path)
     beside = write_decisions(path, found, title=f"{network.title or network.name}: {control or 'what was learnt'}")
+    if path.with_suffix(".xlsx") not in beside:
+        say(NO_WORKBOOK)
     if page is not None:
         from cirl_marl.report.page_html import write_page
         from cirl_marl.report.report_page import page_of_schedule

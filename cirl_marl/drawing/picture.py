@@ -14,7 +14,7 @@ from matplotlib.patches import FancyBboxPatch, Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
 from cirl_marl.drawing.digraph_layout import DigraphLayout, Routes, bezier, digraph_layout
-from cirl_marl.drawing.style import GOOD, INK, MUTED, NEUTRAL, ROLE_COLOURS, WARNING, check_shape, number, readable
+from cirl_marl.drawing.style import FAINT, GOOD, INK, NEUTRAL, ROLE_COLOURS, WARNING, check_shape, number, readable
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Law, Role
 
@@ -105,8 +105,8 @@ def legend_of(network: Network, reference: float) -> dict[str, Any]:
     handles: list[Artist] = [Patch(facecolor=colour, label=label) for colour, label in patches.items()]
     width = f"widest arrow: {number(reference)} {network.mass_unit}/{network.time_unit}"
     handles.append(Line2D([], [], color=NEUTRAL, linewidth=4, label=width))
-    handles.append(Patch(facecolor="none", edgecolor=MUTED, label="half full: the reference stock or flow"))
-    return {"handles": handles, "frameon": False, "fontsize": 8, "labelcolor": MUTED, "handlelength": 1.2}
+    handles.append(Patch(facecolor="none", edgecolor=FAINT, label="half full: the reference stock or flow"))
+    return {"handles": handles, "frameon": False, "fontsize": 8, "labelcolor": FAINT, "handlelength": 1.2}
 
 
 def _frame(axes: Axes, layout: DigraphLayout, legend: bool) -> float:
@@ -136,7 +136,7 @@ def _draw_arrows(axes: Axes, network: Network, routes: Routes, flow: Floats, sha
     halo = [withStroke(linewidth=0.25 * em, foreground="white")]
     ends = Counter((arc.donor, arc.recipient) for arc in network.arcs)
     for arc, (x, y), value, colour in zip(network.arcs, routes.labels, flow, colours, strict=True):
-        ink = MUTED if colour is NEUTRAL else colour
+        ink = FAINT if colour is NEUTRAL else colour
         if value == 0 and len(network.arcs) > SPARSE:
             continue  # so many labels of nothing would hide the others
         parallel = ends[arc.donor, arc.recipient] > 1
@@ -218,4 +218,4 @@ def _write_title(axes: Axes, network: Network, circularity: float | None, title:
     below = "" if circularity is None else f"λ = {number(circularity)} {network.mass_unit}    "
     below += f"flows in {network.mass_unit}/{network.time_unit}"
     axes.text(0.5, 1.075, heading, transform=axes.transAxes, fontsize=11, fontweight="bold", color=INK, ha="center")
-    axes.text(0.5, 1.02, below, transform=axes.transAxes, fontsize=9.5, color=MUTED, ha="center")
+    axes.text(0.5, 1.02, below, transform=axes.transAxes, fontsize=9.5, color=FAINT, ha="center")

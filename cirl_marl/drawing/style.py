@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK = "#222222"
-MUTED = "#5f6368"
+FAINT = "#5f6368"
 GRID = "#e3e5e8"
 WARNING = "#d55e00"
 GOOD = "#009e73"
@@ -36,6 +36,8 @@ ROLE_COLOURS = {
     Role.ENVIRONMENT: "#86d0e6",
 }
 DPI = 200
+WIDTH = 9.0
+"""Width of a figure, inch; shown 900 pixels wide, 9 points are about 12 pixels."""
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -60,10 +62,10 @@ def number(value: float) -> str:
 
 def check_shape(name: str, values: Floats, shape: tuple[int, ...]) -> Floats:
     """Return ``values`` as floats; a ``CirlError`` names them if they have another shape."""
-    found = np.asarray(values, dtype=float)
-    if found.shape != shape:
-        raise CirlError(f"{name} has shape {found.shape}, expected {shape}")
-    return found
+    numbers = np.asarray(values, dtype=float)
+    if numbers.shape != shape:
+        raise CirlError(f"{name} has shape {numbers.shape}, expected {shape}")
+    return numbers
 
 
 def readable(identifier: str) -> str:
@@ -75,7 +77,7 @@ def style_axes(axes: Axes, *, title: str = "", ylabel: str = "", size: float = 9
     """Give axes the plain look of the reports, without touching matplotlib's settings."""
     axes.set_title(title, loc="left", fontsize=size + 1, color=INK, fontweight="bold")
     axes.set_ylabel(ylabel, fontsize=size, color=INK)
-    axes.tick_params(labelsize=size - 1, color=GRID, labelcolor=MUTED)
+    axes.tick_params(labelsize=size - 1, color=GRID, labelcolor=FAINT)
     axes.grid(True, color=GRID, linewidth=0.7)
     axes.set_axisbelow(True)
     for side, spine in axes.spines.items():

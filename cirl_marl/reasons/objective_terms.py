@@ -64,35 +64,35 @@ class LinearFunctional:
     level: Floats | None = None
     imbalance: Floats | None = None
 
-    def of(self, network: Network, course: PlannedEpisode) -> float:
+    def of(self, network: Network, episode: PlannedEpisode) -> float:
         """Return what it is in an episode."""
-        net = np.abs(course.flow @ network.circularity_weights[1])
-        measured = (
-            course.flow,
-            course.stock,
-            network.throughput(course.flow.T).T,
-            service_levels(network, course),
-            net,
+        net = np.abs(episode.flow @ network.circularity_weights[1])
+        through, level = network.throughput(episode.flow.T).T, service_levels(network, episode)
+        pairs = (
+            (self.flow, episode.flow),
+            (self.stock, episode.stock),
+            (self.through, through),
+            (self.level, level),
+            (self.imbalance, net),
         )
-        weights = (self.flow, self.stock, self.through, self.level, self.imbalance)
-        return float(sum((w * m).sum() for w, m in zip(weights, measured, strict=True) if w is not None))
+        return float(sum((weights * values).sum() for weights, values in pairs if weights is not None))
 
     def columns(self, layout: Layout, lifetimes: Lifetimes, steps: int) -> Floats:
         """Return its weights on the variables of a program, shape (steps · size,)."""
-        found = np.zeros((steps, layout.size))
+        weights = np.zeros((steps, layout.size))
         count, stores = len(layout.moments), len(layout.network.stores)
         for moment in layout.moments:
             if self.flow is not None:
-                found[:, layout.flow(moment) :][:, : self.flow.shape[1]] += self.flow / count
+                weights[:, layout.flow(moment) :][:, : self.flow.shape[1]] += self.flow / count
             if self.through is not None:
-                found[:, layout.stock(moment) + stores :][:, : self.through.shape[1]] += self.through / count
+                weights[:, layout.stock(moment) + stores :][:, : self.through.shape[1]] += self.through / count
         if self.stock is not None:
-            found[:, layout.last] += self.stock @ lifetimes.totals
+            weights[:, layout.last] += self.stock @ lifetimes.totals
         if self.level is not None:
-            found[:, layout.level : layout.imbalance] += self.level
+            weights[:, layout.level : layout.imbalance] += self.level
         if self.imbalance is not None:
-            found[:, layout.imbalance] += self.imbalance
-        return found.ravel()
+            weights[:, layout.imbalance] += self.imbalance
+        return weights.ravel()
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +113,12 @@ class ObjectiveTerm:
     about: str = ""
     roles: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def tangent(self, network: Network, course: PlannedEpisode) -> LinearFunctional:
+    def tangent(self, network: Network, episode: PlannedEpisode) -> LinearFunctional:
         """Return the term, or its tangent at an episode."""
         steps = network.episode.horizon
         if self.kind == "services":
             level = np.zeros((steps, len(network.services)))
-            level[:, [each.id for each in network.services].index(self.about)] = 1.0 / steps
+            level[:, [service.id for service in network.services].index(self.about)] = 1.0 / steps
             return LinearFunctional(level=level)
         if self.kind == "circularity":
             if not self.roles.any():
@@ -126,21 +126,17 @@ class ObjectiveTerm:
             return LinearFunctional(flow=np.tile(self.roles / steps, (steps, 1)))
         compartment = network.compartments[self.about]
         assert compartment.set_point is not None
-        slope = -2.0 / (compartment.scale**2 * steps)
         if isinstance(compartment, Arc):
-            place, values = network.arc_index[self.about], course.flow
-            weights = np.zeros_like(course.flow)
-            weights[:, place] = slope * (values[:, place] - compartment.set_point)
-            return LinearFunctional(flow=weights)
-        place, stores = network.node_index[self.about], len(network.stores)
-        if isinstance(compartment, Node) and compartment.stores:
-            weights = np.zeros_like(course.stock)
-            weights[:, place] = slope * (course.stock[:, place] - compartment.set_point)
-            return LinearFunctional(stock=weights)
-        through = network.throughput(course.flow.T).T
-        weights = np.zeros_like(through)
-        weights[:, place - stores] = slope * (through[:, place - stores] - compartment.set_point)
-        return LinearFunctional(through=weights)
+            quantity, values, column = "flow", episode.flow, network.arc_index[self.about]
+        elif isinstance(compartment, Node) and compartment.stores:
+            quantity, values, column = "stock", episode.stock, network.node_index[self.about]
+        else:
+            values = network.throughput(episode.flow.T).T
+            quantity, column = "through", network.node_index[self.about] - len(network.stores)
+        # d/dq of -((q - set-point)/scale)², as a mean over the intervals
+        weights, slope = np.zeros_like(values), -2.0 / (compartment.scale**2 * steps)
+        weights[:, column] = slope * (values[:, column] - compartment.set_point)
+        return LinearFunctional(**{quantity: weights})
 
 
 def objective_terms(network: Network, kinds: Sequence[str] = KINDS) -> list[ObjectiveTerm]:
@@ -156,50 +152,48 @@ def objective_terms(network: Network, kinds: Sequence[str] = KINDS) -> list[Obje
     for kind in kinds:
         if kind not in KINDS:
             raise CirlError(f"terms: {unknown('kind', kind, KINDS)}")
-    found: list[ObjectiveTerm] = []
+    weighable: list[ObjectiveTerm] = []
     if "circularity" in kinds:
         parts: dict[str, Floats] = {}
-        signed = network.circularity_weights.sum(axis=0)
-        if network.objective.net_zero == "abs":
-            signed = network.circularity_weights[0]
-        for k in np.flatnonzero(signed):
-            parts.setdefault(_part(network, int(k)), np.zeros(len(network.arcs)))[k] = signed[k]
-        found += [ObjectiveTerm(name, "circularity", network.mass_unit, roles=roles) for name, roles in parts.items()]
-        if network.objective.net_zero == "abs" and network.circularity_weights[1].any():
-            found.append(ObjectiveTerm("net flow through the environment", "circularity", network.mass_unit))
-    if "services" in kinds:
-        found += [ObjectiveTerm(s.title or readable(s.id), "services", "1", about=s.id) for s in network.services]
-    if "set-points" in kinds:
-        tracked = network.objective.tracked or tuple(
-            each.id for each in network.compartments.values() if each.set_point is not None
-        )
-        found += [
-            ObjectiveTerm(f"set-point of {network.compartments[each].label}", "set-points", "1", about=each)
-            for each in tracked
+        absolute = network.objective.net_zero == "abs"
+        weights = network.circularity_weights[0] if absolute else network.circularity_weights.sum(axis=0)
+        for k in np.flatnonzero(weights).tolist():
+            parts.setdefault(circularity_part(network, k), np.zeros(len(network.arcs)))[k] = weights[k]
+        weighable += [
+            ObjectiveTerm(name, "circularity", network.mass_unit, roles=roles) for name, roles in parts.items()
         ]
-    if len(found) < 2:
+        if absolute and network.circularity_weights[1].any():
+            weighable.append(ObjectiveTerm("net flow through the environment", "circularity", network.mass_unit))
+    if "services" in kinds:
+        for service in network.services:
+            name = service.title or readable(service.id)
+            weighable.append(ObjectiveTerm(name, "services", "1", about=service.id))
+    if "set-points" in kinds:
+        compartments = network.compartments
+        with_set_point = [id_ for id_, compartment in compartments.items() if compartment.set_point is not None]
+        for id_ in network.objective.tracked or with_set_point:
+            weighable.append(ObjectiveTerm(f"set-point of {compartments[id_].label}", "set-points", "1", about=id_))
+    if len(weighable) < 2:
         raise CirlError(
-            f"network '{network.name}': there is nothing to weigh: of {', '.join(kinds)} it has {len(found)} term"
+            f"network '{network.name}': there is nothing to weigh: of {', '.join(kinds)} it has {len(weighable)} term"
         )
-    return found
+    return weighable
 
 
-def _part(network: Network, arc: int) -> str:
-    ends = (network.arcs[arc].donor, network.arcs[arc].recipient)
-    roles = [network.nodes[network.node_index[end]].role for end in ends]
-    return CIRCULARITY_PARTS[
-        next(role for role in CIRCULARITY_PARTS if role in (roles if network.sustainability[arc] > 0 else roles[::-1]))
-    ]
+def circularity_part(network: Network, arc: int) -> str:
+    """Return which part of λ an arc counts in, by the first of the roles of ``CIRCULARITY_PARTS`` at its ends."""
+    roles = [network.nodes[ends[arc]].role for ends in (network.donors, network.recipients)]
+    return next(CIRCULARITY_PARTS[role] for role in CIRCULARITY_PARTS if role in roles)
 
 
-def service_levels(network: Network, course: PlannedEpisode) -> Floats:
+def service_levels(network: Network, episode: PlannedEpisode) -> Floats:
     """Return the level min(1, q/low) of each service in each interval, shape (steps, services)."""
-    found = np.ones((len(course.flow), len(network.services)))
+    levels = np.ones((len(episode.flow), len(network.services)))
     for s, service in enumerate(network.services):
         low = network.interval_means(service.low)
         if service.quantity == "stock":
-            measured = course.stock[:, [network.node_index[each] for each in service.providers]].sum(axis=1)
+            quantity = episode.stock[:, [network.node_index[node] for node in service.providers]].sum(axis=1)
         else:
-            measured = course.flow[:, network.service_arcs(service)].sum(axis=1)
-        found[:, s] = np.minimum(1.0, np.divide(measured, low, out=np.ones_like(measured), where=low > 0))
-    return found
+            quantity = episode.flow[:, network.service_arcs(service)].sum(axis=1)
+        levels[:, s] = np.minimum(1.0, np.divide(quantity, low, out=np.ones_like(quantity), where=low > 0))
+    return levels

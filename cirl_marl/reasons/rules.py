@@ -69,13 +69,13 @@ class Rule:
     Attributes:
         agent: for whom it acts.
         leaves: what it does when.
-        explained: part of the variance of the policy's action that it explains, 1 for an action that never changes.
+        explained_variance: part of the variance of the policy's action that it explains; 1 if the action never changes.
         cost: what changed in episodes in which it acted in the policy's place, and the others by their policies.
     """
 
     agent: str
     leaves: tuple[Leaf, ...]
-    explained: float
+    explained_variance: float
     cost: PairedDifference
 
 
@@ -157,7 +157,7 @@ def distil_rules(
             Rule(
                 agent=agent,
                 leaves=_leaves(env, agent, grown[agent], names, places[agent], watched),
-                explained=_explained(grown[agent], agent, places[agent], watched),
+                explained_variance=_explained_variance(grown[agent], agent, places[agent], watched),
                 cost=cost,
             )
         )
@@ -188,7 +188,9 @@ def _grown(agent: str, watched: Sequence[RecordedEpisodes], places: Sequence[tup
     return tree.fit(features, actions if actions.shape[1] > 1 else actions.ravel())
 
 
-def _explained(tree: Any, agent: str, places: Sequence[tuple[str, int]], watched: Sequence[RecordedEpisodes]) -> float:
+def _explained_variance(
+    tree: Any, agent: str, places: Sequence[tuple[str, int]], watched: Sequence[RecordedEpisodes]
+) -> float:
     features, actions = _table(agent, watched, places)
     left = actions - tree.predict(features).reshape(actions.shape)
     variance = float(actions.var(axis=0).sum())

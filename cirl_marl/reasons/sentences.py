@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from cirl_marl.reasons.observations import TIME, Signal
 from cirl_marl.reasons.prices import ShadowPrices
 from cirl_marl.reasons.rules import Condition, Leaf, Rule
 
-SHOWN = 5
+MOST_PRICES = 5
 """Most stocks and agents of which prices are told in sentences."""
 SMALL = 1e-6
 """Of the largest price of a kind: below it nothing is worth telling."""
@@ -27,183 +27,176 @@ SAME = 0.02
 """Part of a control's range within which two values are the same in words."""
 
 
-def sentences(found: Explanation) -> list[str]:
-    """Return what an explanation says, a sentence or two each."""
-    said: list[str] = []
-    if found.prices is not None:
-        said += price_sentences(found.prices)
-    if found.no_prices:
-        said.append(f"There are no shadow prices: {found.no_prices}.")
-    for each in found.inputs:
-        said.append(input_sentence(found.network, each))
-    if found.rules is not None:
-        for rule in found.rules.rules:
-            said += rule_sentences(found.network, rule)
-        said.append(f"If all agents act by their rules, {difference_text(found.network, found.rules.together)}.")
-    return said
+def paragraphs(explanation: Explanation) -> Iterator[tuple[str, list[str]]]:
+    """Yield headings with their sentences: of the network, then agent by agent."""
+    network = explanation.network
+    prices = [] if explanation.prices is None else price_sentences(explanation.prices)
+    if explanation.no_prices:
+        prices.append(f"There are no shadow prices: {explanation.no_prices}.")
+    if explanation.prices is not None or explanation.no_prices:
+        yield "What is worth what", prices
+    sentences = {inputs.agent: [input_sentence(network, inputs)] for inputs in explanation.inputs}
+    for rule in () if explanation.rules is None else explanation.rules.rules:
+        sentences[rule.agent] = sentences.get(rule.agent, []) + rule_sentences(network, rule)
+    for agent, of_agent in sentences.items():
+        yield compartment_label(network, agent), of_agent
+    if explanation.rules is not None:
+        difference = difference_text(network, explanation.rules.together)
+        yield "All rules together", [f"If all agents act by their rules, {difference}."]
 
 
-def price_sentences(found: ShadowPrices) -> list[str]:
+def price_sentences(prices: ShadowPrices) -> list[str]:
     """Say what is worth most."""
-    network, bound = found.network, found.bound
-    mass, when = network.mass_unit, interval_names(network)
-    said = [f"At the best, λ̄ is {number(bound.objective)} {mass}."]
-    largest = np.abs(found.stock).max(axis=0)
-    for i in np.argsort(-largest, kind="stable")[:SHOWN].tolist():
+    network, bound = prices.network, prices.bound
+    mass, times = network.mass_unit, interval_names(network)
+    sentences = [f"At the best, λ̄ is {number(bound.objective)} {mass}."]
+    largest = np.abs(prices.stock).max(axis=0)
+    for i in np.argsort(-largest, kind="stable")[:MOST_PRICES].tolist():
         if largest[i] <= SMALL * max(largest.max(), 1e-300):
             continue
-        prices, node = found.stock[:, i], network.stores[i]
-        step = int(np.abs(prices).argmax())
-        way = "raises" if prices[step] > 0 else "lowers"
-        at = f"{abs(prices[step]):.3g} {mass} {_when(when[step])}"
-        if abs(prices[0]) < abs(prices[step]):
-            at += f", by {number(float(abs(prices[0])))} {mass} at the start"
-        said.append(f"One more {mass} in {compartment_label(network, node.id)} {way} λ̄ by up to {at}.")
-    demand = found.demand.sum(axis=0)
+        worth = prices.stock[:, i]
+        step = int(np.abs(worth).argmax())
+        when = f"in {times[step]}" if times[step].isdigit() else f"at {times[step]}"
+        change = f"{abs(worth[step]):.3g} {mass} {when}"
+        if abs(worth[0]) < abs(worth[step]):
+            change += f", by {number(float(abs(worth[0])))} {mass} at the start"
+        stock, verb = compartment_label(network, network.stores[i].id), "raises" if worth[step] > 0 else "lowers"
+        sentences.append(f"One more {mass} in {stock} {verb} λ̄ by up to {change}.")
+    demand = prices.demand.sum(axis=0)
     for s, service in enumerate(network.services):
-        if found.demand.any() and abs(demand[s]) > SMALL * np.abs(demand).max():
+        if prices.demand.any() and abs(demand[s]) > SMALL * np.abs(demand).max():
             unit = mass if service.quantity == "stock" else f"{mass}/{network.time_unit}"
             title = service.title or readable(service.id)
-            said.append(
+            sentences.append(
                 f"One more {unit} of demand for {title} in every interval costs {number(float(-demand[s]))} {mass} of"
-                f" λ̄; one per cent more of its level {number(float(-found.level[s] / 100))} {mass}."
+                f" λ̄; one per cent more of its level {number(float(-prices.level[s] / 100))} {mass}."
             )
-    room = found.room.sum(axis=1)
-    for flat in np.argsort(-np.abs(room).ravel(), kind="stable")[:SHOWN].tolist():
+    room = prices.room.sum(axis=1)
+    for flat in np.argsort(-np.abs(room).ravel(), kind="stable")[:MOST_PRICES].tolist():
         side, a = divmod(flat, room.shape[1])
         if abs(room[side, a]) > SMALL * abs(bound.objective):
-            what, way = (("lower", "lower"), ("upper", "higher"))[side]
-            said.append(
-                f"If the {what} bound of {compartment_label(network, bound.agents[a])} were one per cent {way}, λ̄"
+            end, direction = (("lower", "lower"), ("upper", "higher"))[side]
+            sentences.append(
+                f"If the {end} bound of {compartment_label(network, bound.agents[a])} were one per cent {direction}, λ̄"
                 f" could be {number(float(room[side, a]))} {mass} higher."
             )
-    return said
+    return sentences
 
 
-def input_sentence(network: Network, found: AgentInputs) -> str:
+def input_sentence(network: Network, inputs: AgentInputs) -> str:
     """Say what an agent looks at, and what becomes of λ̄ when it does not."""
-    if not found.share.any():
-        return f"*{compartment_label(network, found.agent)}* always does the same, whatever it sees."
+    agent = f"*{compartment_label(network, inputs.agent)}*"
+    if not inputs.share.any():
+        return f"{agent} always does the same, whatever it sees."
     parts = []
-    for i in range(found.top):
-        ways = {bool(slope > 0) for slope in found.slope[:, i]}
-        way = "" if len(ways) > 1 else f", acts {'more' if ways == {True} else 'less'} as it rises"
-        parts.append(f"{signal_text(network, found.signals[i])} ({100 * found.share[i]:.0f} %{way})")
-    hidden = (
-        f"If it is shown their mean{'s' if len(parts) > 1 else ''} instead, {difference_text(network, found.top_held)}."
-    )
-    return f"*{compartment_label(network, found.agent)}* looks at {joined_text(parts)}. {hidden}"
+    for i in range(inputs.top):
+        rises = {bool(slope > 0) for slope in inputs.slope[:, i]}
+        tendency = "" if len(rises) > 1 else f", acts {'more' if rises == {True} else 'less'} as it rises"
+        parts.append(f"{signal_text(network, inputs.signals[i])} ({100 * inputs.share[i]:.0f} %{tendency})")
+    means = "their means" if len(parts) > 1 else "their mean"
+    effect = f"If it is shown {means} instead, {difference_text(network, inputs.top_held)}."
+    return f"{agent} looks at {joined_text(parts)}. {effect}"
 
 
 def rule_sentences(network: Network, rule: Rule) -> list[str]:
     """Say what an agent does when, leaf after leaf, and what it costs if it does just that."""
-    who, said = compartment_label(network, rule.agent), []
-    for leaf in sorted(_merged(network, rule), key=lambda each: (_since(each), -each.share)):
+    leaves = list(rule.leaves)
+    if len({action_text(network, rule.agent, leaf) for leaf in leaves}) == 1:  # all say the same
+        leaves = [Leaf((), leaves[0].action, leaves[0].control, 1.0)]
+    sentences = []
+    for leaf in sorted(leaves, key=lambda leaf: (_first_time(leaf), -leaf.share)):
         when = condition_text(network, leaf.conditions)
-        deed = f"*{who}* {action_text(network, rule.agent, leaf)}"
-        often = "" if len(rule.leaves) == 1 else f" ({100 * leaf.share:.0f} % of decisions)"
-        said.append(f"{when[:1].upper() + when[1:]} {deed}{often}." if when else f"Always {deed}.")
-    said.append(f"Acting by this rule, {difference_text(network, rule.cost)}.")
-    return said
+        action = f"*{compartment_label(network, rule.agent)}* {action_text(network, rule.agent, leaf)}"
+        share = "" if len(rule.leaves) == 1 else f" ({100 * leaf.share:.0f} % of decisions)"
+        sentences.append(f"{when[:1].upper() + when[1:]} {action}{share}." if when else f"Always {action}.")
+    sentences.append(f"Acting by this rule, {difference_text(network, rule.cost)}.")
+    return sentences
 
 
-def _merged(network: Network, rule: Rule) -> list[Leaf]:
-    """Join the leaves of a tree of two that say the same; others keep what sets them apart."""
-    said = {action_text(network, rule.agent, leaf) for leaf in rule.leaves}
-    if len(said) > 1:
-        return [*rule.leaves]
-    first = rule.leaves[0]
-    return [Leaf((), first.action, first.control, 1.0)]
+def _first_time(leaf: Leaf) -> float:
+    return max((condition.low for condition in leaf.conditions if condition.signal.name == TIME), default=-math.inf)
 
 
-def _since(leaf: Leaf) -> float:
-    return max((each.low for each in leaf.conditions if each.signal.name == TIME), default=-math.inf)
-
-
-def condition_text(network: Network, found: Sequence[Condition]) -> str:
+def condition_text(network: Network, conditions: Sequence[Condition]) -> str:
     """Say when: first the calendar, then what is seen.
 
     A condition on time is one on the beginning of intervals.
     """
-    when, seen, labelled = "", [], interval_names(network)
-    for each in found:
-        if each.signal.name == TIME:
-            steps = len(labelled)
-            since = 0 if each.low == -math.inf else min(math.floor(each.low * steps + 1e-6) + 1, steps - 1)
-            until = steps if each.high == math.inf else min(math.floor(each.high * steps + 1e-6) + 1, steps - 1)
-            begins, ends = since > 0, until < steps
-            if begins and ends:
-                when = f"from {labelled[since]} to before {labelled[until]}"
-            elif begins:
-                when = f"from {labelled[since]} on"
-            elif ends:
-                when = f"before {labelled[until]}"
+    when, signals = "", []
+    for condition in conditions:
+        if condition.signal.name == TIME:
+            when = _time_text(condition, interval_names(network))
             continue
-        low, high = each.low * each.signal.scale, each.high * each.signal.scale
-        unit = "" if each.signal.unit == "1" else f" {each.signal.unit}"
-        what = signal_text(network, each.signal)
+        low, high = condition.low * condition.signal.scale, condition.high * condition.signal.scale
+        unit = "" if condition.signal.unit == "1" else f" {condition.signal.unit}"
+        span = f"above {number(low)}" if math.isfinite(low) else f"at most {number(high)}"
         if math.isfinite(low) and math.isfinite(high):
-            seen.append(f"{what} is between {number(low)} and {number(high)}{unit}")
-        elif math.isfinite(low):
-            seen.append(f"{what} is above {number(low)}{unit}")
-        else:
-            seen.append(f"{what} is at most {number(high)}{unit}")
-    where = f"while {joined_text(seen)}," if seen else ""
-    return f"{when}{', ' if when and where else ',' if when else ''}{where}".replace(",,", ",")
+            span = f"between {number(low)} and {number(high)}"
+        signals.append(f"{signal_text(network, condition.signal)} is {span}{unit}")
+    parts = [when] if when else []
+    parts += [f"while {joined_text(signals)}"] if signals else []
+    return f"{', '.join(parts)}," if parts else ""
+
+
+def _time_text(condition: Condition, times: Sequence[str]) -> str:
+    steps = len(times)
+    first, end = (
+        share if math.isinf(share) else min(math.floor(share * steps + 1e-6) + 1, steps - 1)
+        for share in (condition.low, condition.high)
+    )
+    if first > 0 and end < steps:
+        return f"from {times[int(first)]} to before {times[int(end)]}"
+    if first > 0:
+        return f"from {times[int(first)]} on"
+    return f"before {times[int(end)]}" if end < steps else ""
 
 
 def action_text(network: Network, agent: str, leaf: Leaf) -> str:
     """Say what an agent does in a leaf."""
     compartment = network.compartments[agent]
-    control, rows = compartment.control, network.control_rows[agent]
+    control = compartment.control
     assert control is not None
-    low, neutral, high = (each.mean() for each in network.control_bounds[:, rows.start])
+    low, neutral, high = network.control_bounds[:, network.control_rows[agent].start].mean(axis=1)
     value, action = float(leaf.control[0]), float(leaf.action[0])
     if control.kind is ControlKind.INPUT:
         names = compartment.model.input_names if compartment.model is not None else ()
-        return "sets " + joined_text(
-            [f"{each} to {number(at)}" for each, at in zip(names, leaf.control.tolist(), strict=True)]
-        )
-    shown = {
+        values = zip(names, leaf.control.tolist(), strict=True)
+        return "sets " + joined_text([f"{name} to {number(level)}" for name, level in values])
+    donor = f" of {compartment_label(network, compartment.donor)}" if isinstance(compartment, Arc) else ""
+    amount = {
         ControlKind.FLOW: f"{number(value)} {network.mass_unit}/{network.time_unit}",
-        ControlKind.SHARE: f"{100 * value:.3g} %" + _of_donor(network, agent),
+        ControlKind.SHARE: f"{100 * value:.3g} %{donor}",
         ControlKind.STRETCH: f"a lifetime {100 * (value - 1):+.0f} %".replace("-", "−"),
         ControlKind.RATE: f"{100 * value:.3g} % of its flow",
     }[control.kind]
     if action > 1 - 2 * SAME:
-        return f"opens as far as it can, to {shown}"
+        return f"opens as far as it can, to {amount}"
     if action < -1 + 2 * SAME:
-        return f"closes as far as it can, to {shown}"
+        return f"closes as far as it can, to {amount}"
     if abs(value - neutral) < SAME * (high - low):
-        return f"stays about as usual, at {shown}"
-    return f"{'opens' if value > neutral else 'closes'} to {shown}"
+        return f"stays about as usual, at {amount}"
+    return f"{'opens' if value > neutral else 'closes'} to {amount}"
 
 
-def _of_donor(network: Network, agent: str) -> str:
-    compartment = network.compartments[agent]
-    return f" of {network.compartments[compartment.donor].label}" if isinstance(compartment, Arc) else ""
-
-
-def difference_text(network: Network, found: PairedDifference) -> str:
+def difference_text(network: Network, difference: PairedDifference) -> str:
     """Say how λ̄ and service differ, with 95 % intervals."""
-    if found.usual == 0:
-        by = _ranged(found.circularity, 1.0, network.mass_unit)
-    else:
-        by = _ranged(found.circularity, 100 / abs(found.usual), "%")
-    return f"λ̄ changes by {by} and service by {_ranged(found.service, 100.0, 'points')}"
+    factor, unit = (100 / abs(difference.usual), "%") if difference.usual else (1.0, network.mass_unit)
+    circularity = _interval_text(difference.circularity, factor, unit)
+    return f"λ̄ changes by {circularity} and service by {_interval_text(difference.service, 100.0, 'points')}"
 
 
-def _ranged(found: Aggregate, factor: float, unit: str) -> str:
-    value, low, high = (f"{factor * each:+.2f}".replace("-", "−") for each in (found.value, found.low, found.high))
+def _interval_text(aggregate: Aggregate, factor: float, unit: str) -> str:
+    figures = (aggregate.value, aggregate.low, aggregate.high)
+    value, low, high = (f"{factor * figure:+.2f}".replace("-", "−") for figure in figures)
     return f"{value} {unit} [{low}, {high}]"
 
 
-def signal_text(network: Network, found: Signal) -> str:
+def signal_text(network: Network, signal: Signal) -> str:
     """Name a signal."""
-    if not found.about:
-        return "the time" if found.name == TIME else readable(found.name)
-    kind = found.name[: -len(found.about)].rstrip()
-    return f"{kind} {compartment_label(network, found.about)}"
+    if not signal.about:
+        return "the time" if signal.name == TIME else readable(signal.name)
+    kind = signal.name[: -len(signal.about)].rstrip()
+    return f"{kind} {compartment_label(network, signal.about)}"
 
 
 def compartment_label(network: Network, compartment: str) -> str:
@@ -211,35 +204,14 @@ def compartment_label(network: Network, compartment: str) -> str:
     return network.compartments[compartment].label
 
 
-def interval_names(network: Network) -> list[str]:
-    """Return what the beginning of each interval is called: a year or date, or the time since the start."""
+def interval_names(network: Network, form: Callable[[float], str] | None = None) -> list[str]:
+    """Return what the beginning of each interval is called: a year or date, or ``form`` of the time since the start."""
     begins = interval_ends(network) - network.episode.control_interval
     _, dates = labels(network, begins)
-    return dates[0] if dates else [f"{network.time_unit} {each:.6g}" for each in begins.tolist()]
-
-
-def _when(moment: str) -> str:
-    return f"in {moment}" if moment.isdigit() else f"at {moment}"
+    form = form or (lambda time: f"{network.time_unit} {time:.6g}")
+    return dates[0] if dates else [form(time) for time in begins.tolist()]
 
 
 def joined_text(parts: Sequence[str]) -> str:
     """Join parts with commas and an ``and``."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-
-
-def paragraphs(found: Explanation) -> Iterator[tuple[str, list[str]]]:
-    """Yield headings with their sentences: of the network, then agent by agent."""
-    if found.prices is not None or found.no_prices:
-        only = Explanation(network=found.network, about="", prices=found.prices, no_prices=found.no_prices)
-        yield "What is worth what", sentences(only)
-    rules = {} if found.rules is None else {rule.agent: rule for rule in found.rules.rules}
-    looked = {each.agent: each for each in found.inputs}
-    for agent in dict.fromkeys([*looked, *rules]):
-        said = [input_sentence(found.network, looked[agent])] if agent in looked else []
-        said += rule_sentences(found.network, rules[agent]) if agent in rules else []
-        yield compartment_label(found.network, agent), said
-    if found.rules is not None:
-        yield (
-            "All rules together",
-            [f"If all agents act by their rules, {difference_text(found.network, found.rules.together)}."],
-        )

@@ -14,10 +14,11 @@ from scipy.special import stdtrit
 
 from cirl_marl.drawing.style import (
     DASHES,
+    FAINT,
     GRID,
     INK,
-    MUTED,
     SERIES,
+    WIDTH,
     axis_time,
     check_shape,
     readable,
@@ -32,8 +33,6 @@ from cirl_marl.network.elements import Law
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-WIDTH = 9.0
-"""Width of a figure, inch; shown 900 pixels wide, 9 points are about 12 pixels."""
 AGENT_PANELS = 20
 SHOWN = 10
 """Largest number of compartments in one panel of a trajectory."""
@@ -103,10 +102,10 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
         axes.set_axis_off()
     for axes in panels[: len(shown)][-columns:]:
         axes.tick_params(labelbottom=True)  # nothing may lie below the last panel of a column
-    figure.supxlabel("environment steps", fontsize=9, color=MUTED)
-    figure.supylabel("episode return", fontsize=9, color=MUTED)
+    figure.supxlabel("environment steps", fontsize=9, color=FAINT)
+    figure.supylabel("episode return", fontsize=9, color=FAINT)
     if len(returns) > len(shown):
-        figure.suptitle(f"The first {len(shown)} of {len(returns)} agents", fontsize=9, color=MUTED)
+        figure.suptitle(f"The first {len(shown)} of {len(returns)} agents", fontsize=9, color=FAINT)
     return save(figure, path)
 
 
@@ -251,7 +250,7 @@ def _draw_mean(axes: Axes, time: Floats, values: Floats, name: str, index: int, 
 
 def _draw_returns(axes: Axes, steps: Floats, values: Floats) -> None:
     if values.size == 0:
-        axes.text(0.5, 0.5, "no episodes", transform=axes.transAxes, ha="center", va="center", color=MUTED, fontsize=8)
+        axes.text(0.5, 0.5, "no episodes", transform=axes.transAxes, ha="center", va="center", color=FAINT, fontsize=8)
         return
     marker = "o" if values.size < 5 else ""
     axes.plot(steps, values, color=SERIES[5], linewidth=0.7, alpha=0.7, marker=marker, markersize=4)
@@ -309,5 +308,5 @@ def _draw_bound(axes: Axes, bound: Floats) -> None:
     axes.step(service, most, where="post", color=INK, linewidth=1.6, label="bound")
     axes.fill_between(service, most, high, step="post", color=GRID, linewidth=0, zorder=0)
     note, below = "proved out of reach from a middle start", (-4, -12)
-    axes.annotate(note, (1.0, high), xytext=below, textcoords="offset points", ha="right", fontsize=8, color=MUTED)
+    axes.annotate(note, (1.0, high), xytext=below, textcoords="offset points", ha="right", fontsize=8, color=FAINT)
     axes.set_ylim(low, high)

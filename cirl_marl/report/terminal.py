@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,51 +12,70 @@ from cirl_marl.network import Floats, Network
 from cirl_marl.network.elements import Arc, Compartment, ControlKind, Law, Lifetime
 
 
+def text_table(
+    title: str,
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    text: Collection[str],
+    unbroken: Collection[str] = (),
+) -> Table:
+    """Return a table for the terminal: columns of ``text`` stand left, others right; ``unbroken`` ones never wrap."""
+    table = Table(title=title)
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in text else "right", no_wrap=heading in unbroken)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
 def networks_table(networks: Mapping[str, Network]) -> Table:
     """One row a network, or a definition of several: compartments, agents, services, scenarios."""
-    table = Table(title="Networks")
-    _columns(table, "name", "what it is", "compartments", "agents", "services", "scenarios")
+    headings = ["name", "what it is", "compartments", "agents", "services", "scenarios"]
+    rows = []
     for name, network in networks.items():
         services = ", ".join(service.id for service in network.services) or "none"
         scenarios = ", ".join([network.scenario_name, *network.scenarios])
         counts = str(len(network.compartments)), str(len(network.agents))
-        table.add_row(name, network.title, *counts, services, scenarios)
-    return table
+        rows.append([name, network.title, *counts, services, scenarios])
+    return text_table("Networks", headings, rows, text=headings, unbroken=["name"])
 
 
 def nodes_table(network: Network, stock: Floats) -> Table:
     """One row a node: role, stock at the start, set-point, control; those that store nothing have no stock."""
-    table = Table(title=f"{network.title or network.name}: nodes ({network.mass_unit})")
-    _columns(table, "node", "role", "initial range", "stock", "set-point", "control")
+    rows = []
     for i, node in enumerate(network.nodes):
-        span, held = "stores nothing", ""
+        span, amount = "stores nothing", ""
         if node.stores:
             low, high = network.initial[:, i]
-            span = f"{low:g}" if low == high else f"{low:g} – {high:g}"
-            known = "left of its history" if node.history is not None else "all that is asked for"
-            span, held = span if node.initial is not None else known, f"{stock[i]:.5g}"
-        table.add_row(node.id, node.role.value, span, held, _target(node), control_text(network, node))
-    return table
+            span, amount = f"{low:g}" if low == high else f"{low:g} – {high:g}", f"{stock[i]:.5g}"
+        if node.stores and node.initial is None:
+            span = "left of its history" if node.history is not None else "all that is asked for"
+        rows.append([node.id, node.role.value, span, amount, _set_point(node), control_text(network, node)])
+    headings = ["node", "role", "initial range", "stock", "set-point", "control"]
+    title = f"{network.title or network.name}: nodes ({network.mass_unit})"
+    return text_table(title, headings, rows, text=["node", "role", "initial range", "control"], unbroken=["node"])
 
 
 def arcs_table(network: Network, flow: Floats) -> Table:
     """One row an arc: law, flow at the start, its sign in λ, set-point, control."""
-    table = Table(title=f"arcs ({network.mass_unit}/{network.time_unit})")
-    _columns(table, "arc", "law", "flow", "in λ", "set-point", "control")
     signs = {1.0: "−", -1.0: "+", 0.0: ""}
-    for k, arc in enumerate(network.arcs):
-        sign = signs[float(network.sustainability[k])]
-        table.add_row(arc.id, law_text(network, arc), f"{flow[k]:.5g}", sign, _target(arc), control_text(network, arc))
-    return table
+    rows = (
+        [
+            arc.id,
+            law_text(network, arc),
+            f"{flow[k]:.5g}",
+            signs[float(network.sustainability[k])],
+            _set_point(arc),
+            control_text(network, arc),
+        ]
+        for k, arc in enumerate(network.arcs)
+    )
+    headings, title = ["arc", "law", "flow", "in λ", "set-point", "control"], f"{network.mass_unit}/{network.time_unit}"
+    return text_table(f"arcs ({title})", headings, rows, text=["arc", "law", "in λ", "control"], unbroken=["arc"])
 
 
-def _columns(table: Table, name: str, *others: str) -> None:
-    table.add_column(name, no_wrap=True)
-    for other in others:
-        table.add_column(other, justify="right" if other in ("stock", "flow", "set-point") else "left")
-
-
-def _target(compartment: Compartment) -> str:
+def _set_point(compartment: Compartment) -> str:
     return "" if compartment.set_point is None else f"{compartment.set_point:g}"
 
 
@@ -71,8 +90,8 @@ def law_text(network: Network, arc: Arc) -> str:
     if arc.law is Law.COMPARTMENT:
         return f"{arc.rate:g} y({arc.by})"
     if arc.law is Law.BATCH:
-        what = f"{arc.rate:g} x {arc.port} of {arc.by}" if arc.by else f"{len(arc.batches)} on schedule"
-        return f"batches: {what}, " + (f"after {arc.delay:g}" if arc.delay else "by vehicle")
+        amount = f"{arc.rate:g} x {arc.port} of {arc.by}" if arc.by else f"{len(arc.batches)} on schedule"
+        return f"batches: {amount}, " + (f"after {arc.delay:g}" if arc.delay else "by vehicle")
     if arc.law is Law.SHARE:
         donor = network.nodes[network.node_index[arc.donor]]
         share = "s" if arc.control else "rest" if arc.share is None else f"{arc.share:g}"
@@ -106,7 +125,6 @@ def control_text(network: Network, compartment: Compartment) -> str:
 
 def evaluation_table(figures: Mapping[str, Any]) -> Table:
     """One row a controller: λ̄, gain, service level with confidence intervals; returns as means over the agents."""
-    table = Table(title=f"{figures['episodes']} fresh episodes, mean ± half-width of the 95 % confidence interval")
     unit, rows = figures["unit"], figures["controllers"]
     columns = {
         "circularity": (f"λ̄ ({unit})", "{:.4g}"),
@@ -117,28 +135,21 @@ def evaluation_table(figures: Mapping[str, Any]) -> Table:
         "gap": ("gap to bound", "{:.1%}"),
         "time_window_circularity": (f"weighted, time window ({unit})", "{:.4g}"),
     }
-    shown = [which for which in columns if all(which in row for row in rows.values())]
-    table.add_column("controller")
-    for which in shown:
-        table.add_column(columns[which][0], justify="right")
-    for name, row in rows.items():
-        table.add_row(name, *(_figure(row[which], columns[which][1]) for which in shown))
-    return table
+    common = [name for name in columns if all(name in row for row in rows.values())]
+    cells = ([name, *(_figure(row[key], columns[key][1]) for key in common)] for name, row in rows.items())
+    title = f"{figures['episodes']} fresh episodes, mean ± half-width of the 95 % confidence interval"
+    return text_table(title, ["controller", *(columns[name][0] for name in common)], cells, text=["controller"])
 
 
 def local_returns_table(figures: Mapping[str, Any]) -> Table:
     """One row an agent: its local return under each controller."""
-    table = Table(title="local return of each agent")
-    controllers = figures["controllers"]
-    table.add_column("agent")
-    for name in controllers:
-        table.add_column(name, justify="right")
-    for agent in next(iter(controllers.values()))["local_return"]:
-        table.add_row(agent, *(_figure(row["local_return"][agent], "{:.4g}") for row in controllers.values()))
-    return table
+    returns = {name: row["local_return"] for name, row in figures["controllers"].items()}
+    agents = next(iter(returns.values()))
+    rows = ([agent, *(_figure(of_agent[agent], "{:.4g}") for of_agent in returns.values())] for agent in agents)
+    return text_table("local return of each agent", ["agent", *returns], rows, text=["agent"])
 
 
-def _figure(found: Mapping[str, Any], form: str) -> str:
+def _figure(aggregate: Mapping[str, Any], form: str) -> str:
     """Write a mean with the half-width of its interval, which is Student's and so symmetric; alone if it has none.
 
     Of figures by agent it is the mean over the agents.
@@ -146,11 +157,10 @@ def _figure(found: Mapping[str, Any], form: str) -> str:
     >>> _figure({"value": 0.25, "low": 0.2, "high": 0.3}, "{:+.1%}")
     '+25.0% ± 5.0%'
     """
-    if set(found) != {"value", "low", "high"}:
-        return form.format(np.mean([each["value"] for each in found.values()]))
-    value, high = found["value"], found["high"]
+    if set(aggregate) != {"value", "low", "high"}:
+        return form.format(np.mean([agent["value"] for agent in aggregate.values()]))
+    value, high = aggregate["value"], aggregate["high"]
     if value is None:
         return "–"
-    if high is None:
-        return form.format(value)
-    return f"{form.format(value)} ± {form.format(high - value).lstrip('+')}"
+    margin = "" if high is None else f" ± {form.format(high - value).lstrip('+')}"
+    return form.format(value) + margin
