@@ -23,7 +23,7 @@ def test_pieces_are_merged_where_stocks_are_fast(
     fine = program._layout(admissible, 2, False, 1)
     monkeypatch.setattr(program, "LARGE", 0)
     layout = program._layout(admissible, 2, None, 1)
-    assert (fine.pieces, layout.pieces, layout.coarse, layout.merged) == (2, 1, True, merged)
+    assert (fine.pieces, layout.pieces, layout.coarse, layout.has_end_flows) == (2, 1, True, merged)
 
 
 @pytest.mark.medium
@@ -31,7 +31,7 @@ def test_coarse_pieces_bound_what_the_simulator_does(monkeypatch: pytest.MonkeyP
     """The bound is above its plan in the simulator, and near it."""
     monkeypatch.setattr(program, "LARGE", 0)
     found = bound("steel_japan", min_service=1.0, degree=1, horizon=6)
-    assert found.problem.layout.coarse and not found.problem.layout.merged
+    assert found.problem.layout.coarse and not found.problem.layout.has_end_flows
     run = achieved(found)
     assert run.episode_levels.min() > 0.999
     assert 0 < found.gap(run.episode_circularity[0]) < 0.02
@@ -44,7 +44,7 @@ def test_least_arrivals_are_below_those_of_the_inverse() -> None:
         shares = random.dirichlet(np.ones(6), size=6)
         passed, arriving = kept * shares, (1 - kept) * random.dirichlet(np.ones(2), size=6)
         visits = np.full(6, 1 / (1 - kept))
-        found = reach._least(sparse.csc_array(passed), arriving, visits)
+        found = reach._least_arrivals(sparse.csc_array(passed), arriving, visits)
         # all arrives somewhere, so that both stocks together get 1
         assert (found.sum(axis=1) <= 1.0).all()
         assert found.sum(axis=1) == pytest.approx(np.ones(6), abs=1e-7)

@@ -84,12 +84,12 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     short = network.with_options(episode={"control_interval": 1.0 / steps, "horizon": years * steps})
     run = rollout(MultiAgentVectorEnv(short, num_envs=1), Neutral())
     left = weighted(run.flow[:, network.arc_index["discard"]].reshape(-1, FINE), 2).reshape(years, -1)
-    (each,) = lifetimes.lived
+    (each,) = lifetimes.passive
     values = np.zeros((years, layout.size))
     for i, moment in enumerate(layout.moments):
-        values[:, layout.flow(moment) + each.leaving] = left[:, i]
-        values[:, layout.flow(moment) + each.entering[0]] = INFLOW[:years]
-        columns = layout.size * np.arange(years) + layout.flow(moment) + each.leaving
+        values[:, layout.flow[moment] + each.leaving] = left[:, i]
+        values[:, layout.flow[moment] + each.entering[0]] = INFLOW[:years]
+        columns = layout.size * np.arange(years) + layout.flow[moment] + each.leaving
         assert (left[:, i] <= problem.high[columns] * (1 + 1e-6)).all()
     assert (matrix @ values.ravel() <= to + 1e-5 * left.max()).all()
     # and they leave little room

@@ -213,7 +213,7 @@ def test_multipliers_of_merged_pieces_bound_other_starts(monkeypatch: pytest.Mon
     monkeypatch.setattr(program, "LARGE", 0)
     network = cycle(hoarded=500.0)
     found = bound(network)
-    assert found.problem.layout.merged
+    assert found.problem.layout.has_end_flows
     poor = found.initial.copy()
     poor[network.node_index["hoard"]] = 1.0
     proved, solved = float(found.at(poor)), bound(network, poor)

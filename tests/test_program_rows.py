@@ -170,9 +170,9 @@ def variables(layout: Layout, happened: Sequence[Interval]) -> Floats:
                 stock = np.append(stock, flow @ entering)  # what passes through nodes that store nothing
                 found += [stock, flow, (valve * stock)[layout.valves]]
             found.append(merged[-1].end)
-            if layout.merged:
+            if layout.has_end_flows:
                 found += [merged[-1].end_flow @ entering, merged[-1].end_flow]
-        found += [each.levels, np.array([imbalance(network, each.flow)]), valve[layout.openings]]
+        found += [each.levels, np.array([imbalance(network, each.flow)]), valve[layout.free_valves]]
     return np.concatenate(found)
 
 
@@ -265,7 +265,7 @@ def test_the_random_networks_reach_what_matters(make_network: Callable[[int, int
         assert_holds(played, 1 + seed % 2, [None, 0.7][seed % 2])
         layout = Programs(Admissible.of(network), 1, None).layout
         met["cut"] += played.cut
-        met["valve"] += len(layout.openings) > 0
+        met["valve"] += len(layout.free_valves) > 0
         met["series"] += any(isinstance(arc.flow, Series) for arc in network.arcs)
         met["shares"] += any(split.controlled_arcs for split in splits(network))
         met["passing"] += len(network.stores) < len(network.nodes)
@@ -374,9 +374,9 @@ def test_a_store_that_runs_empty(
     assert cut or stock == 700.0 or style == "low"
     programs = Programs(Admissible.of(network), 1, None)
     layout, supply = programs.layout, network.arc_index["supply"]
-    least = programs.program(network.initial[1]).low[layout.flow(0) + supply]
+    least = programs.program(network.initial[1]).low[layout.flow[0] + supply]
     assert (least > 0) == (stock == 700.0 and (valve is None or valve[0] > 0))  # nothing is cut at first
-    assert (network.node_index["store"] in layout.openings) == (valve is not None)
+    assert (network.node_index["store"] in layout.free_valves) == (valve is not None)
     assert (layout.pieces > 1) == (interval == 0.8)
 
 
@@ -473,7 +473,7 @@ def test_the_most_that_is_delivered() -> None:
     assert delivered * 0.4 == pytest.approx(12.0 * z / math.expm1(z), rel=1e-12)
     problem = Programs(Admissible.of(network), 1, None).program(start)
     cost = np.zeros_like(problem.cost)
-    cost[problem.layout.flow(0) + np.array(ordered)] = -1.0
+    cost[problem.layout.flow[0] + np.array(ordered)] = -1.0
     most = -float(cost @ solve(replace(problem, cost=cost)).plan)
     assert most == pytest.approx(delivered, rel=1e-7)
 

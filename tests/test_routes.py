@@ -36,7 +36,7 @@ def test_shares_lie_in_their_ranges(network: Network, seed: int) -> None:
         mixed = np.where(rng.random((rows.sum(), 200)) < 0.7, rng.integers(0, 2, (rows.sum(), 200)), rng.random())
         asked[rows] = low[rows, step, None] + mixed * (high - low)[rows, step, None]
         rate = laws.rate(asked, np.full(200, step))
-        least, most = admissible.rate(step)
+        least, most = admissible.rate[:, step]
         for each in (rate.min(axis=1) - least, most - rate.max(axis=1)):
             assert (each >= -1e-12 * (1 + most))[~admissible.scheduled].all()
 
@@ -46,7 +46,7 @@ def test_routes_bound_what_passes(seed: int) -> None:
     """Throughputs and arrivals under random shares lie within their bounds."""
     network = yearly_network(seed)
     admissible, laws, stores = Admissible.of(network), FlowLaws(network), len(network.stores)
-    routes = RouteBounds(admissible, VisitBounds(network), 0)
+    routes = RouteBounds(admissible.ranges[0], VisitBounds(network), 0)
     low, _, high = network.control_bounds[:, :, 0]
     rng = np.random.default_rng(seed)
     for _ in range(50):

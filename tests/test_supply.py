@@ -37,6 +37,7 @@ from cirl_marl.network.elements import Lifetime
 from cirl_marl.optimum import achieved, bound, improved
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.constraints import idle_supplies
+from cirl_marl.optimum.matrices import ProgramRows
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.reach import Reach
 
@@ -312,19 +313,21 @@ def test_supplies_keep_the_proportions_that_the_program_knows(
     uncut = np.ones((steps, len(planned.arcs)), dtype=bool)
     uncut[:, mines[0]] = ore > 1e3
     reached = Reach(np.zeros((steps, len(planned.nodes))), uncut, np.zeros(steps))
-    rows, limits = idle_supplies(programs.admissible, reached, layout, range(steps))
+    written = ProgramRows(layout, steps)
+    idle_supplies(programs.admissible, reached, range(steps), written)
+    rows, limits = written.matrices()[0], written.limits()
     played = np.random.default_rng(seed).uniform(-1, 1, (steps, 1, 1))
     env = MultiAgentVectorEnv(network, num_envs=1)
     env.reset(seed)
     values = np.zeros((steps, layout.size))
-    starts = [layout.flow(j) for j in layout.moments]
-    starts += [layout.end_flow(piece) for piece in range(layout.pieces)] if layout.merged else []
+    starts = layout.flow.tolist()
+    starts += layout.end_flow.tolist() if layout.has_end_flows else []
     for t in range(steps):
         flow = env.advance(played[t]).flow[:, 0]
         for start in starts:
             values[t, [start + k for k in mines]] = flow[:2]
     left = limits - rows @ values.ravel()
-    assert rows.shape[0] == 2 * 2 * steps * (layout.pieces * (2 if layout.merged else 1))
+    assert rows.shape[0] == 2 * 2 * steps * (layout.pieces * (2 if layout.has_end_flows else 1))
     assert left.min() > -1e-9
     if ore > 1e3 and min(high) == 99.0:  # the chord is the tangent if both come to their bounds together
         sides = slice(1) if weight == 0.25 else slice(2)

@@ -1,4 +1,4 @@
-"""What the acting agents can do to each flow, and for which networks that is all there is."""
+"""What the acting agents can do to each flow, the networks for which that is all, and the actions for planned flows."""
 
 from __future__ import annotations
 
@@ -24,6 +24,76 @@ class NoCertificate(CirlError):
     """A network for which no upper bound is proved; the message says why."""
 
 
+@dataclass(frozen=True, slots=True)
+class FreeSplit:
+    """A split of what leaves a node in which some share can be chosen.
+
+    Attributes:
+        donor: the node.
+        arcs: those with a control, then the others, which keep their proportions.
+        leader: of the others the greatest.
+        followers: the rest of them.
+        ratio: these as parts of the leader.
+    """
+
+    donor: int
+    arcs: Integers
+    leader: int
+    followers: Integers
+    ratio: Floats
+
+    @classmethod
+    def of(cls, split: Split, donor: int, step: int) -> FreeSplit:
+        """Read it off a split in one interval."""
+        proportions, others = split.proportions[:, step], np.array(split.other_arcs, dtype=np.intp)
+        first = int(proportions.argmax())
+        rest = np.arange(len(proportions)) != first
+        arcs = np.array([*split.controlled_arcs, *split.other_arcs])
+        return cls(donor, arcs, split.other_arcs[first], others[rest], proportions[rest] / proportions[first])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntervalRanges:
+    """The ranges of the flows in the intervals of one kind; pairs are lowest and highest.
+
+    Attributes:
+        network: whose flows they are.
+        driver: node that drives each arc; −1 for scheduled flows, shape (arcs,).
+        scheduled: arcs that flow by schedule, as far as their donor holds enough, shape (arcs,).
+        proportional: arcs whose flow is a rate times what drives it: no schedule, no lifetime, shape (arcs,).
+        share_arcs: arcs that share what leaves their donor, shape (arcs,).
+        base: a_k, shape (arcs,).
+        setting: w_k or u_k, shape (2, arcs).
+        valve: v of each node, shape (2, nodes).
+        rate: coefficient of each arc, 1/time for stock-driven arcs, a share for what a node passes on, mass/time for
+            scheduled ones, shape (2, arcs).
+        neutral_rate: the same while nobody acts, shape (arcs,).
+        neutral_valve: v while nobody acts, shape (nodes,).
+        release: rate at which each stock is released to be shared out, 1/time, shape (2, nodes).
+        exits: rate at which each stock leaves in proportion to itself, 1/time, shape (2, nodes).
+        free_splits: the splits in which some share can be chosen.
+        followers: arcs whose flows follow from one with which they share what others leave.
+        service_low: lower end of the band of each service, shape (services,).
+    """
+
+    network: Network
+    driver: Integers
+    scheduled: NDArray[np.bool_]
+    proportional: NDArray[np.bool_]
+    share_arcs: NDArray[np.bool_]
+    base: Floats
+    setting: Floats
+    valve: Floats
+    rate: Floats
+    neutral_rate: Floats
+    neutral_valve: Floats
+    release: Floats
+    exits: Floats
+    free_splits: tuple[FreeSplit, ...]
+    followers: Integers
+    service_low: Floats
+
+
 @dataclass(frozen=True, kw_only=True)
 class Admissible:
     """The ranges of the factors of every flow, f_k = v·w_k·a_k·y_p for driven flows, u_k·v for scheduled ones.
@@ -35,28 +105,28 @@ class Admissible:
     Attributes:
         network: whose flows they are, with lifetimes as the program sees them.
         lifetimes: how that stands for the network that was given.
-        agents: who acts.
+        actuators: who acts, and by which controls.
         driver: node p that drives each arc; −1 for scheduled flows, shape (arcs,).
         base: a_k, 1/time (1 for what a node passes on), or the mean of the schedule over each interval, mass/time (1
             if a control sets the flow), shape (steps, arcs).
-        own: lowest and highest w_k or u_k, shape (2, steps, arcs).
+        setting: lowest and highest w_k or u_k, shape (2, steps, arcs).
         valve: lowest and highest v of each node, shape (2, steps, nodes).
-        neutral_own: w_k or u_k while nobody acts, shape (steps, arcs).
+        neutral_setting: w_k or u_k while nobody acts, shape (steps, arcs).
         neutral_valve: v while nobody acts, shape (steps, nodes).
-        served: lower end of the band of each service, shape (steps, services).
+        service_low: lower end of the band of each service, shape (steps, services).
         splits: the arcs that share what leaves a node.
     """
 
     network: Network
     lifetimes: Lifetimes
-    agents: tuple[str, ...]
+    actuators: Actuators
     driver: Integers
     base: Floats
-    own: Floats
+    setting: Floats
     valve: Floats
-    neutral_own: Floats
+    neutral_setting: Floats
     neutral_valve: Floats
-    served: Floats
+    service_low: Floats
     splits: tuple[Split, ...]
 
     @classmethod
@@ -69,49 +139,54 @@ class Admissible:
         """
         reasons = list(_uncertified(network))
         if reasons:
-            named = f"network '{network.name}', scenario '{network.scenario_name}'"
-            raise NoCertificate(f"{named}: no bound is proved: {'; '.join(reasons)}")
-        acting = Actuators(FlowLaws(network), agents, 1).agents
-        lifetimes = Lifetimes(network, acting)
+            name = f"network '{network.name}', scenario '{network.scenario_name}'"
+            raise NoCertificate(f"{name}: no bound is proved: {'; '.join(reasons)}")
+        actuators = Actuators(FlowLaws(network), agents, 1)
+        agents = actuators.agents
+        lifetimes = Lifetimes(network, agents)
         network = lifetimes.planned
-        laws, divided = FlowLaws(network), tuple(splits(network))
         steps = network.episode.horizon
         # lowest, neutral and highest
-        own, valve = np.ones((3, steps, len(network.arcs))), np.ones((3, steps, len(network.nodes)))
+        setting, valve = np.ones((3, steps, len(network.arcs))), np.ones((3, steps, len(network.nodes)))
         for i, node in enumerate(network.nodes):
             if node.control is not None and node.control.kind is ControlKind.RATE:
-                valve[:, :, i] = _range(network, node, acting)
+                valve[:, :, i] = _control_range(network, node, agents)
         if isinstance(network, StagedNetwork):
             for store, id_ in network.valves.items():
                 if network.compartments[id_].control is not None:
-                    stretch = _range(network, network.compartments[id_], acting)
+                    stretch = _control_range(network, network.compartments[id_], agents)
                     valve[:, :, network.node_index[store]] = 1.0 / stretch[::-1]
-        own[0][:, lifetimes.leaving] = 0.0  # what leaves at the end of a life may be nothing
+        setting[0][:, lifetimes.leaving] = 0.0  # what leaves at the end of a life may be nothing
         for k, arc in enumerate(network.arcs):
-            setter = _setter(network, arc)
-            if setter is not None:
-                own[:, :, k] = _range(network, setter, acting)
-        for split in divided:
+            compartment = _setter(network, arc)
+            if compartment is not None:
+                setting[:, :, k] = _control_range(network, compartment, agents)
+        split_arcs = tuple(splits(network))
+        for split in split_arcs:
             arcs = [*split.controlled_arcs, *split.other_arcs]
-            asked = own[:, :, list(split.controlled_arcs)].transpose(0, 2, 1)
-            (low, high), (neutral, _) = shares(split, asked[[0, 2]]), shares(split, asked[[1, 1]])
-            own[:, :, arcs] = np.stack([low.T, neutral.T, high.T])
-        share = np.array([arc.law is Law.SHARE for arc in network.arcs], dtype=bool)
+            wishes = setting[:, :, list(split.controlled_arcs)].transpose(0, 2, 1)
+            (low, high), (neutral, _) = share_ranges(split, wishes[[0, 2]]), share_ranges(split, wishes[[1, 1]])
+            setting[:, :, arcs] = np.stack([low.T, neutral.T, high.T])
         base = [network.interval_means(LAWS[arc.law].coefficient(arc, network)) for arc in network.arcs]
-        served = [network.interval_means(service.low) for service in network.services]
+        service_low = [network.interval_means(service.low) for service in network.services]
         return cls(
             network=network,
             lifetimes=lifetimes,
-            agents=acting,
-            driver=np.where(laws.is_scheduled, -1, np.where(share, network.donors, laws.driver)),
+            actuators=actuators,
+            driver=np.array([_driver(network, arc) for arc in network.arcs], dtype=np.intp),
             base=np.array(base, dtype=float).reshape(-1, steps).T,
-            own=own[::2],
+            setting=setting[::2],
             valve=valve[::2],
-            neutral_own=own[1],
+            neutral_setting=setting[1],
             neutral_valve=valve[1],
-            served=np.array(served, dtype=float).reshape(-1, steps).T,
-            splits=divided,
+            service_low=np.array(service_low, dtype=float).reshape(-1, steps).T,
+            splits=split_arcs,
         )
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Who acts."""
+        return self.actuators.agents
 
     @property
     def scheduled(self) -> NDArray[np.bool_]:
@@ -119,90 +194,96 @@ class Admissible:
         return self.driver < 0
 
     @cached_property
-    def lived(self) -> NDArray[np.bool_]:
-        """Arcs through which comes what has lived, whatever its stock, shape (arcs,)."""
-        found = np.zeros(len(self.network.arcs), dtype=bool)
-        found[self.lifetimes.leaving] = True
-        return found
+    def share_arcs(self) -> NDArray[np.bool_]:
+        """Arcs that share what leaves their donor, shape (arcs,)."""
+        return np.array([arc.law is Law.SHARE for arc in self.network.arcs], dtype=bool)
 
     @cached_property
-    def factor(self) -> Floats:
-        """Lowest and highest v·w_k or v·u_k, shape (2, steps, arcs)."""
-        return self.own * self.valve[:, :, self.network.donors]
+    def rate(self) -> Floats:
+        """Lowest and highest coefficient of each arc in each interval (see ``IntervalRanges``), (2, steps, arcs)."""
+        return self.setting * self.valve[:, :, self.network.donors] * self.base
 
     @cached_property
     def neutral_rate(self) -> Floats:
         """v·w_k·a_k or u_k·v while nobody acts, shape (steps, arcs)."""
-        return self.neutral_own * self.base * self.neutral_valve[:, self.network.donors]
+        return self.neutral_setting * self.base * self.neutral_valve[:, self.network.donors]
 
     @cached_property
     def kinds(self) -> Integers:
         """For each interval the first that is like it but for what flows by schedule, shape (steps,)."""
         driven = ~self.scheduled
-        parts = [*self.own[:, :, driven], self.base[:, driven], *self.valve, self.neutral_rate[:, driven], self.served]
-        parts += [split.proportions.T for split in self.splits]
+        parts = [*self.setting[:, :, driven], self.base[:, driven], *self.valve, self.neutral_rate[:, driven]]
+        parts += [self.service_low, *(split.proportions.T for split in self.splits)]
         _, first, kind = np.unique(np.concatenate(parts, axis=1), axis=0, return_index=True, return_inverse=True)
         kinds: Integers = first[kind.ravel()]
         return kinds
 
-    def rate(self, step: int) -> Floats:
-        """Return the lowest and highest coefficient of each arc in one interval, shape (2, arcs).
-
-        1/time for stock-driven arcs, a share for what a node passes on, mass/time for scheduled arcs.
-        """
-        rate: Floats = self.factor[:, step] * self.base[step]
-        return rate
-
-    def released(self, step: int) -> Floats:
-        """Return the lowest and highest rate at which each stock is released to be shared out, shape (2, nodes)."""
-        released = np.zeros((2, len(self.network.nodes)))
-        for split in self.splits:
-            i = self.network.node_index[split.donor]
-            released[:, i] = self.valve[:, step, i] * self.base[step, split.other_arcs[0]]
-        return released
-
-    def exits(self, step: int) -> Floats:
-        """Return the lowest and highest rate at which each stock leaves in proportion to itself, shape (2, nodes)."""
-        donors, nodes = self.network.donors, len(self.network.nodes)
-        rates = self.rate(step) * ((self.driver == donors) & ~self.shared)
-        return np.array([np.bincount(donors, each, nodes) for each in rates], dtype=float) + self.released(step)
-
     @cached_property
-    def shared(self) -> NDArray[np.bool_]:
-        """Arcs that share what leaves their donor, shape (arcs,)."""
-        return np.array([arc.law is Law.SHARE for arc in self.network.arcs], dtype=bool)
+    def ranges(self) -> dict[int, IntervalRanges]:
+        """The ranges in the intervals of each kind."""
+        return {kind: self._ranges_of(kind) for kind in np.unique(self.kinds).tolist()}
 
-    def divided(self, step: int) -> list[Split]:
-        """Return the splits in which some share can be chosen in an interval."""
-        free = self.own[0, step] < self.own[1, step]
-        return [split for split in self.splits if free[[*split.controlled_arcs, *split.other_arcs]].any()]
+    def _ranges_of(self, step: int) -> IntervalRanges:
+        network, rate, setting = self.network, self.rate[:, step], self.setting[:, step]
+        donors, nodes = network.donors, len(network.nodes)
+        release = np.zeros((2, nodes))
+        free_splits = []
+        for split in self.splits:
+            donor, arcs = network.node_index[split.donor], [*split.controlled_arcs, *split.other_arcs]
+            release[:, donor] = self.valve[:, step, donor] * self.base[step, split.other_arcs[0]]
+            if (setting[0] < setting[1])[arcs].any():
+                free_splits.append(FreeSplit.of(split, donor, step))
+        # shares of a release do not leave one by one: the release as a whole does
+        single = rate * ((self.driver == donors) & ~self.share_arcs)
+        exits = np.array([np.bincount(donors, bound, nodes) for bound in single], dtype=float) + release
+        proportional = ~self.scheduled
+        proportional[self.lifetimes.leaving] = False
+        return IntervalRanges(
+            network=network,
+            driver=self.driver,
+            scheduled=self.scheduled,
+            proportional=proportional,
+            share_arcs=self.share_arcs,
+            base=self.base[step],
+            setting=setting,
+            valve=self.valve[:, step],
+            rate=rate,
+            neutral_rate=self.neutral_rate[step],
+            neutral_valve=self.neutral_valve[step],
+            release=release,
+            exits=exits,
+            free_splits=tuple(free_splits),
+            followers=np.concatenate([np.zeros(0, dtype=np.intp), *(split.followers for split in free_splits)]),
+            service_low=self.service_low[step],
+        )
 
 
-def shares(split: Split, asked: Floats) -> Floats:
+def share_ranges(split: Split, wishes: Floats) -> Floats:
     """Return the lowest and highest share of each arc, first of those with a control, shape (2, arcs, steps).
 
     A share rises with what its own arc asks for and falls with what the others do.
 
     Args:
         split: the arcs.
-        asked: least and most that each control asks for, shape (2, controlled, steps).
+        wishes: least and most that each control asks for, shape (2, controlled, steps).
     """
     low = split.bounds[0]
     room = np.maximum(1.0 - low.sum(axis=0), 0.0)
-    over = np.maximum(asked - low, 0.0)
-    others = (over.sum(axis=1, keepdims=True) - over)[::-1]
-    wanted = over + others
-    kept = np.divide(room, wanted, out=np.ones_like(wanted), where=wanted > room)
-    left = room - np.minimum(over.sum(axis=1), room)[::-1]
-    return np.concatenate([low + over * kept, left[:, None] * split.proportions], axis=1)
+    over = np.maximum(wishes - low, 0.0)
+    # against the least of one arc stands the most of all others, and the other way round
+    rivals = (over.sum(axis=1, keepdims=True) - over)[::-1]
+    total = over + rivals
+    cut = np.divide(room, total, out=np.ones_like(total), where=total > room)
+    rest = room - np.minimum(over.sum(axis=1), room)[::-1]
+    return np.concatenate([low + over * cut, rest[:, None] * split.proportions], axis=1)
 
 
-def _range(network: Network, compartment: Compartment, acting: Sequence[str]) -> Floats:
+def _control_range(network: Network, compartment: Compartment, agents: Sequence[str]) -> Floats:
     """Return the lowest, neutral and highest value of a control, shape (3, steps)."""
     bounds = network.control_bounds[:, network.control_rows[compartment.id].start]
     # what is supplied while nobody acts depends on the state: all that may be is allowed
     supplies = isinstance(compartment, Arc) and bool(compartment.makes_up_for)
-    return bounds if compartment.id in acting or supplies else bounds[[1, 1, 1]]
+    return bounds if compartment.id in agents or supplies else bounds[[1, 1, 1]]
 
 
 def _setter(network: Network, arc: Arc) -> Arc | Node | None:
@@ -213,21 +294,26 @@ def _setter(network: Network, arc: Arc) -> Arc | Node | None:
     return arc if arc.control is not None else None
 
 
+def _driver(network: Network, arc: Arc) -> int:
+    """Return the node whose stock or throughput drives an arc; −1 for a scheduled one."""
+    if LAWS[arc.law].is_scheduled:
+        return -1
+    return network.node_index[arc.recipient if arc.law is Law.RECIPIENT else arc.donor]
+
+
 def _uncertified(network: Network) -> Iterator[str]:
     """Yield why the theorem does not hold for the flows of ``network``."""
     if network.episode.solver != "exact":
         yield f"solver '{network.episode.solver}' is not exact within a control interval"
-    modelled = [c.id for c in network.compartments.values() if c.model is not None]
-    if modelled:
-        yield f"{modelled} have inner physics"
+    models = [c.id for c in network.compartments.values() if c.model is not None]
+    if models:
+        yield f"{models} have inner physics"
     batches = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
     if batches:
         yield f"{batches} move batches"
 
 
-def normalised_actions(
-    admissible: Admissible, layout: Layout, planned: Floats, intervals: range | None = None
-) -> Floats:
+def normalised_actions(admissible: Admissible, layout: Layout, plan: Floats, intervals: range | None = None) -> Floats:
     """Return the actions whose constant factors give the planned mean flows at the planned mean stocks.
 
     v = Z̄/X̄ where a node has several outflows, else what its outflow asks with its own control neutral; then
@@ -237,17 +323,17 @@ def normalised_actions(
     Args:
         admissible: ranges of the factors.
         layout: of the variables.
-        planned: variables of each interval, shape (steps, size).
+        plan: variables of each interval, shape (steps, size).
         intervals: of the episode, whose first were planned; None is all of them.
 
     Returns:
         Actions in [−1, 1], in the order of ``MultiAgentVectorEnv.stack``, shape (steps, entries).
     """
     network, first = admissible.network, 0 if intervals is None else intervals.start
-    during = slice(first, first + len(planned))
-    own_range, valve_range, base = admissible.own[:, during], admissible.valve[:, during], admissible.base[during]
-    stock, flow, through = layout.means(planned)
-    neutral, valve = admissible.neutral_own[during], admissible.neutral_valve[during].copy()
+    when = slice(first, first + len(plan))
+    valve_range, base = admissible.valve[:, when], admissible.base[when]
+    stock, flow, through = layout.means(plan)
+    neutral, valve = admissible.neutral_setting[when], admissible.neutral_valve[when].copy()
     by_donor = admissible.driver == network.donors
     for k in np.flatnonzero(by_donor):
         donor = int(network.donors[k])
@@ -257,37 +343,31 @@ def normalised_actions(
     for z, node in enumerate(layout.valves):
         valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
     if isinstance(network, StagedNetwork):
-        for node in dict.fromkeys(network.valves.values()):
-            arcs = [k for k in np.flatnonzero(by_donor) if network.valves.get(network.arcs[k].donor) == node]
-            unit, place = base[:, arcs] * stock[:, network.donors[arcs]], network.node_index[node]
+        for living in dict.fromkeys(network.valves.values()):
+            arcs = [k for k in np.flatnonzero(by_donor) if network.valves.get(network.arcs[k].donor) == living]
+            unit, place = base[:, arcs] * stock[:, network.donors[arcs]], network.node_index[living]
             valve[:, place] = _ratio(flow[:, arcs].sum(axis=1), unit.sum(axis=1), valve[:, place])
     # what is left of f̄_k after the valve is the arc's own factor, w_k = f̄_k/(a_k·v·X̄_p)
     valve = np.clip(valve, *valve_range)
-    driving = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
-    own = _ratio(flow, base * driving * valve[:, network.donors], neutral)
-    return _entries(admissible, valve, np.clip(own, *own_range), during)
-
-
-def _entries(admissible: Admissible, valve: Floats, own: Floats, during: slice) -> Floats:
-    network, steps = admissible.network, np.arange(during.start, during.stop)
-    actuators = Actuators(FlowLaws(admissible.lifetimes.network), admissible.agents or None, len(steps))
+    driver = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
+    setting = np.clip(_ratio(flow, base * driver * valve[:, network.donors], neutral), *admissible.setting[:, when])
+    actuators, steps = admissible.actuators, np.arange(when.start, when.stop)
     actions = np.zeros((len(steps), len(actuators.acting)))
     for agent, entries in actuators.entries.items():
         control = network.compartments[agent].control
         assert control is not None
         if agent in network.arc_index:
-            values = own[:, network.arc_index[agent]]
+            physical = setting[:, network.arc_index[agent]]
         elif control.kind is ControlKind.RATE:
-            values = valve[:, network.node_index[agent]]
+            physical = valve[:, network.node_index[agent]]
         elif control.kind is ControlKind.STRETCH:
-            values = 1.0 / valve[:, network.node_index[agent]]
+            physical = 1.0 / valve[:, network.node_index[agent]]
         else:
-            node = network.node_index[agent]
-            sets = next(k for k in np.flatnonzero(network.donors == node) if network.arcs[k].law is Law.CONTROLLED)
-            values = own[:, sets]
-        actions[:, entries] = actuators.normalise(agent, values[None], steps).T
+            outflows = np.flatnonzero(network.donors == network.node_index[agent])
+            physical = setting[:, next(k for k in outflows if network.arcs[k].law is Law.CONTROLLED)]
+        actions[:, entries] = actuators.normalise(agent, physical[None], steps).T
     return actions
 
 
-def _ratio(amount: Floats, unit: Floats, otherwise: Floats) -> Floats:
-    return np.divide(amount, unit, out=otherwise.copy(), where=unit > 1e-12 * np.abs(amount))
+def _ratio(amount: Floats, unit: Floats, fallback: Floats) -> Floats:
+    return np.divide(amount, unit, out=fallback.copy(), where=unit > 1e-12 * np.abs(amount))

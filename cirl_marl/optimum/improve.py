@@ -289,7 +289,7 @@ def refine(
     for done in range(rounds):
         if enough(run):
             break
-        asked = replace(admissible, served=admissible.served * raised)
+        asked = replace(admissible, service_low=admissible.service_low * raised)
         programs = Programs(asked, DEGREE, bound.service_weight, hold_controls=True)
         try:
             problem = programs.program(bound.initial, bound.min_service)

@@ -69,7 +69,9 @@ def released(chain: Chain, rate: Floats, length: float, degree: int) -> Floats:
         Means weighted with B_i over each piece p of what entered at the start of piece q, 1/time, shape
         (q, p, d + 1); 0 before.
     """
-    parts = {each: weighted(chain.matrix / chain.rate * each * length, degree) for each in np.unique(rate).tolist()}
+    parts = {
+        each: bernstein_means(chain.matrix / chain.rate * each * length, degree) for each in np.unique(rate).tolist()
+    }
     found = np.zeros((len(rate), len(rate), degree + 1))
     held = np.zeros((chain.stages, len(rate)))
     for p, each in enumerate(rate.tolist()):
@@ -92,7 +94,7 @@ class _Motion:
 
     def __init__(self, unit: Floats, turnover: float, entering: Floats, degree: int) -> None:
         stages, matrix = len(unit), unit * turnover
-        means, self.whole = weighted(matrix, degree)
+        means, self.whole = bernstein_means(matrix, degree)
         self.left = turnover * means[:, -1]
         self.later = _Smooth(matrix, entering[:, None], degree)
         # y' = A y + E ψ_0, ψ_l' = ψ_(l+1): with ψ_0 the polynomial, read from the end of the piece
@@ -139,7 +141,7 @@ class _Smooth:
         return low[:, :, ::-1], high[:, :, ::-1]
 
 
-def weighted(matrix: Floats, degree: int, length: float = 1.0) -> tuple[Floats, Floats]:
+def bernstein_means(matrix: Floats, degree: int, length: float = 1.0) -> tuple[Floats, Floats]:
     """Return the means of e^{Ms} under B_0 … B_d, and e^{Mδ}, shape (d + 1, n, n) and (n, n).
 
     The first row of exp of the blocks [[M, I, 0, …], [0, 0, I, …], …]·δ has e^{Mδ}, then, for m = 0 … d, the integrals

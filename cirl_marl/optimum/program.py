@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 
-from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.network import Floats, Integers
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.constraints import (
@@ -23,6 +22,7 @@ from cirl_marl.optimum.constraints import (
     flow_laws,
     held_controls,
     idle_supplies,
+    service_levels,
     throughputs,
     valve_envelopes,
 )
@@ -103,32 +103,32 @@ class Programs:
             merge_pieces: whether an interval has fewer pieces than the simulator has substeps; None: if the program
                 were large otherwise.
         """
-        self.admissible = admissible
-        lifetimes = admissible.lifetimes
-        living = lifetimes.planned is not lifetimes.reached
-        self._system = ComparisonSystem(Admissible.of(lifetimes.reached, admissible.agents) if living else admissible)
+        self.admissible, lifetimes = admissible, admissible.lifetimes
+        has_lifetimes = lifetimes.planned is not lifetimes.reached
+        chained = Admissible.of(lifetimes.reached, admissible.agents) if has_lifetimes else admissible
+        self._system = ComparisonSystem(chained)
         self.layout = layout = _layout(admissible, self._system.substeps, merge_pieces, degree)
-        fading = ComparisonSystem(admissible) if living and layout.merged else self._system
+        fast_system = ComparisonSystem(admissible) if has_lifetimes and layout.has_end_flows else self._system
         self._equal, self._under = ChainedRows(layout), ChainedRows(layout)
-        for kind in np.unique(admissible.kinds).tolist():
-            linked_equal, equal, linked_under, under = (ProgramRows(layout) for _ in range(4))
-            balances(layout, linked_equal)
-            constant_schedules(admissible, layout, equal, under)
-            flow_laws(admissible, layout, kind, equal, under)
-            throughputs(admissible, layout, kind, equal)
+        for kind, ranges in admissible.ranges.items():
+            equal_links, equal, under_links, under = (ProgramRows(layout) for _ in range(4))
+            balances(layout, equal_links)
+            constant_schedules(ranges, layout, equal, under)
+            flow_laws(ranges, layout, equal, under)
+            throughputs(ranges, layout, equal)
             if hold_controls:
-                held_controls(admissible, layout, kind, equal)
-            delivery_limits(admissible, layout, kind, linked_under)
-            decay_rows(admissible, layout, kind, linked_under)
-            if layout.merged:
-                end_laws(admissible, layout, kind, equal, under)
-                quasi_steady_rows(admissible, layout, kind, fading.of_kind(kind), linked_under)
-            measures(layout, admissible.served[kind], under)
-            self._equal.add(kind, linked_equal, equal)
-            self._under.add(kind, linked_under, under)
+                held_controls(ranges, layout, equal)
+            delivery_limits(ranges, layout, under_links)
+            service_levels(ranges, layout, under)
+            decay_rows(ranges, layout, under_links)
+            if layout.has_end_flows:
+                end_laws(ranges, layout, equal, under)
+                quasi_steady_rows(ranges, layout, fast_system.of_kind(kind), under_links)
+            self._equal.add(kind, equal_links, equal)
+            self._under.add(kind, under_links, under)
         self._weights, self._constant = objective(layout, service_weight)
 
-    def at_start(self, interval: int) -> tuple[Any, Any]:
+    def rows_at_start(self, interval: int) -> tuple[Any, Any]:
         """Return what the linked rows of A and of G have of the stocks at the start of an interval, (rows, stores)."""
         kind = int(self.admissible.kinds[interval])
         return self._equal.at_start(kind), self._under.at_start(kind)
@@ -145,25 +145,27 @@ class Programs:
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds.
         """
-        layout, network = self.layout, self.admissible.network
-        when = range(network.episode.horizon) if intervals is None else intervals
-        steps, kinds, lifetimes = len(when), self.admissible.kinds[when.start : when.stop], self.admissible.lifetimes
-        reached, leaving = _reached(lifetimes, self._system, initial, when)
-        asked = self.admissible.factor[1] * self.admissible.base
-        cut = np.where(self.admissible.scheduled & ~reached.uncut, asked[when.start : when.stop], 0.0)
-        start = lifetimes.start_planned @ initial
+        layout, admissible, network = self.layout, self.admissible, self.admissible.network
+        intervals = range(network.episode.horizon) if intervals is None else intervals
+        steps, when, lifetimes = len(intervals), slice(intervals.start, intervals.stop), admissible.lifetimes
+        reach, lifetime_flow = _reach(lifetimes, self._system, initial, intervals)
+        cut = np.where(admissible.scheduled & ~reach.uncut, admissible.rate[1, when], 0.0)
+        start, kinds = lifetimes.start_planned @ initial, admissible.kinds[when]
         equal, equal_to = self._equal.over(kinds, start, cut)
         under, under_to = self._under.over(kinds, start, cut)
-        opened, opened_to = valve_envelopes(self.admissible, reached, layout, when)
-        supplied, supplied_to = idle_supplies(self.admissible, reached, layout, when)
-        lived, lived_to = lifetimes.rows(layout, initial, when)
-        blocks, limits = [under, opened, supplied, lived], [under_to, opened_to, supplied_to, lived_to]
+        rows = ProgramRows(layout, steps)
+        valve_envelopes(admissible, reach, intervals, rows)
+        idle_supplies(admissible, reach, intervals, rows)
+        from_start = rows.matrices()[0]
+        from_start.eliminate_zeros()
+        lifetime_rows, lifetime_limits = lifetimes.rows(layout, initial, intervals)
+        blocks, limits = [under, from_start, lifetime_rows], [under_to, rows.limits(), lifetime_limits]
         if min_service is not None:
             services = len(network.services)
             levels = sparse.eye_array(services, layout.size, k=layout.level)
             blocks.append(sparse.kron(np.full((1, steps), -1.0 / steps), levels, format="csr"))
             limits.append(-np.broadcast_to(min_service, services))
-        low, high = _box(self.admissible, reached, leaving, layout, when)
+        low, high = _box(admissible, reach, lifetime_flow, layout, when)
         return Program(
             layout=layout,
             cost=np.tile(-self._weights / steps, steps),
@@ -177,109 +179,82 @@ class Programs:
         )
 
 
-def _reached(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, intervals: range) -> tuple[Reach, Floats]:
+def _reach(lifetimes: Lifetimes, system: ComparisonSystem, initial: Floats, intervals: range) -> tuple[Reach, Floats]:
     """Return what the planned network can reach, and the most that leaves lifetimes, shape (steps, lifetimes)."""
-    delayed = [
-        DelayLine(each.reached_arc, each.reached_node, each.slots(initial), lifetimes.network.episode.control_interval)
-        for each in lifetimes.lived
-        if not len(each.rate)
-    ]
-    slots = {each.arc: each for each in delayed}
-    found = system.reach(lifetimes.start_reached @ initial, intervals, delayed)
+    interval = lifetimes.network.episode.control_interval
+    lines = {
+        passive.reached_arc: DelayLine(passive.reached_arc, passive.reached_node, passive.slots(initial), interval)
+        for passive in lifetimes.passive
+        if not len(passive.rate)
+    }
+    reach = system.reach(lifetimes.start_reached @ initial, intervals, list(lines.values()))
     most = [
-        each.rate[intervals.start : intervals.stop] * found.upper[:, each.reached_node]
-        + each.at_once * found.upper[:, each.reached_entry]
-        if len(each.rate)
-        else np.array([slots[each.reached_arc].most(t, found.entered) for t in range(len(intervals))])
-        for each in lifetimes.lived
+        passive.rate[intervals.start : intervals.stop] * reach.upper[:, passive.reached_node]
+        + passive.at_once * reach.upper[:, passive.reached_entry]
+        if len(passive.rate)
+        else np.array([lines[passive.reached_arc].most(t, reach.inflow) for t in range(len(intervals))])
+        for passive in lifetimes.passive
     ]
-    upper = found.upper @ lifetimes.nodes_reached.T
-    leaving = np.array(most).reshape(len(most), len(intervals)).T
-    return Reach(upper, found.uncut[:, lifetimes.arcs_reached], found.entered), leaving
+    upper = reach.upper @ lifetimes.nodes_reached.T
+    lifetime_flow = np.array(most).reshape(len(most), len(intervals)).T
+    return Reach(upper, reach.uncut[:, lifetimes.arcs_reached], reach.inflow), lifetime_flow
 
 
-def _layout(admissible: Admissible, substeps: int, merged: bool | None, degree: int) -> Layout:
-    network = admissible.network
-    nodes = len(network.nodes)
-    pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.lived else substeps
+def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, degree: int) -> Layout:
+    network, nodes = admissible.network, len(admissible.network.nodes)
+    pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.passive else substeps
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
-    constant_schedules = np.bincount(network.donors[admissible.scheduled], minlength=nodes)
+    schedules = np.bincount(network.donors[admissible.scheduled], minlength=nodes)
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
-    valve_envelopes = np.flatnonzero(movable & (exits > 0) & (constant_schedules > 0))
-    valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (constant_schedules > 0)))
-    fine = Layout(network, pieces, pieces < substeps, False, degree, valves, valve_envelopes)
+    valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (schedules > 0)))
+    free_valves = np.flatnonzero(movable & (exits > 0) & (schedules > 0))
+    fine = Layout(network, pieces, pieces < substeps, False, degree, valves, free_valves)
     few = max(1, degree - 1)
-    if pieces > few and (fine.size * network.episode.horizon > LARGE if merged is None else merged):
-        coarse = replace(fine, pieces=few, coarse=True)
-        return replace(coarse, merged=True) if merged or has_fast_stocks(admissible, coarse.length) else coarse
-    return fine
+    is_large = fine.size * network.episode.horizon > LARGE if merge_pieces is None else merge_pieces
+    if pieces <= few or not is_large:
+        return fine
+    coarse = replace(fine, pieces=few, coarse=True)
+    return replace(coarse, has_end_flows=bool(merge_pieces) or has_fast_stocks(admissible, coarse.length))
 
 
 def _box(
-    admissible: Admissible, reached: Reach, leaving: Floats, layout: Layout, intervals: range
+    admissible: Admissible, reach: Reach, lifetime_flow: Floats, layout: Layout, when: slice
 ) -> tuple[Floats, Floats]:
     """Return the lowest and highest value of every variable; all are finite, which makes every multiplier a bound."""
-    network = admissible.network
-    low, high = np.zeros((2, len(intervals), layout.size))
-    scheduled = admissible.scheduled
-    during = slice(intervals.start, intervals.stop)
-    rates, valve = (admissible.factor * admissible.base)[:, during], admissible.valve[:, during]
+    network, scheduled = admissible.network, admissible.scheduled
+    stores, nodes, arcs = len(network.stores), len(network.nodes), len(network.arcs)
+    low, high = np.zeros((2, len(reach.upper), layout.size))
+    rate, valve = admissible.rate[:, when], admissible.valve[:, when]
     # no weighted mean exceeds the supremum: F ≤ r̄·x̄_p, and U ≤ ū; U ≥ u̲ only where nothing is ever cut
-    most = rates[1] * np.where(scheduled, 1.0, reached.upper[:, admissible.driver])
-    least = np.where(scheduled & reached.uncut, rates[0], 0.0)
-    most[:, admissible.lifetimes.leaving] = leaving
-    for i in layout.moments:
-        high[:, layout.stock(i) : layout.flow(i)] = reached.upper
-        high[:, layout.flow(i) : layout.valve(i)] = most
-        low[:, layout.flow(i) : layout.valve(i)] = least
-        high[:, layout.valve(i) :][:, : len(layout.valves)] = (reached.upper * valve[1])[:, layout.valves]
-    for piece in range(layout.pieces):
-        last = layout.end(piece)
-        high[:, last : last + len(network.stores)] = reached.upper[:, : len(network.stores)]
-        if layout.merged:
-            high[:, last : last + len(network.nodes)] = reached.upper
-            high[:, layout.end_flow(piece) :][:, : len(network.arcs)] = most
-            low[:, layout.end_flow(piece) :][:, : len(network.arcs)] = least
+    most = rate[1] * np.where(scheduled, 1.0, reach.upper[:, admissible.driver])
+    least = np.where(scheduled & reach.uncut, rate[0], 0.0)
+    most[:, admissible.lifetimes.leaving] = lifetime_flow
+    for stock, flow, through in zip(layout.stock, layout.flow, layout.valve, strict=True):
+        high[:, stock:flow] = reach.upper
+        high[:, flow:through], low[:, flow:through] = most, least
+        high[:, through:][:, : len(layout.valves)] = (reach.upper * valve[1])[:, layout.valves]
+    for end, end_flow in zip(layout.end, layout.end_flow, strict=True):
+        high[:, end : end + stores] = reach.upper[:, :stores]
+        if layout.has_end_flows:
+            high[:, end : end + nodes] = reach.upper
+            high[:, end_flow : end_flow + arcs], low[:, end_flow : end_flow + arcs] = most, least
     high[:, layout.level : layout.imbalance] = 1.0
     weights = network.objective.reference_interval * np.abs(network.sustainability * network.environmental)
     high[:, layout.imbalance] = most @ weights
-    low[:, layout.opening :], high[:, layout.opening :] = valve[:, :, layout.openings]
+    low[:, layout.free_valve :], high[:, layout.free_valve :] = valve[:, :, layout.free_valves]
     return low.ravel(), high.ravel()
-
-
-def measures(layout: Layout, low: Floats, rows: ProgramRows) -> None:
-    """Add low·level − q ≤ 0 for each service and ±Δ·σ_env·f̄ − imbalance ≤ 0; their keys are (1, …).
-
-    The level is at most min(1, q/low): a finite upper end of the band could only lower it further.
-    """
-    network, count = layout.network, len(layout.moments)
-    for s, service in enumerate(network.services):
-        row = rows.add(1, s)
-        rows.put(row, layout.level + s, low[s])  # level ≤ q/low; level ≤ 1 is a box
-        if service.quantity == "stock":
-            stages = network.stages if isinstance(network, StagedNetwork) else {}
-            for store in (store for each in service.providers for store in stages.get(each, (each,))):
-                rows.put(row, layout.end(-1) + network.node_index[store], -1.0)
-        else:
-            rows.put(row, layout.flow(layout.moment_column) + network.service_arcs(service), -1.0 / count)
-    weights = -network.circularity_weights[1]
-    counted = np.flatnonzero(weights)
-    row = rows.add(1, len(network.services), [0, 1])
-    for each, sign in zip(row, (1.0, -1.0), strict=True):
-        rows.put(each, layout.flow(layout.moment_column) + counted, sign * weights[counted] / count)
-    rows.put(row, layout.imbalance, -1.0)
 
 
 def circularity_weights(layout: Layout) -> Floats:
     """Return the weights of the mean of λ over an interval on its variables, shape (size,), mass."""
     network = layout.network
     weights = np.zeros(layout.size)
-    counted = network.circularity_weights.sum(axis=0)
+    by_arc = network.circularity_weights.sum(axis=0)
     if network.objective.net_zero == "abs":
-        counted = network.circularity_weights[0]
+        by_arc = network.circularity_weights[0]
         weights[layout.imbalance] = -1.0
-    for i in layout.moments:
-        weights[layout.flow(i) : layout.valve(i)] = counted / len(layout.moments)
+    for flow, through in zip(layout.flow, layout.valve, strict=True):
+        weights[flow:through] = by_arc / len(layout.moments)
     return weights
 
 

@@ -52,14 +52,14 @@ def _reached(admissible: Admissible, layout: Layout) -> NDArray[np.bool_]:
     found, driven = np.zeros(layout.size, dtype=bool), ~admissible.scheduled
     nodes, arcs = len(layout.network.nodes), len(layout.network.arcs)
     for i in layout.moments:
-        found[layout.stock(i) : layout.flow(i)] = True
-        found[layout.flow(i) : layout.valve(i)] = driven
-        found[layout.valve(i) :][: len(layout.valves)] = True
+        found[layout.stock[i] : layout.flow[i]] = True
+        found[layout.flow[i] : layout.valve[i]] = driven
+        found[layout.valve[i] :][: len(layout.valves)] = True
     for piece in range(layout.pieces):
-        found[layout.end(piece) :][: len(layout.network.stores)] = True
-        if layout.merged:
-            found[layout.end(piece) :][:nodes] = True
-            found[layout.end_flow(piece) :][:arcs] = driven
+        found[layout.end[piece] :][: len(layout.network.stores)] = True
+        if layout.has_end_flows:
+            found[layout.end[piece] :][:nodes] = True
+            found[layout.end_flow[piece] :][:arcs] = driven
     found[layout.imbalance] = True
     return found
 
@@ -117,14 +117,14 @@ def of_stocks(proven: Bound, programs: Programs) -> Floats:
     worth, tops = np.empty((steps, len(planned.stores))), [0, 0]
     for step in range(steps):
         # a stock s at the start stands on the left as B s, so a unit more lowers the right-hand side by B
-        blocks = programs.at_start(step)
+        blocks = programs.rows_at_start(step)
         worth[step] = sum(
             block.T @ multipliers[top : top + block.shape[0]]
             for block, multipliers, top in zip(blocks, (y, mu), tops, strict=True)
         )
         tops = [top + block.shape[0] for top, block in zip(tops, blocks, strict=True)]
     last = len(mu) - (0 if proven.min_service is None else len(planned.services))
-    for each in reversed(lifetimes.lived):
+    for each in reversed(lifetimes.passive):
         out = lifetimes.of_new(each, problem.layout)
         rows = out.shape[1]
         above, below = mu[last - 2 * rows : last - rows], mu[last - rows : last]

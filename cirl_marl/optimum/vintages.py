@@ -77,7 +77,7 @@ class Lifetimes:
         network: as it is given.
         planned: as the program has it.
         reached: as stocks are bounded, all lifetimes but fixed ones being chains.
-        lived: the lifetimes that nobody controls.
+        passive: the lifetimes that nobody controls.
     """
 
     def __init__(self, network: Network, acting: Sequence[str]) -> None:
@@ -92,7 +92,7 @@ class Lifetimes:
         rows = StateLayout(self._written)
         self.stocks = rows.nodes.stop
         neutral = network.control_bounds[1]
-        self.lived: list[PassiveLifetime] = []
+        self.passive: list[PassiveLifetime] = []
         for node in whole:
             assert node.lifetime is not None and isinstance(self.planned, StagedNetwork)
             place, chain, planned = network.node_index[node.id], node.lifetime.chain, self.planned
@@ -101,7 +101,7 @@ class Lifetimes:
                 rate = chain.rate / node.lifetime.mean / network.interval_means(node.stretch)
                 if node.control is not None:
                     rate = rate / neutral[network.control_rows[node.id].start]
-            self.lived.append(
+            self.passive.append(
                 PassiveLifetime(
                     node=node,
                     rows=rows.stages.get(place, np.array([place])),
@@ -119,13 +119,13 @@ class Lifetimes:
     @cached_property
     def leaving(self) -> Integers:
         """Arcs of the planned network that come out of lifetimes that nobody controls."""
-        return np.array([each.leaving for each in self.lived], dtype=np.intp)
+        return np.array([each.leaving for each in self.passive], dtype=np.intp)
 
     def pieces(self, degree: int, most: int) -> int:
         """Return the pieces of an interval, at most ``most``, in which stocks turn over once and kernels are smooth."""
         laws, interval = FlowLaws(self.planned), self.network.episode.control_interval
         turnover = laws.turnover.copy()
-        driven = [each for each in self.lived if len(each.rate)]
+        driven = [each for each in self.passive if len(each.rate)]
         for each in driven:
             turnover[self.planned.donors[each.leaving]] = 0.0
         pieces = max(1, math.ceil(interval * float(turnover.max(initial=0.0)) - 1e-9))
@@ -178,7 +178,7 @@ class Lifetimes:
         """
         blocks: list[Any] = [sparse.csr_array((0, layout.size * len(intervals)))]
         limits = [np.zeros(0)]
-        for each in self.lived:
+        for each in self.passive:
             write = self._of_line if each.node.lifetime is None or not len(each.rate) else self._of_chain
             matrix, to = write(each, layout, initial, intervals)
             blocks.append(matrix)
@@ -237,7 +237,7 @@ class Lifetimes:
 
 def _columns(each: PassiveLifetime, layout: Layout, steps: int) -> tuple[Integers, Integers]:
     """Return the columns of what leaves, shape (moments of all,), and of what enters, shape (moments of all, arcs)."""
-    moments = np.array([layout.flow(moment) for moment in layout.moments])
+    moments = layout.flow
     first = (layout.size * np.arange(steps)[:, None] + moments).ravel()
     return first + each.leaving, first[:, None] + each.entering
 

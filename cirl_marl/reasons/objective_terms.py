@@ -83,9 +83,9 @@ class LinearFunctional:
         count, stores = len(layout.moments), len(layout.network.stores)
         for moment in layout.moments:
             if self.flow is not None:
-                weights[:, layout.flow(moment) :][:, : self.flow.shape[1]] += self.flow / count
+                weights[:, layout.flow[moment] :][:, : self.flow.shape[1]] += self.flow / count
             if self.through is not None:
-                weights[:, layout.stock(moment) + stores :][:, : self.through.shape[1]] += self.through / count
+                weights[:, layout.stock[moment] + stores :][:, : self.through.shape[1]] += self.through / count
         if self.stock is not None:
             weights[:, layout.last] += self.stock @ lifetimes.totals
         if self.level is not None:

@@ -98,10 +98,10 @@ def shadow_prices(
     demand, room = np.zeros((steps, services)), np.zeros((2, steps, len(best.agents)))
     to_do, done = services + 2 * len(best.agents), 0
     for s in range(services):
-        step = DIFFERENCE * max(float(admissible.served[:, s].max()), 1.0)
-        served = admissible.served.copy()
+        step = DIFFERENCE * max(float(admissible.service_low[:, s].max()), 1.0)
+        served = admissible.service_low.copy()
         served[:, s] += step
-        demand[:, s] = _slope(best, admissible, replace(admissible, served=served)) / step
+        demand[:, s] = _slope(best, admissible, replace(admissible, service_low=served)) / step
         done += 1
         progress(0.5 + 0.5 * done / to_do)
     for a, agent in enumerate(best.agents):
