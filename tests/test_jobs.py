@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -87,6 +86,9 @@ def test_nobody_is_sent_for_what_is_claimed(tmp_path: Path, monkeypatch: pytest.
         def start(self, work: object) -> object:
             raise AssertionError("somebody was sent")
 
+        def close(self) -> None:
+            pass
+
     def watch(standings: Sequence[Standing]) -> None:
         if standings[0].state == "elsewhere" and lock.is_locked:
             jobs[0].file.write_text("by another")
@@ -95,6 +97,32 @@ def test_nobody_is_sent_for_what_is_claimed(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(driver, "place_of", lambda *_: Nowhere())
     assert run_jobs(jobs, tmp_path / "jobs", watch=watch) == []
     assert jobs[0].file.read_text() == "by another"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a.json", "[1, 2]"), ("a.json", "{"), ("a.json", '{"done": "half"}'), ("b.json", '"' * 10_000)],
+)
+def test_progress_that_no_job_told(name: str, content: str, tmp_path: Path) -> None:
+    """A file of somebody else's is refused, named, and cited briefly."""
+    (tmp_path / "jobs").mkdir()
+    (tmp_path / "jobs" / name).write_text(content)
+    with pytest.raises(RunError, match=rf"{name}: is not what a job told") as error:
+        raise_first(run_jobs(written(tmp_path), tmp_path / "jobs"))
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize("name", ["a.log", "a.json", ".a.lock", "below/link"])
+def test_links_are_not_followed(name: str, tmp_path: Path) -> None:
+    """What a link in the folder of jobs leads to is neither emptied nor written."""
+    outside, link = tmp_path / "outside", tmp_path / "jobs" / name
+    outside.write_text("precious")
+    link.parent.mkdir(parents=True)
+    link.symlink_to(outside)
+    with pytest.raises(RunError, match=rf"{name}: is a link"):
+        run_jobs(written(tmp_path), tmp_path / "jobs")
+    assert outside.read_text() == "precious"
+    assert not (tmp_path / "a.txt").exists()
 
 
 @pytest.mark.medium
@@ -179,7 +207,7 @@ def is_alive(process: int) -> bool:
             {"on": "local", "settings": {"slurm_partition": "long"}},
             "--slurm slurm_partition=long: goes with --on slurm",
         ),
-        ({"on": "slurm"}, r"--on slurm needs the package submitit, .* pip install 'cirl-marl\[slurm\]'"),
+        ({"on": "slurm", "settings": {"output": "x"}}, "--slurm output=x: is no setting that can be given"),
         ({"on": "ray"}, r"--on ray needs the package ray, .* pip install 'cirl-marl\[ray\]'"),
     ],
 )
@@ -195,56 +223,6 @@ def test_places_that_cannot_be(
     with pytest.raises(CirlError, match=message):
         run_jobs(written(tmp_path), tmp_path / "jobs", **options)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
-
-
-QUEUE = "3 at a time in the queue of Slurm"
-NO_QUEUE = "3 at a time on this machine, as there is no Slurm here (no sbatch): submitit runs them"
-
-
-def controller() -> str:
-    """Return why no job of Slurm can be done on this machine; empty if one can."""
-    if shutil.which("sbatch") is None:
-        return "no sbatch here"
-    asked = subprocess.run(["sinfo", "--noheader"], capture_output=True, check=False, timeout=60)
-    return "" if asked.returncode == 0 and asked.stdout else "sbatch is here, but no controller of Slurm answers sinfo"
-
-
-@pytest.mark.slow
-@installed("submitit")
-@pytest.mark.parametrize("said_of_the_place", [NO_QUEUE, QUEUE], ids=["without", "with"])
-def test_slurm_through_submitit(said_of_the_place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without Slurm it says that it is none, and does the same; what submitit does not take is refused."""
-    if said_of_the_place == NO_QUEUE:
-        (tmp_path / "bin").mkdir()
-        (tmp_path / "bin" / "tail").symlink_to(str(shutil.which("tail")))  # submitit's only command
-        monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-    elif lacking := controller():
-        pytest.skip(lacking)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(TESTS), str(TESTS.parent)]))
-    jobs = written(tmp_path, a="die", b="raise")
-    with pytest.raises(CirlError, match="--slurm slurm_partitoin=long: submitit says: "):
-        run_jobs(jobs, tmp_path / "jobs", on="slurm", settings={"slurm_partitoin": "long"})
-    said: list[str] = []
-    failures = run_jobs(jobs, tmp_path / "jobs", on="slurm", workers=3, say=said.append)
-    assert said == [said_of_the_place]
-    found = {each.name: each.said for each in failures}
-    assert found["b"] == "ValueError: paper is out"
-    assert found["a"].endswith(": the pen breaks")
-    assert jobs[2].is_done()
-    assert run_jobs(written(tmp_path), tmp_path / "jobs", on="slurm", settings={"timeout_min": "5"}) == []
-
-
-@pytest.mark.medium
-@installed("submitit")
-def test_a_queue_that_takes_no_jobs_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine may have the commands of Slurm and no controller: what sbatch says stands in one line."""
-    for name in ("sbatch", "srun", "sinfo"):
-        (tmp_path / name).write_text("#!/bin/sh\necho 'sbatch: fatal: no configuration source' >&2\nexit 1\n")
-        (tmp_path / name).chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    assert controller() == "sbatch is here, but no controller of Slurm answers sinfo"
-    with pytest.raises(CirlError, match=r"^--on slurm: sbatch: fatal: no configuration source$"):
-        run_jobs(written(tmp_path), tmp_path / "jobs", on="slurm")
 
 
 @pytest.mark.slow
@@ -293,6 +271,9 @@ def test_the_leave_to_import_goes_along(tmp_path: Path, monkeypatch: pytest.Monk
         def start(self, work: object) -> object:
             sent.append(work)
             raise KeyboardInterrupt
+
+        def close(self) -> None:
+            pass
 
     monkeypatch.setattr(driver, "place_of", lambda *_: Post())
     monkeypatch.chdir(tmp_path)

@@ -38,6 +38,12 @@ class Written:
             os.kill(os.getpid(), signal.SIGKILL)
         if self.does == "wait":
             time.sleep(60)
+        if self.does == "count":  # to 100 seconds, over several workers
+            counted = self.file.with_suffix(".counted")
+            for second in range(int(counted.read_text()) if counted.is_file() else 0, 100):
+                counted.write_text(str(second))
+                tell(f"counting {second // 10}", second, 100)
+                time.sleep(1)
         if self.does != "forget":
             self.file.write_text(str(len(begun.read_text().splitlines())))
 
@@ -45,3 +51,14 @@ class Written:
 def written(folder: Path, **does: str) -> list[Written]:
     """Return jobs ``a``, ``b`` and ``c``, of which some do other things first."""
     return [Written(name, folder / f"{name}.txt", does.get(name, "")) for name in "abc"]
+
+
+@dataclass(frozen=True)
+class Exploding:
+    """Leaves a file behind when somebody unpickles it."""
+
+    file: str
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Have the file made."""
+        return Path.touch, (Path(self.file),)

@@ -15,6 +15,7 @@ from cirl_marl.definitions.code_permission import is_code_allowed
 from cirl_marl.errors import CirlError, RunError
 from cirl_marl.jobs.places import Worker, Workplace, place_of
 from cirl_marl.jobs.work import Job, JobFiles, Work, do
+from cirl_marl.records.files import refuse_links
 
 JobState = Literal["waiting", "running", "elsewhere", "done", "failed"]
 POLL, WATCH = 0.1, 1.0
@@ -81,7 +82,7 @@ def run_jobs(
         folder: where logs, locks and what was told are kept.
         on: ``here`` (one after the other in this process), ``local``, ``slurm`` or ``ray``.
         workers: how many work at a time; None is all that the place has.
-        settings: of submitit, for ``slurm``.
+        settings: of ``sbatch``, for ``slurm``.
         watch: called with the standing of every job, about once a second.
         say: called with where the jobs are done.
 
@@ -90,8 +91,10 @@ def run_jobs(
 
     Raises:
         CirlError: if the place is unknown or cannot be used; nothing is begun then.
+        RunError: if a link stands in ``folder``, or a file there is not what jobs write.
         KeyboardInterrupt: after Ctrl-C; workers are told to stop, and what they save is kept.
     """
+    refuse_links(folder)
     place = place_of(on, folder, workers, settings or {})
     folder.mkdir(parents=True, exist_ok=True)
     if place is not None:
@@ -102,6 +105,8 @@ def run_jobs(
             time.sleep(POLL + EACH * driver.at_work)
     finally:
         driver.stop()
+        if place is not None:
+            place.close()
     return driver.failures
 
 

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cirl_marl.errors import CirlError, unknown
+from cirl_marl.jobs.slurm import Slurm, sbatch_options
 from cirl_marl.jobs.work import Work
 
-EXTRAS = {"submitit": "slurm", "ray": "ray"}
+EXTRAS = {"ray": "ray"}
 """Packages that a place needs, and the extra of this library that installs them."""
-MINUTES = 24 * 60
-"""Longest that a Slurm job may take unless something else is asked for; what is cut off goes on in another one."""
 
 
 class Worker(Protocol):
@@ -40,6 +39,9 @@ class Workplace(Protocol):
 
     def start(self, work: Work) -> Worker:
         """Have a job done."""
+
+    def close(self) -> None:
+        """Clear away what the place needed beside the jobs' own files."""
 
 
 def cores() -> int:
@@ -80,6 +82,9 @@ class Local:
         """Start a process."""
         return LocalProcess(work)
 
+    def close(self) -> None:
+        """Do nothing: a process leaves nothing behind."""
+
 
 def _in_process(work: Work) -> None:
     """Do a job in this process, which ends when the one that started it is gone."""
@@ -106,65 +111,6 @@ def _one_thread() -> Iterator[None]:
     finally:
         if not given:
             del os.environ["OMP_NUM_THREADS"]
-
-
-class SlurmJob:
-    """A worker in a job of Slurm."""
-
-    def __init__(self, job: Any) -> None:
-        """Follow a job of submitit."""
-        self._job = job
-
-    def ended(self) -> str | None:
-        """Say how the job ended, by what submitit knows of it."""
-        if not self._job.done():
-            return None
-        error = self._job.exception()
-        return "" if error is None else f"{self._job.state}: {_last_line(error)}"
-
-    def stop(self) -> None:
-        """Cancel it."""
-        self._job.cancel()
-
-
-class Slurm:
-    """The queue of Slurm, through submitit; where there is no Slurm, submitit starts processes on this machine."""
-
-    def __init__(self, folder: Path, workers: int | None, settings: Mapping[str, str]) -> None:
-        """Set up submitit, whose own files go to ``folder``, with ``settings`` by its own names.
-
-        Raises:
-            CirlError: if submitit is not installed, or does not take the settings.
-        """
-        submitit = self._submitit = _wanted("submitit")
-        self._executor = submitit.AutoExecutor(folder=folder / "slurm")
-        parameters = {"name": "cirl", "cpus_per_task": 1, "timeout_min": MINUTES}
-        try:
-            self._executor.update_parameters(
-                **parameters | {name: int(value) if value.isdigit() else value for name, value in settings.items()}
-            )
-        except (NameError, TypeError, ValueError) as error:
-            raise CirlError(f"--slurm {_settings(settings)}: submitit says: {_last_line(error)}") from error
-        real = self._executor.cluster == "slurm"
-        self.workers = workers or (2**31 if real else cores())
-        at_once = "all" if workers is None and real else f"{self.workers}"
-        self.said = f"{at_once} at a time in the queue of Slurm"
-        if not real:
-            self.said = (
-                f"{at_once} at a time on this machine, as there is no Slurm here (no sbatch): submitit runs them"
-            )
-
-    def start(self, work: Work) -> SlurmJob:
-        """Put a job into the queue.
-
-        Raises:
-            CirlError: if the queue does not take it, for instance as no controller answers.
-        """
-        with _one_thread():
-            try:
-                return SlurmJob(self._executor.submit(work))
-            except self._submitit.core.utils.FailedJobError as error:
-                raise CirlError(f"--on slurm: {_last_line(error)}") from error
 
 
 class RayTask:
@@ -214,6 +160,9 @@ class Ray:
         """Start a task in a process of its own."""
         return RayTask(self._ray, self._do.remote(work))
 
+    def close(self) -> None:
+        """Do nothing: the cluster is the user's, or ends with this process."""
+
 
 def _in_task(work: Work) -> bool:
     return work()
@@ -262,6 +211,8 @@ def check_place(on: str, workers: int | None = None, settings: Mapping[str, str]
         raise CirlError(f"workers must be at least 1, got {workers}")
     if on == "here" and workers not in (None, 1):
         raise CirlError(f"in this process there is one worker, not {workers}; use --on local")
+    if on == "slurm":
+        sbatch_options(settings or {})
     for package, extra in EXTRAS.items():
         if on == extra:
             _wanted(package)
@@ -271,7 +222,7 @@ def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, 
     """Return a place by its name; None is this process.
 
     Raises:
-        CirlError: if ``check_place`` refuses it, or submitit its settings, or there is no Ray where there should be.
+        CirlError: if ``check_place`` refuses it, Slurm its settings, or there is no Slurm or Ray where there should be.
     """
     check_place(on, workers, settings)
     makers: dict[str, Callable[[], Workplace]] = {

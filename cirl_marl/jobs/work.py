@@ -23,6 +23,8 @@ from cirl_marl.records.files import write_json
 
 APART = 1.0
 """Seconds between two reports of a job."""
+STOPPED = 75
+"""Exit code of a worker that was told to stop, and whose work goes on in another one."""
 
 
 class Tell(Protocol):
@@ -78,11 +80,20 @@ class JobFiles:
             return True
 
     def figures(self) -> dict[str, Any]:
-        """Return what was told last; empty if nothing was."""
+        """Return what was told last; empty if nothing was.
+
+        Raises:
+            RunError: if the file is something else than what a job tells.
+        """
         try:
-            found: dict[str, Any] = json.loads(self.told.read_text())
+            found = json.loads(self.told.read_text())
         except FileNotFoundError:
             return {}
+        except ValueError as error:
+            raise RunError(f"{self.told}: is not what a job told: {error}") from error
+        numbers = ("done", "total", "cpu_seconds")
+        if not isinstance(found, dict) or any(type(found.get(name, 0)) not in (int, float) for name in numbers):
+            raise RunError(f"{self.told}: is not what a job told: {found!r:.80}")
         return found
 
     def last_words(self) -> str:

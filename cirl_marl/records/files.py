@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from cirl_marl.errors import RunError
+
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` fill a temporary file, then put it in the place of ``path`` in one step."""
@@ -37,6 +39,20 @@ def sync(path: Path) -> None:
 def write_json(path: Path, value: object) -> None:
     """Write JSON atomically."""
     write_atomically(path, lambda temporary: temporary.write_text(json.dumps(value, indent=2) + "\n"))
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder in which, or below which, a link stands: nothing outside of it may be read or written.
+
+    Raises:
+        RunError: naming the link.
+    """
+    for parent, folders, files in os.walk(folder):
+        for path in (Path(parent) / name for name in (*folders, *files)):
+            if path.is_symlink():
+                raise RunError(
+                    f"{path}: is a link; nothing outside of {folder} is read or written, so put a copy there"
+                )
 
 
 @contextmanager

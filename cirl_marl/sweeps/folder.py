@@ -21,7 +21,7 @@ from typing import Any
 from filelock import FileLock
 
 from cirl_marl.errors import RunError
-from cirl_marl.records.files import write_atomically, write_json, write_table
+from cirl_marl.records.files import refuse_links, write_atomically, write_json, write_table
 from cirl_marl.sweeps.cells import Cell, CellJob
 from cirl_marl.sweeps.reading import SweepFile
 
@@ -47,6 +47,7 @@ class SweepFolder:
         if self.path.is_dir() and not self._asked.is_file() and any(self._strangers()):
             found = ", ".join(sorted(self._strangers())[:SHOWN])
             raise RunError(f"{self.path}: holds something else than a sweep ({found}); choose another folder")
+        refuse_links(self.path)
         now = self._described(asked, cells)
         self.path.mkdir(parents=True, exist_ok=True)
         with FileLock(self.path / ".asked.lock"):
