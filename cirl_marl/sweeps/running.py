@@ -64,7 +64,7 @@ def sweep(
         on: ``here``, ``local``, ``slurm`` or ``ray``.
         workers: how many cells at a time; None is as many as the place has.
         out: folder of the sweep; None is ``runs/sweep-NAME`` after the name of the file.
-        settings: of submitit, for ``slurm``.
+        settings: options of ``sbatch``, for ``slurm``.
         checkpoint_every: seconds after which a training is saved; None is a minute.
         watch: called with the standing of all cells, about once a second.
         say: called with where the cells are trained.
