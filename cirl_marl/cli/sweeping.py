@@ -48,9 +48,7 @@ def sweep(
     out: Annotated[Path | None, typer.Option(help="Folder of the sweep; default: runs/sweep-NAME.")] = None,
     slurm: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE", help="Option of sbatch, such as partition=long, or timeout_min=600; repeatable."
-        ),
+        typer.Option(metavar="NAME=VALUE", help="Of sbatch, such as partition=long or timeout_min=600; repeatable."),
     ] = None,
     checkpoint_every: Annotated[
         float | None, typer.Option(min=0, help="Seconds between checkpoints; 0: none by time.", show_default="60")
