@@ -219,18 +219,18 @@ def lone_seat(env: FreeEnv, agent: str) -> AgentVecEnv:
         step += 1
         seen, nothing = env.observation(agent, step), np.zeros(env.num_envs)
         paid = env.reward(agent, step).astype(np.float32)
-        seat.handed = StepResult(seen, paid, env.ended(step), seen, nothing, nothing.astype(int))
+        agent_env.last_step = StepResult(seen, paid, env.ended(step), seen, nothing, nothing.astype(int))
 
-    seat = AgentVecEnv(env, agent, OneAgent(env, agent), wait)
+    agent_env = AgentVecEnv(env, agent, OneAgent(env, agent), wait)
     ready = np.zeros(env.num_envs, dtype=np.float32), np.ones(env.num_envs, dtype=bool)
-    seat.handed = StepResult(env.observation(agent, 0), *ready)
-    return seat
+    agent_env.last_step = StepResult(env.observation(agent, 0), *ready)
+    return agent_env
 
 
 def learn_together(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weights]:
     """Let every agent learn for ``steps`` in lockstep; return the seconds it took, without set-up, and the weights."""
     world = NetworkWorld(env, range(env.num_envs))
-    learners = {agent: _built(seat, recipe, env) for agent, seat in world.seats.items()}
+    learners = {agent: _built(agent_env, recipe, env) for agent, agent_env in world.agent_envs.items()}
     everyone = [
         Participant(
             agent, _learning(learner, steps), learner.act, learner.streams, budget=partial(learner.budget, steps)
@@ -254,8 +254,8 @@ def learn_alone(env: FreeEnv, recipe: Recipe, steps: int) -> tuple[float, Weight
     return seconds, _weights(learners)
 
 
-def _built(seat: AgentVecEnv, recipe: Recipe, env: FreeEnv) -> Learner:
-    return Learner(seat, recipe.learner_of(seat.name, env.network), 0).build()
+def _built(agent_env: AgentVecEnv, recipe: Recipe, env: FreeEnv) -> Learner:
+    return Learner(agent_env, recipe.learner_of(agent_env.name, env.network), 0).build()
 
 
 def _learning(learner: Learner, steps: int) -> Callable[[], None]:

@@ -113,7 +113,10 @@ def _learnt(run: Path) -> Act:
     """Return what the learners of a run do, each for its own agent."""
     directory = RunDirectory(run)
     env = directory.make_env(1)
-    policies = {group.name: _policy(load_acting_learner(directory.chosen, group, env)) for group in directory.groups()}
+    policies = {
+        group.name: _policy(load_acting_learner(directory.acting_checkpoint, group, env))
+        for group in directory.groups()
+    }
     return lambda _env, _t, seen, _script: {agent: act(seen[agent]) for agent, act in policies.items()}
 
 

@@ -75,7 +75,7 @@ def mean_return(models: Mapping[str, BaseAlgorithm]) -> float:
         actions = {agent: models[agent].predict(seen[agent], deterministic=True)[0] for agent in copies.agents}
         seen, rewards, *_ = copies.step(actions)
         paid += sum(float(each.sum()) for each in rewards.values())
-        ended += int(copies.begun.sum())
+        ended += int(copies.new_episode.sum())
     return paid / ended
 
 

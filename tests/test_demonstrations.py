@@ -89,7 +89,7 @@ def test_buffer_holds_what_the_controller_did(scheme: str, controller: str) -> N
     seed = derived_seed(SEED, "demonstrations", controller)
     assert len(training.learners) == (3 if scheme == "independent" else 1)
     for name, learner in training.learners.items():
-        buffer, view = buffer_of(training, name), learner.seat.view
+        buffer, view = buffer_of(training, name), learner.agent_env.view
         groups = {group.name: group for group in training.config.recipe.groups(training.env.network, AGENTS)}
         expected = list(shown_by(named_controller(controller), seed, groups[name].view, 10))
         assert buffer.pos == len(expected) == 10
@@ -107,7 +107,7 @@ def test_last_observation_of_an_episode_is_exact_without_a_normaliser() -> None:
     """And is not the first of the next."""
     training = trained(recipe({"controller": "random", "steps": 20}, normalise=PLAIN), steps=20)
     seed = derived_seed(SEED, "demonstrations", "random")
-    buffer, view = buffer_of(training, "use"), training.learners["use"].seat.view
+    buffer, view = buffer_of(training, "use"), training.learners["use"].agent_env.view
     for t, (_, after, _, _, done) in enumerate(shown_by(named_controller("random"), seed, lambda env: view, 10)):
         np.testing.assert_array_equal(buffer.next_observations[t], after)
         assert not done or (buffer.observations[t + 1] != after).any()
@@ -161,13 +161,13 @@ def test_learner_without_a_buffer_imitates(algorithm: str, policy: str, paramete
         neutral.start(training.env, 0)
         wanted, found = neutral.act(observations), 0.0
         for name, learner in training.learners.items():
-            counted = learner.seat.num_envs if algorithm == "ARS" else 1
+            counted = learner.agent_env.num_envs if algorithm == "ARS" else 1
             assert learner.model.num_timesteps == steps * counted and learner.demonstrations == 0
             if isinstance(learner.model, ARS):
                 parameters_now = torch.nn.utils.parameters_to_vector(learner.model.policy.parameters())
                 assert learner.model.weights is not None and torch.equal(learner.model.weights, parameters_now)
             assert isinstance(learner.env, VecNormalize)
-            seen = learner.env.normalize_obs(learner.seat.view.observe(observations, training.env.state))
+            seen = learner.env.normalize_obs(learner.agent_env.view.observe(observations, training.env.state))
             action, _ = learner.model.predict(seen, deterministic=True)
             found = max(found, float(np.abs(action - wanted[name]).max()))
         far[steps] = found

@@ -155,19 +155,19 @@ def test_rows_of_a_seat_are_agents_in_copies() -> None:
     env = vector_env("copper_net", num_envs=2, horizon=3)
     by_hand = vector_env("copper_net", num_envs=2, horizon=3)
     world = NetworkWorld(env, [1, 2], {"all": SharedPolicy(env, env.agents).with_state(env)})
-    seat, count = world.seats["all"], len(env.agents)
+    agent_env, count = world.agent_envs["all"], len(env.agents)
     by_hand.reset(seed=[1, 2])
-    assert seat.get_attr("agent") == [agent for agent in env.agents for _ in range(2)]
-    assert seat.get_attr("index") == [0, 1] * count
+    assert agent_env.get_attr("agent") == [agent for agent in env.agents for _ in range(2)]
+    assert agent_env.get_attr("index") == [0, 1] * count
     seen: list[Any] = []
 
     def learn() -> None:
         for _ in range(3):
-            seen.append(seat.step(np.zeros((2 * count, 1), dtype=np.float32)))
+            seen.append(agent_env.step(np.zeros((2 * count, 1), dtype=np.float32)))
 
     def rest() -> None:
         while True:
-            seat.step(np.zeros((2 * count, 1), dtype=np.float32))
+            agent_env.step(np.zeros((2 * count, 1), dtype=np.float32))
 
     Lockstep([world], [Participant("all", learn, rest, Streams(0))]).run()
     returns = np.zeros(2 * count)
@@ -196,7 +196,7 @@ def central_critic() -> PPO:
     """Return PPO with a central critic on a toy view."""
     env = vector_env("carbo_net", num_envs=2)
     world = NetworkWorld(env, [0, 1], {"all": SharedPolicy(env, env.agents).with_state(env)})
-    return PPO(CentralCriticPolicy, world.seats["all"], seed=0, device="cpu", **SMALL)
+    return PPO(CentralCriticPolicy, world.agent_envs["all"], seed=0, device="cpu", **SMALL)
 
 
 def perturbed(model: PPO) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
@@ -286,7 +286,7 @@ def test_learners_share_by_match(tmp_path: Path) -> None:
     ]
     recipe = small(LearnerSettings(scheme="shared", algorithm="PPO", parameters=SMALL), match=matches)
     training = learnt("copper_net", recipe, directory=tmp_path / "run", horizon=8)
-    members = {name: learner.seat.view.agents for name, learner in training.learners.items()}
+    members = {name: learner.agent_env.view.agents for name, learner in training.learners.items()}
     assert set(members) == {"shared-learner-0", "shared-learner-2", "joint-learner", "mine"}
     assert sorted(a for agents in members.values() for a in agents) == sorted(training.env.agents)
     assert members["joint-learner"] == ("use_to_collection", "collection_to_sorting")
@@ -294,7 +294,7 @@ def test_learners_share_by_match(tmp_path: Path) -> None:
     assert all(agent in network.node_index for agent in members["shared-learner-2"])
     assert all(agent in network.arc_index for agent in members["shared-learner-0"])
     for name, learner in training.learners.items():
-        assert learner.model.num_timesteps == 64 * max(1, len(learner.seat.view.row_agents)), name
+        assert learner.model.num_timesteps == 64 * max(1, len(learner.agent_env.view.row_agents)), name
     controller, env = Trained(tmp_path / "run"), vector_env("copper_net", num_envs=2, horizon=8)
     assert np.isfinite(rollout(env, controller).episode_circularity).all()
 

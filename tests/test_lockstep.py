@@ -25,46 +25,51 @@ def make_world(agents: list[str] | None = None) -> NetworkWorld:
     return NetworkWorld(env, seeds=[11, 12, 13])
 
 
-def scripted(seat: AgentVecEnv, steps: int, seen: list[VecEnvStepReturn], value: float = 0.0) -> Callable[[], None]:
+def scripted(
+    agent_env: AgentVecEnv, steps: int, seen: list[VecEnvStepReturn], value: float = 0.0
+) -> Callable[[], None]:
     """Return a learner that takes a fixed action for some steps and notes what comes back."""
 
     def run() -> None:
-        seat.reset()
+        agent_env.reset()
         for _ in range(steps):
-            seen.append(seat.step(np.full((COPIES, 1), value, dtype=np.float32)))
+            seen.append(agent_env.step(np.full((COPIES, 1), value, dtype=np.float32)))
 
     return run
 
 
-def hold(seat: AgentVecEnv) -> Callable[[], None]:
+def hold(agent_env: AgentVecEnv) -> Callable[[], None]:
     """Return an actor that holds action 0 for ever."""
 
     def run() -> None:
         while True:
-            seat.step(np.zeros((COPIES, 1), dtype=np.float32))
+            agent_env.step(np.zeros((COPIES, 1), dtype=np.float32))
 
     return run
 
 
 def run_scripted(world: NetworkWorld, steps: dict[str, int], **options: Any) -> dict[str, list[VecEnvStepReturn]]:
     """Run scripted learners for the given numbers of steps."""
-    seen: dict[str, list[VecEnvStepReturn]] = {agent: [] for agent in world.seats}
-    learn = {agent: scripted(seat, steps[agent], seen[agent]) for agent, seat in world.seats.items()}
+    seen: dict[str, list[VecEnvStepReturn]] = {agent: [] for agent in world.agent_envs}
+    learn = {agent: scripted(agent_env, steps[agent], seen[agent]) for agent, agent_env in world.agent_envs.items()}
     Lockstep([world], participants(world, learn)).run(**options)
     return seen
 
 
 def participants(world: NetworkWorld, learn: dict[str, Callable[[], None]]) -> list[Participant]:
     """Return who learns by its own function, and holds action 0 after it."""
-    seats = world.seats.items()
-    return [Participant(seat.title, learn[a], hold(seat), Streams(i)) for i, (a, seat) in enumerate(seats)]
+    agent_envs = world.agent_envs.items()
+    return [
+        Participant(agent_env.title, learn[a], hold(agent_env), Streams(i))
+        for i, (a, agent_env) in enumerate(agent_envs)
+    ]
 
 
 def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
     """Every seat sees just what ``MultiAgentVectorEnv`` gives its agent, and the true last observation at the end."""
     world = make_world()
-    first = {agent: seat.handed.seen for agent, seat in world.seats.items()}
-    seen = run_scripted(world, dict.fromkeys(world.seats, HORIZON + 2))
+    first = {agent: agent_env.last_step.observation for agent, agent_env in world.agent_envs.items()}
+    seen = run_scripted(world, dict.fromkeys(world.agent_envs, HORIZON + 2))
     env = MultiAgentVectorEnv("copper_net", num_envs=COPIES, horizon=HORIZON)
     by_hand = env.reset(seed=[11, 12, 13])
     actions = {agent: np.zeros((COPIES, 1)) for agent in env.agents}
@@ -87,27 +92,29 @@ def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
 def test_copies_have_their_own_seeds() -> None:
     """SuperSuit's bridge gives all copies one stream; here no two copies start alike."""
     world = make_world()
-    starts = np.asarray(world.seats["use"].handed.seen)
+    starts = np.asarray(world.agent_envs["use"].last_step.observation)
     assert len(np.unique(starts[:, 0])) == COPIES
 
 
 def test_seeded_algorithm_can_be_built_on_a_seat() -> None:
     """With SuperSuit's bridge ``PPO(seed=…)`` raises; here it works and does not reseed the environment."""
     world = make_world()
-    before = np.asarray(world.seats["use"].handed.seen).copy()
+    before = np.asarray(world.agent_envs["use"].last_step.observation).copy()
     with Streams(0).active():
-        model = PPO("MlpPolicy", world.seats["use"], seed=3, device="cpu")
+        model = PPO("MlpPolicy", world.agent_envs["use"], seed=3, device="cpu")
     assert model.seed == 3
-    assert np.array_equal(np.asarray(world.seats["use"].handed.seen), before)
+    assert np.array_equal(np.asarray(world.agent_envs["use"].last_step.observation), before)
 
 
 def test_truncation_bootstraps() -> None:
     """SuperSuit's bridge never reports truncation; here PPO adds the value of the final observation."""
     world = make_world(["use"])
-    seat = world.seats["use"]
+    agent_env = world.agent_envs["use"]
     streams = Streams(0)
     with streams.active():
-        model = PPO("MlpPolicy", seat, n_steps=HORIZON, batch_size=HORIZON * COPIES, seed=0, device="cpu", gamma=0.9)
+        model = PPO(
+            "MlpPolicy", agent_env, n_steps=HORIZON, batch_size=HORIZON * COPIES, seed=0, device="cpu", gamma=0.9
+        )
     finals: list[np.ndarray] = []
     rewards: list[np.ndarray] = []
     values: list[np.ndarray] = []
@@ -130,9 +137,9 @@ def test_truncation_bootstraps() -> None:
     def hook(infos: Any, done: np.ndarray) -> None:
         if done.any():
             finals.append(infos["use"]["final_observation"].copy())
-            last.append(seat.paid()[0])
+            last.append(agent_env.rewards_and_dones()[0])
 
-    Lockstep([world], [Participant("use", learn, hold(seat), streams)]).run([hook])
+    Lockstep([world], [Participant("use", learn, hold(agent_env), streams)]).run([hook])
     assert np.allclose(rewards[0], last[0] + 0.9 * values[0], atol=1e-4)
     assert np.all(np.abs(values[0]) > 0.1)  # so that it would show if the value were not added
 
@@ -152,12 +159,12 @@ def test_failing_learner_is_named() -> None:
 
     def fails() -> None:
         for _ in range(4):
-            world.seats["mine"].step(np.zeros((COPIES, 1), dtype=np.float32))
+            world.agent_envs["mine"].step(np.zeros((COPIES, 1), dtype=np.float32))
         raise ValueError("exploded")
 
     def steady() -> None:
         try:
-            hold(world.seats["use"])()
+            hold(world.agent_envs["use"])()
         finally:
             ended.append("use")
 
@@ -190,17 +197,17 @@ def test_rewards_are_each_agents_own() -> None:
 def test_env_method_and_attributes_reach_the_agent() -> None:
     """HER calls ``env_method``; it reaches the agent's view of the chosen copies, and through it the environment."""
     world = make_world()
-    seat = world.seats["use"]
-    rewards = seat.env_method("local_reward", indices=[0, 2])
+    agent_env = world.agent_envs["use"]
+    rewards = agent_env.env_method("local_reward", indices=[0, 2])
     expected = world.env.local_rewards()["use"]
     assert rewards == [expected[0], expected[2]]
-    assert seat.get_attr("compartment")[0] is world.env.network.compartments["use"]
-    assert seat.get_attr("network", indices=1) == [world.env.network]
-    seat.set_attr("note", "here", indices=[1])
-    assert seat.get_attr("note", indices=[1]) == ["here"]
-    assert seat.env_is_wrapped(object) == [False] * COPIES
+    assert agent_env.get_attr("compartment")[0] is world.env.network.compartments["use"]
+    assert agent_env.get_attr("network", indices=1) == [world.env.network]
+    agent_env.set_attr("note", "here", indices=[1])
+    assert agent_env.get_attr("note", indices=[1]) == ["here"]
+    assert agent_env.env_is_wrapped(object) == [False] * COPIES
     with pytest.raises(AttributeError):
-        seat.env_method("no_such_method")
+        agent_env.env_method("no_such_method")
 
 
 @pytest.mark.parametrize("keep", [True, False])

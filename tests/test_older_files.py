@@ -93,7 +93,7 @@ def test_the_reasons_of_a_run_are_shown(tmp_path: Path) -> None:
     from cirl_marl.report.explanations import read_reasons
 
     run = RunDirectory(OLDER / "complete")
-    sections, missing = read_reasons(run, run.chosen.name)
+    sections, missing = read_reasons(run, run.acting_checkpoint.name)
     assert sections and not missing
 
 

@@ -108,17 +108,17 @@ def test_an_episode_reports_the_means_over_its_own_steps() -> None:
 def test_a_second_episode_has_a_return_of_its_own() -> None:
     """The return and the length that a learner is told are those of the episode that ended, and of no other."""
     world = NetworkWorld(MultiAgentVectorEnv("carbo_net", num_envs=2, horizon=4), seeds=[1, 2])
-    seen: dict[str, list[Any]] = {name: [] for name in world.seats}
+    seen: dict[str, list[Any]] = {name: [] for name in world.agent_envs}
 
     def learner(name: str, steps: int) -> None:
-        seat = world.seats[name]
-        seat.reset()
+        agent_env = world.agent_envs[name]
+        agent_env.reset()
         for step in range(steps):
-            seen[name].append(seat.step(np.full((2, 1), 0.5 * (-1) ** step, dtype=np.float32)))
+            seen[name].append(agent_env.step(np.full((2, 1), 0.5 * (-1) ** step, dtype=np.float32)))
 
     acting = [
         Participant(name, partial(learner, name, 12), partial(learner, name, 10**6), Streams(i))
-        for i, name in enumerate(world.seats)
+        for i, name in enumerate(world.agent_envs)
     ]
     Lockstep([world], acting).run()
     for told in seen.values():

@@ -85,7 +85,7 @@ def test_runs_without_a_checkpoint_are_begun_again_by_their_owner_only(bottles: 
     status = json.loads((run.path / "status.json").read_text())
     (run.path / "status.json").write_text(json.dumps(status | {"state": "running", "checkpoint": None}))
     kept = sorted(path.name for path in run.path.iterdir())
-    with run.claimed(), pytest.raises(RunError, match="is being trained"):
+    with run.lock(), pytest.raises(RunError, match="is being trained"):
         swept(bottles, tmp_path)
     assert sorted(path.name for path in run.path.iterdir()) == kept
     assert swept(bottles, tmp_path).points == found.points

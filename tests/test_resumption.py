@@ -143,7 +143,7 @@ def test_what_needs_its_past_does_not_go_on_without(tmp_path: Path) -> None:
 def test_a_run_is_trained_by_one_at_a_time(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """Neither do two trainings share a directory, nor the random streams of a process."""
     train("copper_net", ppo_recipe, agents=["mine", "use"], directory=tmp_path)
-    with RunDirectory(tmp_path).claimed(), pytest.raises(RunError, match="is being trained by another process"):
+    with RunDirectory(tmp_path).lock(), pytest.raises(RunError, match="is being trained by another process"):
         resume(tmp_path, steps=160)
     refused = []
 

@@ -56,7 +56,7 @@ def test_the_best_checkpoint_acts(tmp_path: Path, demanded: float | None) -> Non
     best = max(range(8), key=lambda i: scores[i].rank(demanded))
     status = run.status["best"]
     assert status["joint_steps"] == rows[best]["joint_step"]
-    assert run.chosen.name == status["checkpoint"] == f"{6 * (best + 1):09d}-best"
+    assert run.acting_checkpoint.name == status["checkpoint"] == f"{6 * (best + 1):09d}-best"
     assert max(i for i in range(8) if rows[i]["best"]) == best
     env = MultiAgentVectorEnv("copper_net", num_envs=3, horizon=HORIZON, reward="team")
     again = rollout(env, Trained(run), seed=FIRST_SEED)
@@ -69,9 +69,9 @@ def test_the_best_checkpoint_acts(tmp_path: Path, demanded: float | None) -> Non
     said = acting_checkpoint(run)
     assert f"after {12 * (best + 1)} environment steps, the best of 8 evaluations" in said
     assert ("none assured the service of 1" in said) == (demanded == 1.0)
-    assert compare([run], ("neutral",), episodes=2, bounds=False).entries[0].checkpoint == run.chosen.name
+    assert compare([run], ("neutral",), episodes=2, bounds=False).entries[0].checkpoint == run.acting_checkpoint.name
     names = {path.name for path in (run.path / "checkpoints").iterdir()}
-    assert names == {run.chosen.name, run.checkpoint.name}
+    assert names == {run.acting_checkpoint.name, run.checkpoint.name}
 
 
 @given(
@@ -81,18 +81,20 @@ def test_service_comes_first(figures: list[tuple[float, float, float]], demanded
     """No score that falls short is above one that does not; among those that serve, λ̄ decides, else the level."""
     scores = [Score(circularity, assured, assured, paid) for circularity, assured, paid in figures]
     best = max(scores, key=lambda score: score.rank(demanded))
-    serving = [score for score in scores if score.assured >= demanded]
+    serving = [score for score in scores if score.service_bound >= demanded]
     if serving:
         assert best in serving and best.circularity == max(score.circularity for score in serving)
     else:
-        assert best.assured == max(score.assured for score in scores)
-    assert max(scores, key=lambda score: score.rank(None)).paid == max(score.paid for score in scores)
+        assert best.service_bound == max(score.service_bound for score in scores)
+    assert max(scores, key=lambda score: score.rank(None)).episode_return == max(
+        score.episode_return for score in scores
+    )
 
 
 def test_without_evaluations_the_last_checkpoint_acts(tmp_path: Path) -> None:
     """And the same is learnt: evaluating changes nothing."""
     run, other = learnt(tmp_path / "a", recipe(evaluations=0)), learnt(tmp_path / "b", recipe())
-    assert run.chosen == run.checkpoint
+    assert run.acting_checkpoint == run.checkpoint
     assert acting_checkpoint(run) == "who acts: the last checkpoint, after 96 environment steps"
     assert not evaluations(run)
     kept = list(run.checkpoint.glob("*"))
@@ -111,7 +113,7 @@ def test_the_best_survives_a_resumption(tmp_path: Path) -> None:
     assert len({row["joint_step"] for row in after}) == len(after)
     scores = {row["joint_step"]: Score(row["circularity"], 0.0, row["assured"], row["paid"]) for row in after}
     assert run.status["best"]["joint_steps"] == max(scores, key=lambda step: scores[step].rank(1.0))
-    assert scores[best["joint_steps"]].assured == pytest.approx(best["figures"]["assured"])
+    assert scores[best["joint_steps"]].service_bound == pytest.approx(best["figures"]["assured"])
 
 
 @pytest.mark.parametrize("best", [3, {"checkpoint": 4, "joint_steps": 1, "figures": {}}, {"checkpoint": "x"}])
@@ -122,10 +124,10 @@ def test_a_status_of_something_else_is_refused(tmp_path: Path, best: object) -> 
     status = json.loads(path.read_text())
     del status["best"]
     path.write_text(json.dumps(status))
-    assert run.chosen == run.checkpoint
+    assert run.acting_checkpoint == run.checkpoint
     path.write_text(json.dumps(status | {"best": best}))
     with pytest.raises(RunError, match="is not the status of a run"):
-        assert run.chosen
+        assert run.acting_checkpoint
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.7])
@@ -134,8 +136,8 @@ def test_the_price_moves_by_what_lacks(assured: float, step: float, damping: flo
     """In closed form, at once in what is paid, and never without end."""
     env = MultiAgentVectorEnv("copper_net", num_envs=2, reward="team", circularity="mean", circularity_weight=0.8)
     price = ServiceMultiplier(env, 0.99, 0.2, damping)
-    price.heed(0.0)
-    price.heed(assured)
+    price.update(0.0)
+    price.update(assured)
     weight = env.circularity_weight
     moved = 0.2 + step + damping * step / 0.2
     assert np.log((1 - weight) / weight) == pytest.approx(np.log(0.25) + max(moved, 0.0))
@@ -146,7 +148,7 @@ def test_the_price_moves_by_what_lacks(assured: float, step: float, damping: flo
     paid = weight * outcome.circularity_mean / objective.circularity_scale - (1 - weight) * short
     np.testing.assert_allclose(outcome.reward[0], paid, rtol=1e-9)
     for _ in range(2000):
-        price.heed(assured)
+        price.update(assured)
     ends = {0.2: LARGEST_MULTIPLIER, 0.1: LARGEST_MULTIPLIER, 0.0: 0.25 * np.exp(0.2)}
     end = ends.get(step, 0.25)  # it falls to what it was at first
     weight = env.circularity_weight

@@ -114,7 +114,7 @@ def test_a_rollout_and_its_updates_are_those_of_the_library(case: str) -> None:
 def test_unequal_observations_and_actions_stack() -> None:
     """A robot with four inputs beside a truck and a furnace with one: padding changes nothing."""
     lockstep, stacked = both(recipe(parameters=PPO_SMALL), "solids_net", reward="mixed")
-    assert len({each.seat.action_space.shape for each in stacked.learners.values()}) > 1
+    assert len({each.agent_env.action_space.shape for each in stacked.learners.values()}) > 1
     assert_same(lockstep, stacked)
 
 
@@ -259,7 +259,7 @@ def test_what_is_kept_is_an_ordinary_model(tmp_path: Path) -> None:
     assert further.learners["use"].model.num_timesteps == 80
     config = RunDirectory(run).config
     changed = config.recipe.model_copy(update={"run": config.recipe.run.model_copy(update={"engine": "lockstep"})})
-    RunDirectory(run).go_on(config.model_copy(update={"recipe": changed}), RunDirectory(run).checkpoint)
+    RunDirectory(run).reopen(config.model_copy(update={"recipe": changed}), RunDirectory(run).checkpoint)
     RunDirectory(run).set_status("complete", 40, RunDirectory(run).status["checkpoint"])
     assert resume(run, steps=120).learners["use"].model.num_timesteps == 120
 

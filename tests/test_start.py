@@ -131,7 +131,7 @@ def test_start_is_the_best_checkpoint(tmp_path: Path) -> None:
     chosen = asked.model_copy(update={"run": asked.run.model_copy(update={"evaluations": 6, "episodes": 2})})
     train("copper_net", chosen, directory=tmp_path / "first", **OPTIONS)
     found = prepare("copper_net", recipe(**from_run(tmp_path / "first")), **OPTIONS)
-    folder = RunDirectory(tmp_path / "first").chosen
+    folder = RunDirectory(tmp_path / "first").acting_checkpoint
     assert folder.name.endswith("-best") and found.config.origins["use"].checkpoint == folder.name
     source = RunDirectory(tmp_path / "first")
     group = next(each for each in source.groups() if each.name == "use")

@@ -58,19 +58,19 @@ def test_three_defects_of_the_vector_bridge_are_not_ours() -> None:
     assert not any("TimeLimit.truncated" in info for info in infos)
 
     ours = NetworkWorld(MultiAgentVectorEnv("copper_net", num_envs=2, agents=AGENTS, horizon=4), seeds=[1, 2])
-    seat = ours.seats["refinery"]
-    mine = np.asarray(seat.handed.seen)
+    agent_env = ours.agent_envs["refinery"]
+    mine = np.asarray(agent_env.last_step.observation)
     assert not np.array_equal(mine[0], mine[1])
     with Streams(0).active():
-        assert PPO("MlpPolicy", seat, seed=1, device="cpu").seed == 1
+        assert PPO("MlpPolicy", agent_env, seed=1, device="cpu").seed == 1
     seen: list[list[dict[str, Any]]] = []
 
     def learn() -> None:
         for _ in range(4):
-            seen.append(seat.step(np.zeros((2, 1), dtype=np.float32))[3])
+            seen.append(agent_env.step(np.zeros((2, 1), dtype=np.float32))[3])
 
     def rest() -> None:
-        other = ours.seats["mine"]
+        other = ours.agent_envs["mine"]
         while True:
             other.step(np.zeros((2, 1), dtype=np.float32))
 

@@ -100,7 +100,7 @@ def test_weights_are_those_of_learning_alone() -> None:
         whole = alone(agent, 1, 5, made, lone)
         assert len(kept[agent].kept) > 5
         assert all(torch.equal(ours, theirs) for ours, theirs in zip(kept[agent].kept, lone.kept, strict=False)), agent
-        if getattr(team.world.seats[agent], "missed_steps"):  # noqa: B009 (poles fall while others go on)
+        if getattr(team.world.agent_envs[agent], "missed_steps"):  # noqa: B009 (poles fall while others go on)
             assert agent in ("walker", "jumper")
             assert made < 150
         else:
@@ -186,7 +186,7 @@ def test_absent_rows_are_not_learnt(algorithm: Any) -> None:
         }
         assert set(learnt) <= acted
         assert len(learnt) > 0.7 * len(acted)  # but for the last rollout, which is not over
-    early = team.world.seats["early"]
+    early = team.world.agent_envs["early"]
     assert early.absent == (not getattr(early, "present").any())  # noqa: B009
 
 

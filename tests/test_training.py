@@ -173,7 +173,7 @@ class Alone(AgentVecEnv):
         """Seat the only agent of ``env``."""
         self.joint = env
         super().__init__(env, env.agents[0], OneAgent(env, env.agents[0]), lambda: None)
-        self.show(env.reset(seed=seeds), env.state)
+        self.receive_reset(env.reset(seed=seeds), env.state)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step the environment."""
@@ -197,8 +197,8 @@ def test_lockstep_equals_plain_learning_where_agents_do_not_meet(ppo_recipe: Rec
 
     env = MultiAgentVectorEnv(two_chains(), num_envs=2, reward="local", agents=["a"])
     parameters = ppo_recipe.learner.parameters
-    seat = Alone(env, [derived_seed(3, "copies", i) for i in range(2)])
-    model = PPO("MlpPolicy", VecNormalize(seat, gamma=0.99), seed=derived_seed(3, "a"), device="cpu", **parameters)
+    agent_env = Alone(env, [derived_seed(3, "copies", i) for i in range(2)])
+    model = PPO("MlpPolicy", VecNormalize(agent_env, gamma=0.99), seed=derived_seed(3, "a"), device="cpu", **parameters)
     model.learn(80)
     assert_same(lone, {f"a.{name}": value for name, value in model.policy.state_dict().items()})
 

@@ -91,7 +91,8 @@ def _run(run: RunDirectory) -> dict[str, Any]:
         "network_sha256": _hash(run.definition.read_bytes()),
         "data_sha256": config.data_sha256,
         "policies_sha256": {
-            group.name: _hash((run.chosen / f"{group.name}.safetensors").read_bytes()) for group in run.groups()
+            group.name: _hash((run.acting_checkpoint / f"{group.name}.safetensors").read_bytes())
+            for group in run.groups()
         },
     }
 

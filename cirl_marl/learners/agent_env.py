@@ -1,10 +1,10 @@
-"""Where one learner sits: its view of the joint environment, as a Stable-Baselines3 ``VecEnv``."""
+"""The environment of one agent: the joint environment as its learner sees it, a ``VecEnv`` of Stable-Baselines3."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,29 +40,37 @@ class JointEnv(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """What a learner is handed after a joint step, one row for each row of its view.
+    """The outcome of a joint step for one learner, one row for each row of its view.
 
     Attributes:
-        seen: the observation that it acts on next.
+        observation: on which it acts next.
         rewards: of the step.
-        ended: rows whose episode ended with it; all of them at a reset, after which episodes begin as well.
-        final: what was seen last in these, anything in others; None if none ended.
-        returns: sum of the rewards of the episodes that ended, anything in others.
-        lengths: steps of these.
-        truncated: rows whose episode a time limit ended; None if it was this wherever one ended.
+        dones: rows whose episode ended with it; all of them at a reset, after which episodes begin as well.
+        final_observation: the last one of the episodes that ended, anything in other rows; None if none ended.
+        returns: sum of the rewards of the episodes that ended, anything in other rows.
+        lengths: steps of these episodes.
+        truncated: rows whose episode a time limit ended; None if a time limit ended all of them.
     """
 
-    seen: ObservedRows
+    NAMES_IN_FILES: ClassVar = {"observation": "seen", "dones": "ended", "final_observation": "final"}
+
+    observation: ObservedRows
     rewards: NDArray[np.float32]
-    ended: NDArray[np.bool_]
-    final: ObservedRows | None = None
+    dones: NDArray[np.bool_]
+    final_observation: ObservedRows | None = None
     returns: Floats | None = None
     lengths: NDArray[np.integer] | None = None
     truncated: NDArray[np.bool_] | None = None
 
-    def told(self) -> dict[str, Any]:
-        """Return the parts by name."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+    def state_dict(self) -> dict[str, Any]:
+        """Return the parts by their names in files."""
+        return {self.NAMES_IN_FILES.get(name, name): getattr(self, name) for name in self.__slots__}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> StepResult:
+        """Return what ``state_dict`` was taken of."""
+        names = {written: name for name, written in cls.NAMES_IN_FILES.items()}
+        return cls(**{names.get(key, key): value for key, value in state.items()})
 
 
 _NO_STEP = StepResult(np.zeros(0), np.zeros(0, dtype=np.float32), np.zeros(0, dtype=bool))
@@ -71,13 +79,13 @@ _NO_STEP = StepResult(np.zeros(0), np.zeros(0, dtype=np.float32), np.zeros(0, dt
 
 @dataclass(frozen=True, slots=True)
 class JointStep:
-    """What a joint step brought.
+    """The outcome of a joint step for all agents.
 
     Attributes:
         observations: of each agent, of the episodes that begin where one ended.
         state: returns the state of the environment for critics.
         rewards: of this step by agent, shape (B,).
-        ended: the copies in which the agent's episode ended, by agent, shape (B,).
+        dones: the copies in which the agent's episode ended, by agent, shape (B,).
         truncated: those in which a time limit ended it, likewise.
         returns: of the episodes so far by agent, shape (B,).
         lengths: of the episodes so far, likewise.
@@ -87,7 +95,7 @@ class JointStep:
     observations: Arrays
     state: Callable[[], Floats]
     rewards: Mapping[str, Floats]
-    ended: Mapping[str, NDArray[np.bool_]]
+    dones: Mapping[str, NDArray[np.bool_]]
     truncated: Mapping[str, NDArray[np.bool_]]
     returns: Mapping[str, Floats]
     lengths: Mapping[str, NDArray[np.integer]]
@@ -121,7 +129,7 @@ class AgentInNetworkCopy:
 
 
 class AgentVecEnv(VecEnv):
-    """The B copies of the joint environment as one learner sees them.
+    """The B copies of the joint environment as one learner sees them; its ``step`` waits for all other learners.
 
     Time limits reach the learner as Stable-Baselines3 expects them: ``done`` with ``TimeLimit.truncated`` (unless
     nothing counts for it beyond the episode) and the true last observation in ``terminal_observation``. A ``reset``
@@ -129,8 +137,8 @@ class AgentVecEnv(VecEnv):
 
     Attributes:
         name: of the learner; an independent learner has its agent's.
-        handed: what it was handed last.
-        action: what it last did.
+        last_step: the outcome of the last joint step.
+        action: its last one.
         bootstrap: whether time limits are reported as truncations, after which the learner expects more to come.
     """
 
@@ -142,12 +150,12 @@ class AgentVecEnv(VecEnv):
         wait: Callable[[], object],
         row: Callable[..., Any] = AgentInNetworkCopy,
     ) -> None:
-        """Seat the learner ``name``; ``wait`` returns when every learner has acted and the environment has moved.
+        """Show ``env`` by ``view``; ``wait`` returns when every learner has acted and the environment has moved.
 
-        ``row`` returns what attributes of a row are those of, from the environment, the copy and the agent.
+        ``row`` makes the environment of one row, which ``env_method`` and ``get_attr`` reach: of copy and agent.
         """
         self.name, self.view, self.copies = name, view, env.num_envs
-        self.handed: StepResult = _NO_STEP
+        self.last_step: StepResult = _NO_STEP
         self.action: NDArray[np.float32] | None = None
         self.bootstrap = True
         self.views = [row(env, i, agent) for agent in view.row_agents or (None,) for i in range(self.copies)]
@@ -159,41 +167,41 @@ class AgentVecEnv(VecEnv):
         """What messages call the learner."""
         return f"agent '{self.name}'" if self.view.agents == (self.name,) else f"learner '{self.name}'"
 
-    def show(self, observations: Arrays, state: Callable[[], Floats]) -> None:
-        """Show the first observation after a reset of the joint environment."""
+    def receive_reset(self, observations: Arrays, state: Callable[[], Floats]) -> None:
+        """Take over the first observation after a reset of the joint environment."""
         rows = self.num_envs
-        seen = _rows_in_order(self.view.observe(observations, state))
-        self.handed = StepResult(seen, np.zeros(rows, dtype=np.float32), np.ones(rows, dtype=bool))
+        first = _rows_in_order(self.view.observe(observations, state))
+        self.last_step = StepResult(first, np.zeros(rows, dtype=np.float32), np.ones(rows, dtype=bool))
 
     @property
     def absent(self) -> bool:
         """Whether none of its rows has anybody who acts next, so that the learner is not asked."""
         return False
 
-    def hand(self, step: JointStep) -> None:
-        """Hand over what the joint step brought."""
+    def receive_step(self, step: JointStep) -> None:
+        """Take over the outcome of a joint step."""
         agents, rows = self.view.agents, self.view.row_agents or self.view.agents[:1]
-        seen = _rows_in_order(self.view.observe(step.observations, step.state))
+        observation = _rows_in_order(self.view.observe(step.observations, step.state))
         rewards = self.view.score(step.rewards).astype(np.float32)
-        ended = np.concatenate([step.ended[agent] for agent in rows])
-        if not ended.any():
-            self.handed = StepResult(seen, rewards, ended)
+        dones = np.concatenate([step.dones[agent] for agent in rows])
+        if not dones.any():
+            self.last_step = StepResult(observation, rewards, dones)
             return
-        last = {agent: step.infos[agent]["final_observation"] for agent in agents}
-        final = _rows_in_order(self.view.observe(last, lambda: step.infos[agents[0]]["final_state"]))
+        final_by_agent = {agent: step.infos[agent]["final_observation"] for agent in agents}
+        final = _rows_in_order(self.view.observe(final_by_agent, lambda: step.infos[agents[0]]["final_state"]))
         returns, lengths = self.view.score(step.returns), np.concatenate([step.lengths[agent] for agent in rows])
         truncated = np.concatenate([step.truncated[agent] for agent in rows])
-        self.handed = StepResult(seen, rewards, ended, final, returns, lengths, truncated)
+        self.last_step = StepResult(observation, rewards, dones, final, returns, lengths, truncated)
 
-    def paid(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Return the reward of each row, and whether its episode ended; arrays of its own, which PPO adds to."""
-        return self.handed.rewards.copy(), self.handed.ended.copy()
+    def rewards_and_dones(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Return the reward of each row, and whether its episode ended; copies, as PPO adds to rewards in place."""
+        return self.last_step.rewards.copy(), self.last_step.dones.copy()
 
     def reset(self) -> VecEnvObs:
         """Return the current observation of every copy."""
-        if self.handed is _NO_STEP:
-            raise CirlError(f"the seat of {self.title} has no observation: the joint environment is not reset")
-        return self.handed.seen
+        if self.last_step is _NO_STEP:
+            raise CirlError(f"the environment of {self.title} has no observation: the joint environment is not reset")
+        return self.last_step.observation
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Keep the actions, one row for each row of the view, for the next joint step."""
@@ -202,21 +210,21 @@ class AgentVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Wait until every learner has handed in its actions and the joint environment has moved."""
         self._wait()
-        rewards, ended = self.paid()
+        rewards, dones = self.rewards_and_dones()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        now = self.handed
-        if now.final is not None and now.returns is not None and now.lengths is not None:
-            for row in np.flatnonzero(ended):
-                limited = now.truncated is None or bool(now.truncated[row])
+        now = self.last_step
+        if now.final_observation is not None and now.returns is not None and now.lengths is not None:
+            for row in np.flatnonzero(dones):
+                out_of_time = now.truncated is None or bool(now.truncated[row])
                 infos[row] = {
-                    "TimeLimit.truncated": self.bootstrap and limited,
-                    "terminal_observation": _row(now.final, int(row)),
+                    "TimeLimit.truncated": self.bootstrap and out_of_time,
+                    "terminal_observation": _row(now.final_observation, int(row)),
                     "episode": {"r": float(now.returns[row]), "l": int(now.lengths[row]), "t": 0.0},
                 }
-        return self.reset(), rewards, ended, infos
+        return self.reset(), rewards, dones, infos
 
     def close(self) -> None:
-        """Do nothing: the joint environment is not the seat's to close."""
+        """Do nothing: the joint environment is not one agent's to close."""
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Do nothing: every copy of the joint environment has its own seed already."""
@@ -224,29 +232,29 @@ class AgentVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Return an attribute of the given rows' views."""
-        return [getattr(view, attr_name) for view in self._chosen(indices)]
+        return [getattr(view, attr_name) for view in self._envs_at(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Set an attribute of the given rows' views."""
-        for view in self._chosen(indices):
+        for view in self._envs_at(indices):
             setattr(view, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of the given rows' views."""
-        return [getattr(view, method_name)(*method_args, **method_kwargs) for view in self._chosen(indices)]
+        return [getattr(view, method_name)(*method_args, **method_kwargs) for view in self._envs_at(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:
         """Return False for each row: no Gymnasium wrapper is involved."""
-        return [False for _ in self._chosen(indices)]
+        return [False for _ in self._envs_at(indices)]
 
-    def _chosen(self, indices: int | Iterable[int] | None) -> list[AgentInNetworkCopy]:
+    def _envs_at(self, indices: int | Iterable[int] | None) -> list[AgentInNetworkCopy]:
         return [self.views[i] for i in self._get_indices(indices)]
 
 
 def _rows_in_order(observation: ObservedRows) -> ObservedRows:
-    """Return it row after row in memory, as it is when it has been kept; products of others round differently."""
+    """Return an observation in C order, as replayed ones are: matrix products of other layouts round differently."""
     if isinstance(observation, dict):
         return {key: np.ascontiguousarray(value) for key, value in observation.items()}
     return np.ascontiguousarray(observation)
@@ -255,5 +263,5 @@ def _rows_in_order(observation: ObservedRows) -> ObservedRows:
 def _row(observation: ObservedRows, row: int) -> ObservedRows:
     if isinstance(observation, dict):
         return {key: value[row].copy() for key, value in observation.items()}
-    own: NDArray[np.floating] = observation[row].copy()
-    return own
+    part: NDArray[np.floating] = observation[row].copy()
+    return part

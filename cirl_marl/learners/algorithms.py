@@ -31,7 +31,7 @@ DISCRETE = ("DQN", "QRDQN", "MaskablePPO")
 POLICIES: Mapping[str, type[BasePolicy]] = {CENTRAL_CRITIC: CentralCriticPolicy}
 """Policies that Stable-Baselines3 has no name for."""
 
-RESERVED = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "device", "_init_setup_model")
+RESERVED_PARAMETERS = ("self", "env", "seed", "policy", "tensorboard_log", "verbose", "device", "_init_setup_model")
 BOUNDS = {
     **dict.fromkeys(("gamma", "gae_lambda", "tau"), (0.0, 1.0)),
     **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "n_delta"), (1.0, math.inf)),
@@ -47,17 +47,17 @@ NOISES: Mapping[str, type[ActionNoise]] = {
 
 def every_algorithm() -> dict[str, type[BaseAlgorithm]]:
     """Return every algorithm that the installed packages export, by class name."""
-    exported = {name: getattr(module, name) for module in (stable_baselines3, sb3_contrib) for name in module.__all__}
+    classes = {name: getattr(module, name) for module in (stable_baselines3, sb3_contrib) for name in module.__all__}
     return {
-        name: found
-        for name, found in sorted(exported.items())
-        if isinstance(found, type) and issubclass(found, BaseAlgorithm)
+        name: kind
+        for name, kind in sorted(classes.items())
+        if isinstance(kind, type) and issubclass(kind, BaseAlgorithm)
     }
 
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:
     """Return those for continuous actions, which compartments have."""
-    return {name: found for name, found in every_algorithm().items() if name not in DISCRETE}
+    return {name: kind for name, kind in every_algorithm().items() if name not in DISCRETE}
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
@@ -66,25 +66,25 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     >>> algorithm_class("PPO").__name__
     'PPO'
     """
-    known = every_algorithm()
-    if name not in known:
-        raise RecipeError(f"algorithm: {unknown('algorithm', name, known)}")
-    return known[name]
+    classes = every_algorithm()
+    if name not in classes:
+        raise RecipeError(f"algorithm: {unknown('algorithm', name, classes)}")
+    return classes[name]
 
 
 def parameters_of(name: str) -> dict[str, inspect.Parameter]:
     """Return the constructor parameters that a recipe may set."""
     parameters = inspect.signature(algorithm_class(name).__init__).parameters
-    return {key: parameter for key, parameter in parameters.items() if key not in RESERVED}
+    return {key: parameter for key, parameter in parameters.items() if key not in RESERVED_PARAMETERS}
 
 
 def algorithm_mistakes(name: str, policy: str, parameters: Mapping[str, Any]) -> Iterator[str]:
     """Yield what is wrong with an algorithm, its policy and its parameters: key, value and what would do."""
-    known = algorithms()
-    if name not in known:
-        yield f"algorithm: {unknown('algorithm', name, known)}"
+    classes = algorithms()
+    if name not in classes:
+        yield f"algorithm: {unknown('algorithm', name, classes)}"
         return
-    aliases = known[name].policy_aliases
+    aliases = classes[name].policy_aliases
     fit = [alias for alias in aliases if not alias.startswith(("Cnn", "MultiInput"))]
     if aliases.get("MultiInputPolicy") is MultiInputActorCriticPolicy:
         fit.append(CENTRAL_CRITIC)
@@ -99,18 +99,18 @@ def parameter_mistakes(name: str, parameters: Mapping[str, Any]) -> Iterator[str
     Stable-Baselines3 checks ``policy_kwargs`` when it is constructed, but few others: an entropy coefficient that is a
     text fails in the middle of a training, a discount of 1.5 or a batch of 0 never does.
     """
-    known = parameters_of(name)
+    signature = parameters_of(name)
     for key, value in parameters.items():
         place = f"parameters.{key}"
-        if key not in known:
-            yield f"parameters: {unknown(f'parameter of {name}', key, known)}"
+        if key not in signature:
+            yield f"parameters: {unknown(f'parameter of {name}', key, signature)}"
         elif infinite := list(_not_finite(place, value)):
             yield from infinite
-        elif not _takes(known[key], value):
-            if key in WRITTEN:
-                yield from WRITTEN[key](place, value)
+        elif not _takes(signature[key], value):
+            if key in TABLE_CHECKS:
+                yield from TABLE_CHECKS[key](place, value)
             else:
-                yield f"{place}: {name} needs {_needed(known[key])}, got {value!r}"
+                yield f"{place}: {name} needs {_requirement(signature[key])}, got {value!r}"
 
 
 def _not_finite(place: str, value: object) -> Iterator[str]:
@@ -118,8 +118,8 @@ def _not_finite(place: str, value: object) -> Iterator[str]:
     if isinstance(value, float | np.floating) and not math.isfinite(value):
         yield f"{place}: must be a finite number, got {value!r}"
     elif isinstance(value, Mapping | list | tuple):
-        for key, each in value.items() if isinstance(value, Mapping) else enumerate(value):
-            yield from _not_finite(f"{place}.{key}", each)
+        for key, part in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _not_finite(f"{place}.{key}", part)
 
 
 def _takes(parameter: inspect.Parameter, value: object) -> bool:
@@ -129,15 +129,15 @@ def _takes(parameter: inspect.Parameter, value: object) -> bool:
         low, high = BOUNDS[parameter.name]
         if not low <= number <= high:
             return False
-    checked = TypeAdapter[Any](parameter.annotation, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
+    adapter = TypeAdapter[Any](parameter.annotation, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
     for form in (value, _as_tuple(value)):
         with suppress(ValidationError):
-            checked.validate_python(form)
+            adapter.validate_python(form)
             return True
     return False
 
 
-def _needed(parameter: inspect.Parameter) -> str:
+def _requirement(parameter: inspect.Parameter) -> str:
     stated = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
     if parameter.name not in BOUNDS:
         return stated
@@ -166,10 +166,10 @@ def _are_amounts(values: Iterable[object]) -> bool:
     return all(isinstance(value, int | float) and not isinstance(value, bool) and value >= 0 for value in values)
 
 
-SCHEDULED = ("learning_rate", "clip_range", "delta_std")
+SCHEDULE_PARAMETERS = ("learning_rate", "clip_range", "delta_std")
 """Parameters that may change from one number to another over the run."""
-WRITTEN: Mapping[str, Callable[[str, object], Iterator[str]]] = {
-    **dict.fromkeys(SCHEDULED, _rate_mistakes),
+TABLE_CHECKS: Mapping[str, Callable[[str, object], Iterator[str]]] = {
+    **dict.fromkeys(SCHEDULE_PARAMETERS, _rate_mistakes),
     "action_noise": _noise_mistakes,
 }
 """Parameters that recipes may write as tables, which ``build`` turns into the objects that the library takes."""
@@ -187,7 +187,7 @@ def can_be_shown(name: str) -> bool:
     return imitates or has_replay_buffer(name)
 
 
-def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **fixed: Any) -> BaseAlgorithm:
+def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **more: Any) -> BaseAlgorithm:
     """Construct the algorithm on ``env``; it logs nowhere until it is given a logger.
 
     Args:
@@ -195,7 +195,7 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         policy: such as ``MlpPolicy``.
         env: what it learns in.
         parameters: keyword arguments of its constructor; tables that recipes write become the objects that it expects.
-        **fixed: seed, device, tensorboard_log and so on.
+        **more: seed, device, tensorboard_log and so on.
 
     Raises:
         RecipeError: for unknown parameters or values that the algorithm refuses.
@@ -203,7 +203,7 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
     if mistakes := list(parameter_mistakes(name, parameters)):
         raise RecipeError("; ".join(mistakes))
     arguments = {key: _as_tuple(value) for key, value in copy.deepcopy(dict(parameters)).items()}
-    for key in SCHEDULED:
+    for key in SCHEDULE_PARAMETERS:
         if isinstance(ends := arguments.get(key), Mapping):
             arguments[key] = LinearSchedule(ends["linear_from"], ends["linear_to"], 1.0)
     noise = arguments.get("action_noise")
@@ -211,7 +211,7 @@ def build(name: str, policy: str, env: VecEnv, parameters: Mapping[str, Any], **
         mean = np.zeros(env.action_space.shape or (1,))
         arguments["action_noise"] = NOISES[noise["kind"]](mean, noise["sigma"] * np.ones_like(mean))  # type: ignore[call-arg]
     try:
-        model = algorithm_class(name)(POLICIES.get(policy, policy), env, **arguments, **fixed)
+        model = algorithm_class(name)(POLICIES.get(policy, policy), env, **arguments, **more)
     except (TypeError, ValueError, AssertionError, KeyError, NotImplementedError) as error:
         raise RecipeError(f"{name} refuses its parameters {dict(parameters)}: {error}") from error
     model.set_logger(Logger(None, []))  # left to itself it makes an empty temporary folder when it begins to learn

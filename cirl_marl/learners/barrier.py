@@ -1,92 +1,149 @@
-"""Where a learner can be saved: between two rollouts. What came after that is kept, and handed to it again.
+"""Checkpoint barrier with a replay log: how learners are saved together that update at other times.
 
-A checkpoint is asked for at any time. Every learner writes its state when it comes to its next boundary, and from then
-on what it does and what is handed to it is noted. When all have done so, the environment is saved, too. Who goes on
-from there begins as it did, is brought into its state at the first boundary, and does again what it did; what it is
-handed is what was noted, until it has come to where the environment is. Each draws from streams of its own, so that it
-does the same to the bit; an action that differs is an error.
+A barrier is a point of a computation at which its state is small and complete. That of a learner lies between two
+rollouts (of ARS, before it draws candidates). Learners come to theirs at different joint steps, and waiting for the
+others would change what they learn. So each one writes its state when it comes to its barrier after a checkpoint was
+requested, goes on, and logs from then on its actions and what the environment answered. When all have written, the
+environment is saved, and with it the logs: the checkpoint is a consistent cut, as in Chandy and Lamport 1985.
+
+A resumed learner is loaded with its state at its first barrier. The environment is already where the logs end, so the
+learner is fed the logged answers until it gets there. It draws from random streams of its own and therefore acts as it
+did, to the bit; an action that differs from the logged one is an error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sb3_contrib import ARS
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import Schedule
 
 from cirl_marl.errors import RunError
 from cirl_marl.learners.agent_env import AgentVecEnv, StepResult
 
 LoggedStep = tuple[NDArray[np.float32], StepResult]
-"""An action, and what was handed to the learner after it."""
+"""An action, and what the environment answered."""
 
 
 class CheckpointBarrier:
-    """The boundaries of one learner.
+    """The barrier of one learner.
 
     Attributes:
-        folder: where its state is asked for; None if it is not.
-        noted: what came after the state that it wrote; None if it wrote none yet.
-        again: what is to be handed to it again.
+        folder: where a checkpoint is requested; None if none is.
+        log: steps since the learner wrote its state for that checkpoint; None if it has not.
+        replay_log: steps that a resumed learner has still to repeat.
     """
 
-    def __init__(self, seat: AgentVecEnv) -> None:
-        """Of the learner of ``seat``; ``keeps`` says how it is saved."""
-        self._seat = seat
+    def __init__(self, agent_env: AgentVecEnv) -> None:
+        """Of the learner in ``agent_env``; ``write_with`` says how it is saved."""
+        self._agent_env = agent_env
         self._write: Callable[[Path, dict[str, Any]], None] | None = None
-        self._read: Callable[[], None] | None = None
-        self._acting: Mapping[str, Any] | None = None
+        self._load: Callable[[], None] | None = None
+        self._acting_state: Mapping[str, Any] | None = None
         self.folder: Path | None = None
-        self.noted: list[LoggedStep] | None = None
-        self.again: list[LoggedStep] = []
+        self.log: list[LoggedStep] | None = None
+        self.replay_log: list[LoggedStep] = []
 
-    def keeps(self, write: Callable[[Path, dict[str, Any]], None]) -> None:
+    def write_with(self, write: Callable[[Path, dict[str, Any]], None]) -> None:
         """Have the state written by ``write``, which takes the folder and what else belongs to the state."""
         self._write = write
 
-    def begins_at(self, read: Callable[[], None], handed: StepResult, acting: Mapping[str, Any] | None) -> None:
-        """Go on at the first boundary: ``read`` brings the learner into its state, ``handed`` is what it knew."""
+    def resume_from(self, load: Callable[[], None], step: StepResult, acting_state: Mapping[str, Any] | None) -> None:
+        """Have ``load`` bring the learner into its saved state at the first barrier, where ``step`` was its last."""
 
-        def back() -> None:
-            self._seat.handed = handed
-            read()
+        def load_at_barrier() -> None:
+            self._agent_env.last_step = step
+            load()
 
-        self._read, self._acting = back, acting
-
-    @property
-    def resuming(self) -> bool:
-        """Whether the learner has not come to the boundary yet at which it goes on."""
-        return self._read is not None
+        self._load, self._acting_state = load_at_barrier, acting_state
 
     @property
-    def acting(self) -> Mapping[str, Any] | None:
-        """What a learner that had learnt enough knew when it was saved; None if it goes on learning."""
-        return self._acting if self.resuming else None
+    def is_restoring(self) -> bool:
+        """Whether a resumed learner has not come to its first barrier yet."""
+        return self._load is not None
 
-    def reached(self, acting: Mapping[str, Any] | None = None) -> None:
-        """Write the state if it is asked for, or go on from it; ``acting`` is what one knows that has learnt enough."""
-        if self._read is not None:
-            read, self._read = self._read, None
-            read()
-        if self.folder is not None and self.noted is None and self._write is not None:
-            self.noted = []
-            self._write(self.folder, {"handed": self._seat.handed.told(), "acting": acting})
+    @property
+    def acting_state(self) -> Mapping[str, Any] | None:
+        """The saved memory of a policy whose learner had finished; None if the learner goes on learning."""
+        return self._acting_state if self.is_restoring else None
 
-    def note(self) -> None:
-        """Note what the learner did and what was handed to it, if it has written its state."""
-        if self.noted is not None:
-            assert self._seat.action is not None
-            self.noted.append((self._seat.action.copy(), self._seat.handed))
+    def arrive(self, acting_state: Mapping[str, Any] | None = None) -> None:
+        """Load the state to resume from, or write it if requested; ``acting_state`` is that of a finished learner."""
+        if self._load is not None:
+            load, self._load = self._load, None
+            load()
+        if self.folder is not None and self.log is None and self._write is not None:
+            self.log = []
+            self._write(self.folder, {"handed": self._agent_env.last_step.state_dict(), "acting": acting_state})
 
-    def repeat(self, place: int) -> None:
-        """Hand over again what was noted; a ``RunError`` if the learner did not do again what it did."""
-        action, handed = self.again[place]
-        if self._seat.action is None or not np.array_equal(action, self._seat.action):
-            raise RunError(f"{self._seat.title} does not do again what it did: versions or files are others now")
-        self._seat.handed = handed
+    def record(self) -> None:
+        """Log the last step, if the learner has written its state."""
+        if self.log is not None:
+            assert self._agent_env.action is not None
+            self.log.append((self._agent_env.action.copy(), self._agent_env.last_step))
 
-    def forget(self) -> None:
-        """Ask for nothing any more."""
-        self.folder = self.noted = None
+    def replay_step(self, place: int) -> None:
+        """Answer from the replay log; a ``RunError`` if the learner's action is not the logged one."""
+        action, step = self.replay_log[place]
+        if self._agent_env.action is None or not np.array_equal(action, self._agent_env.action):
+            raise RunError(f"{self._agent_env.title} does not do again what it did: versions or files are others now")
+        self._agent_env.last_step = step
+
+    def release(self) -> None:
+        """End the request, and with it the log."""
+        self.folder = self.log = None
+
+
+class BarrierCallback(BaseCallback):
+    """Arrives at a barrier at the beginning of every rollout."""
+
+    def __init__(self, barrier: CheckpointBarrier) -> None:
+        """Arrive at ``barrier``."""
+        super().__init__()
+        self._barrier = barrier
+
+    def _on_rollout_start(self) -> None:
+        if not isinstance(self.model, ARS):
+            self._barrier.arrive()
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class _BarrierSchedule:
+    """A schedule that ARS asks at the beginning of every update, before it draws; pickled as the schedule itself."""
+
+    def __init__(self, schedule: Schedule, model: ARS, barrier: CheckpointBarrier) -> None:
+        self._schedule, self._model, self._barrier = schedule, model, barrier
+
+    def __call__(self, _progress: float) -> float:
+        self._barrier.arrive()
+        return self._schedule(self._model._current_progress_remaining)  # loading the state may have changed it
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _identity, (self._schedule,)
+
+
+def _identity(value: Any) -> Any:
+    return value
+
+
+@contextmanager
+def barrier_at_updates(model: BaseAlgorithm, barrier: CheckpointBarrier) -> Iterator[None]:
+    """Let ARS arrive before every update: its candidates are drawn when ``on_rollout_start`` comes."""
+    if not isinstance(model, ARS):
+        yield
+        return
+    schedule = model.delta_std_schedule
+    model.delta_std_schedule = _BarrierSchedule(schedule, model, barrier)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        model.delta_std_schedule = schedule

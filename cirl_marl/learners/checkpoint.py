@@ -19,7 +19,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.errors import RunError
-from cirl_marl.learners.algorithms import RESERVED, parameters_of
+from cirl_marl.learners.algorithms import RESERVED_PARAMETERS, parameters_of
 
 KIND = "__kind__"
 """Key that says what a table stands for, if it is no table."""
@@ -34,9 +34,9 @@ def write_tree(folder: Path, name: str, value: Any) -> None:
         TypeError: for anything else.
     """
     arrays: dict[str, np.ndarray[Any, Any]] = {}
-    told = json.dumps(_told(value, arrays, ()))
+    text = json.dumps(_to_json(value, arrays, ()))
     save_file(arrays, folder / f"{name}.safetensors")
-    (folder / f"{name}.json").write_text(told + "\n")
+    (folder / f"{name}.json").write_text(text + "\n")
 
 
 def read_tree(folder: Path, name: str) -> Any:
@@ -45,7 +45,7 @@ def read_tree(folder: Path, name: str) -> Any:
     try:
         arrays = load_file(path)
         path = folder / f"{name}.json"
-        return _meant(json.loads(path.read_text()), arrays)
+        return _from_json(json.loads(path.read_text()), arrays)
     except UNREADABLE as error:
         raise RunError(f"{path}: cannot be read: {error}") from error
 
@@ -55,16 +55,16 @@ def is_plain(value: object) -> bool:
     if isinstance(value, torch.Tensor):
         return not value.requires_grad
     if isinstance(value, Mapping):
-        return all(isinstance(key, str) and is_plain(each) for key, each in value.items())
+        return all(isinstance(key, str) and is_plain(part) for key, part in value.items())
     if isinstance(value, deque | tuple | list):
         return all(map(is_plain, value))
     return value is None or isinstance(value, bool | int | float | str | np.generic | np.ndarray)
 
 
-def _told(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: tuple[object, ...]) -> Any:
+def _to_json(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: tuple[object, ...]) -> Any:
     """Return what stands for a value in JSON; arrays are gathered by the names on their paths."""
     if isinstance(value, torch.Tensor):
-        return {KIND: "tensor", "is": _told(value.detach().cpu().numpy(), arrays, path)}
+        return {KIND: "tensor", "is": _to_json(value.detach().cpu().numpy(), arrays, path)}
     if isinstance(value, np.ndarray):
         key = ".".join(map(str, path))
         key = f"{key}#{len(arrays)}" if key in arrays else key
@@ -72,11 +72,11 @@ def _told(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: tuple[objec
         return {KIND: "array", "is": key}
     if isinstance(value, Mapping):
         if all(isinstance(key, str) and key != KIND for key in value):
-            return {key: _told(each, arrays, (*path, key)) for key, each in value.items()}
-        told = [[_told(key, arrays, path), _told(each, arrays, (*path, key))] for key, each in value.items()]
-        return {KIND: "table", "is": told}
+            return {key: _to_json(part, arrays, (*path, key)) for key, part in value.items()}
+        entries = [[_to_json(key, arrays, path), _to_json(part, arrays, (*path, key))] for key, part in value.items()]
+        return {KIND: "table", "is": entries}
     if isinstance(value, tuple | list | deque):
-        items = [_told(each, arrays, (*path, place)) for place, each in enumerate(value)]
+        items = [_to_json(part, arrays, (*path, place)) for place, part in enumerate(value)]
         return {KIND: "tuple", "is": items} if isinstance(value, tuple) else items
     if isinstance(value, np.generic):
         return value.item()
@@ -85,24 +85,24 @@ def _told(value: Any, arrays: dict[str, np.ndarray[Any, Any]], path: tuple[objec
     raise TypeError(f"a {type(value).__name__} cannot be kept")
 
 
-def _meant(told: Any, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Any:
-    if isinstance(told, list):
-        return [_meant(each, arrays) for each in told]
-    if not isinstance(told, dict):
-        return told
-    if KIND not in told:
-        return {key: _meant(each, arrays) for key, each in told.items()}
-    inside = told["is"]
-    match told[KIND]:
+def _from_json(plain: Any, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Any:
+    if isinstance(plain, list):
+        return [_from_json(part, arrays) for part in plain]
+    if not isinstance(plain, dict):
+        return plain
+    if KIND not in plain:
+        return {key: _from_json(part, arrays) for key, part in plain.items()}
+    inside = plain["is"]
+    match plain[KIND]:
         case "array":
             return np.array(arrays[inside])  # its own, to be written to
         case "tensor":
-            return torch.from_numpy(_meant(inside, arrays))
+            return torch.from_numpy(_from_json(inside, arrays))
         case "table":
-            return {_meant(key, arrays): _meant(each, arrays) for key, each in inside}
+            return {_from_json(key, arrays): _from_json(part, arrays) for key, part in inside}
         case "tuple":
-            return tuple(_meant(each, arrays) for each in inside)
-    raise ValueError(f"unknown kind {told[KIND]!r}")
+            return tuple(_from_json(part, arrays) for part in inside)
+    raise ValueError(f"unknown kind {plain[KIND]!r}")
 
 
 MATRICES = ("exploration_mat", "exploration_matrices")
@@ -111,13 +111,13 @@ MATRICES = ("exploration_mat", "exploration_matrices")
 
 def model_state(model: BaseAlgorithm) -> dict[str, Any]:
     """Return parameters, optimisers, counters, last observations, noise and stream of actions, without the buffer."""
-    settings = {*parameters_of(type(model).__name__), *RESERVED, "start_time"}
+    settings = {*parameters_of(type(model).__name__), *RESERVED_PARAMETERS, "start_time"}
     return {
         "parameters": model.get_parameters(),
         "variables": variables(model),
         "values": {k: v for k, v in vars(model).items() if k not in settings and _is_progress(v)},
         "noise": [_plain_of(noise) for noise in _noises(model)],
-        "matrices": [{name: getattr(each, name) for name in MATRICES} for each in _explorers(model)],
+        "matrices": [{name: getattr(explorer, name) for name in MATRICES} for explorer in _explorers(model)],
         "action_stream": model.action_space.np_random.bit_generator.state,
     }
 
@@ -131,9 +131,9 @@ def set_model_state(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
     for noise, values in zip(_noises(model), state["noise"], strict=True):
         for name, value in values.items():
             setattr(noise, name, value)
-    for each, matrices in zip(_explorers(model), state["matrices"], strict=True):
+    for explorer, matrices in zip(_explorers(model), state["matrices"], strict=True):
         for name, value in matrices.items():
-            setattr(each, name, value)
+            setattr(explorer, name, value)
     model.action_space.np_random.bit_generator.state = state["action_stream"]
 
 
@@ -142,17 +142,17 @@ def variables(model: BaseAlgorithm) -> dict[str, Any]:
     return {name: attrgetter(name)(model) for name in model._get_torch_save_params()[1]}
 
 
-def set_variables(model: BaseAlgorithm, told: Mapping[str, Any]) -> None:
+def set_variables(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
     """Bring what is learnt beside the networks into a state."""
-    for name, own in variables(model).items():
-        own.data.copy_(told[name])
+    for name, variable in variables(model).items():
+        variable.data.copy_(state[name])
 
 
 def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
     """Return what is in a replay buffer, without the room that is left."""
-    used = buffer.buffer_size if buffer.full else buffer.pos
-    found = {name: value for name, value in vars(buffer).items() if is_plain(value)}
-    return {name: _first(value, used, buffer.buffer_size) for name, value in found.items()}
+    length = buffer.buffer_size if buffer.full else buffer.pos
+    attributes = {name: value for name, value in vars(buffer).items() if is_plain(value)}
+    return {name: _first(value, length, buffer.buffer_size) for name, value in attributes.items()}
 
 
 def set_buffer_state(buffer: ReplayBuffer, state: Mapping[str, Any]) -> None:
@@ -172,10 +172,10 @@ def set_buffer_state(buffer: ReplayBuffer, state: Mapping[str, Any]) -> None:
 
 def normaliser_state(env: VecNormalize) -> dict[str, Any]:
     """Return the moments of observations and rewards, and the discounted returns under way, as plain numbers."""
-    seen = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
-    kept = seen if env.norm_obs else {}
+    moments = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
+    observations = moments if env.norm_obs else {}
     return {
-        "observations": {key: _moments(each) for key, each in kept.items()},
+        "observations": {key: _moments(part) for key, part in observations.items()},
         "rewards": _moments(env.ret_rms),
         "returns": _numbers(env.returns),
     }
@@ -183,15 +183,18 @@ def normaliser_state(env: VecNormalize) -> dict[str, Any]:
 
 def set_normaliser_state(env: VecNormalize, state: Mapping[str, Any], *, returns: bool = True) -> None:
     """Bring a normaliser into a state; a ``RunError`` if it sees something else."""
-    seen = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
-    known = seen if env.norm_obs else {}
-    if set(known) != set(state["observations"]):
-        raise RunError(f"normalises {sorted(state['observations'])}, not {sorted(known)}")
-    for own, told in ((env.ret_rms, state["rewards"]), *((known[key], state["observations"][key]) for key in known)):
-        mean, var = _array(told["mean"]), _array(told["var"])
-        if np.shape(own.mean) != mean.shape:
-            raise RunError(f"is for {mean.size} entries, not {np.size(own.mean)}")
-        own.mean, own.var, own.count = mean, var, told["count"]
+    moments = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
+    observations = moments if env.norm_obs else {}
+    if set(observations) != set(state["observations"]):
+        raise RunError(f"normalises {sorted(state['observations'])}, not {sorted(observations)}")
+    for statistics, saved in (
+        (env.ret_rms, state["rewards"]),
+        *((observations[key], state["observations"][key]) for key in observations),
+    ):
+        mean, var = _array(saved["mean"]), _array(saved["var"])
+        if np.shape(statistics.mean) != mean.shape:
+            raise RunError(f"is for {mean.size} entries, not {np.size(statistics.mean)}")
+        statistics.mean, statistics.var, statistics.count = mean, var, saved["count"]
     if returns:
         env.returns = _array(state["returns"])
 
@@ -199,10 +202,10 @@ def set_normaliser_state(env: VecNormalize, state: Mapping[str, Any], *, returns
 class FrozenStatistics(RunningMeanStd):
     """Statistics that no longer follow what is seen."""
 
-    def __init__(self, known: RunningMeanStd) -> None:
-        """Stay with what is ``known``."""
-        super().__init__(shape=known.mean.shape)
-        self.mean, self.var, self.count = known.mean.copy(), known.var.copy(), known.count
+    def __init__(self, statistics: RunningMeanStd) -> None:
+        """Stay with what is ``statistics``."""
+        super().__init__(shape=statistics.mean.shape)
+        self.mean, self.var, self.count = statistics.mean.copy(), statistics.var.copy(), statistics.count
 
     def update_from_moments(self, batch_mean: Any, batch_var: Any, batch_count: float) -> None:
         """Do nothing."""
@@ -224,14 +227,14 @@ def _moments(moments: RunningMeanStd) -> dict[str, Any]:
 
 
 def _numbers(array: Any) -> dict[str, Any]:
-    found = np.asarray(array)
-    return {"type": found.dtype.name, "values": found.tolist()}
+    numbers = np.asarray(array)
+    return {"type": numbers.dtype.name, "values": numbers.tolist()}
 
 
-def _array(told: Mapping[str, Any]) -> Any:
-    if told["type"] not in ("float32", "float64"):
-        raise ValueError(f"numbers of type {told['type']!r}")
-    return np.array(told["values"], dtype=told["type"])
+def _array(saved: Mapping[str, Any]) -> Any:
+    if saved["type"] not in ("float32", "float64"):
+        raise ValueError(f"numbers of type {saved['type']!r}")
+    return np.array(saved["values"], dtype=saved["type"])
 
 
 def _is_progress(value: object) -> bool:
@@ -240,7 +243,7 @@ def _is_progress(value: object) -> bool:
 
 
 def _is_observation(value: object) -> bool:
-    return isinstance(value, dict) and bool(value) and all(isinstance(each, np.ndarray) for each in value.values())
+    return isinstance(value, dict) and bool(value) and all(isinstance(part, np.ndarray) for part in value.values())
 
 
 def _like(now: Any, value: Any) -> Any:
@@ -266,11 +269,15 @@ def _noises(model: BaseAlgorithm) -> Iterator[Any]:
 def _explorers(model: BaseAlgorithm) -> list[Any]:
     """Return distributions whose noise depends on the state."""
     parts = (model.policy, getattr(model.policy, "actor", None))
-    found = [getattr(part, "action_dist", None) for part in parts]
-    return [each for each in found if isinstance(getattr(each, MATRICES[0], None), torch.Tensor)]
+    distributions = [getattr(part, "action_dist", None) for part in parts]
+    return [
+        distribution
+        for distribution in distributions
+        if isinstance(getattr(distribution, MATRICES[0], None), torch.Tensor)
+    ]
 
 
-def _first(value: Any, used: int, size: int) -> Any:
+def _first(value: Any, length: int, size: int) -> Any:
     if isinstance(value, dict):
-        return {key: _first(each, used, size) for key, each in value.items()}
-    return value[:used] if isinstance(value, np.ndarray) and value.ndim and len(value) == size else value
+        return {key: _first(part, length, size) for key, part in value.items()}
+    return value[:length] if isinstance(value, np.ndarray) and value.ndim and len(value) == size else value

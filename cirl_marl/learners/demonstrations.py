@@ -88,58 +88,60 @@ def _imitate(model: BaseAlgorithm, steps: int, act: Act) -> None:
     """
     env = model.get_env()
     assert env is not None
-    seen: list[Any] = []
-    shown: list[NDArray[np.float32]] = []
+    observations: list[Any] = []
+    actions_to_copy: list[NDArray[np.float32]] = []
     rollout = model.n_steps if isinstance(model, OnPolicyAlgorithm) else None
     while model.num_timesteps < steps:
-        copying, before = not seen, len(seen)
-        ended = np.zeros(env.num_envs, dtype=bool)
-        while model.num_timesteps < steps and (not ended.any() if rollout is None else len(seen) < before + rollout):
-            seen.append(env.get_original_obs() if isinstance(env, VecNormalize) else model._last_obs)
-            shown.append(act())
+        follows, before = not observations, len(observations)
+        dones = np.zeros(env.num_envs, dtype=bool)
+        while model.num_timesteps < steps and (
+            not dones.any() if rollout is None else len(observations) < before + rollout
+        ):
+            observations.append(env.get_original_obs() if isinstance(env, VecNormalize) else model._last_obs)
+            actions_to_copy.append(act())
             assert model._last_obs is not None
-            actions = shown[-1] if copying else model.predict(model._last_obs)[0]
-            model._last_obs, _, ended, _ = env.step(actions)  # type: ignore[assignment]
-            model._last_episode_starts = ended
+            actions = actions_to_copy[-1] if follows else model.predict(model._last_obs)[0]
+            model._last_obs, _, dones, _ = env.step(actions)  # type: ignore[assignment]
+            model._last_episode_starts = dones
             model.num_timesteps += steps_counted(model, env.num_envs)
-        _fit(model, _stacked(seen), np.concatenate(shown))
+        _fit(model, _concatenate(observations), np.concatenate(actions_to_copy))
 
 
-def _stacked(seen: Sequence[Any]) -> Any:
+def _concatenate(observations: Sequence[Any]) -> Any:
     """Return the observations of several steps as one; those of a dict key by key."""
-    if isinstance(seen[0], dict):
-        return {key: np.concatenate([each[key] for each in seen]) for key in seen[0]}
-    return np.concatenate(seen)
+    if isinstance(observations[0], dict):
+        return {key: np.concatenate([observation[key] for observation in observations]) for key in observations[0]}
+    return np.concatenate(observations)
 
 
 def _rows(observations: Any, rows: Any) -> Any:
     """Return some rows of observations, which may be those of a dict."""
     if isinstance(observations, dict):
-        return {key: each[rows] for key, each in observations.items()}
+        return {key: part[rows] for key, part in observations.items()}
     return observations[rows]
 
 
-def _fit(model: BaseAlgorithm, seen: Any, shown: NDArray[np.float32]) -> None:
-    """Bring the policy close to what was ``shown``, by the statistics that the normaliser has now."""
+def _fit(model: BaseAlgorithm, observed: Any, actions_to_copy: NDArray[np.float32]) -> None:
+    """Bring the policy close to what was ``actions_to_copy``, by the statistics that the normaliser has now."""
     env, policy = model.get_env(), model.policy
-    observations, _ = policy.obs_to_tensor(env.normalize_obs(seen) if isinstance(env, VecNormalize) else seen)
-    actions = torch.as_tensor(shown)
+    inputs, _ = policy.obs_to_tensor(env.normalize_obs(observed) if isinstance(env, VecNormalize) else observed)
+    actions = torch.as_tensor(actions_to_copy)
     optimiser = torch.optim.Adam(policy.parameters(), lr=IMITATION_RATE)
     policy.set_training_mode(True)
     for _ in range(IMITATION_EPOCHS):
         for rows in torch.split(torch.randperm(len(actions)), IMITATION_BATCH):
             optimiser.zero_grad()
-            _unlike(policy, _rows(observations, rows), actions[rows]).backward()  # type: ignore[no-untyped-call]
+            _unlike(policy, _rows(inputs, rows), actions[rows]).backward()  # type: ignore[no-untyped-call]
             optimiser.step()
     policy.set_training_mode(False)
     keep_parameters(model)
 
 
-def _unlike(policy: BasePolicy, seen: Any, shown: Tensor) -> Tensor:
+def _unlike(policy: BasePolicy, observations: Any, actions_to_copy: Tensor) -> Tensor:
     """Return minus the mean log-likelihood of what was shown; without a spread the mean square of the difference."""
     if isinstance(policy, ActorCriticPolicy):
-        return -policy.evaluate_actions(seen, shown)[1].mean()
-    difference: Tensor = policy(seen) - shown
+        return -policy.evaluate_actions(observations, actions_to_copy)[1].mean()
+    difference: Tensor = policy(observations) - actions_to_copy
     return difference.square().mean()
 
 
@@ -178,11 +180,11 @@ class Demonstrator:
         except CirlError as error:
             raise RecipeError(f"{title}: demonstrations by {self.name} control: {error}") from error
         if isinstance(self._controller, ScriptController) and not set(agents) & set(
-            known := self._controller.script_agents
+            scripts := self._controller.script_agents
         ):
             raise RecipeError(
                 f"{title}: demonstrations by scripted control: there is no script for it; "
-                f"there are scripts for {', '.join(known) or 'no agent of this network'}"
+                f"there are scripts for {', '.join(scripts) or 'no agent of this network'}"
             )
 
     def act(self) -> Arrays:
@@ -204,7 +206,7 @@ def in_copies(name: str, envs: Sequence[gymnasium.Env[Any, Any]], seeds: Sequenc
     Raises:
         RecipeError: if an environment is not of a network, or the controller cannot act in it.
     """
-    followed = [Demonstrator(name, _batch_of(env), seed) for env, seed in zip(envs, seeds, strict=True)]
+    demonstrators = [Demonstrator(name, _batch_of(env), seed) for env, seed in zip(envs, seeds, strict=True)]
 
     def row(demonstrator: Demonstrator) -> NDArray[np.floating]:
         (agent,) = demonstrator.env.agents
@@ -212,12 +214,12 @@ def in_copies(name: str, envs: Sequence[gymnasium.Env[Any, Any]], seeds: Sequenc
             demonstrator.check([agent], f"agent '{agent}'")
         return demonstrator.act()[agent]
 
-    return lambda: np.concatenate([row(each) for each in followed], dtype=np.float32, casting="same_kind")
+    return lambda: np.concatenate([row(each) for each in demonstrators], dtype=np.float32, casting="same_kind")
 
 
 def _batch_of(env: gymnasium.Env[Any, Any]) -> MultiAgentVectorEnv:
-    own = env.unwrapped
-    single = own.flat if isinstance(own, GoalEnv) else own
+    inner = env.unwrapped
+    single = inner.flat if isinstance(inner, GoalEnv) else inner
     if not isinstance(single, SingleAgentEnv):
-        raise RecipeError(f"demonstrations: controllers act in networks, and {type(own).__name__} is none")
+        raise RecipeError(f"demonstrations: controllers act in networks, and {type(inner).__name__} is none")
     return single.parallel.batch

@@ -76,11 +76,13 @@ def train(
         LearnerError: if a learner fails; the last checkpoint stays.
         KeyboardInterrupt: after Ctrl-C, SIGTERM or SIGHUP; the run is saved first and can be resumed.
     """
-    _check(options, train)
-    kept = None if directory is None else [Path(directory)]
-    asked = {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents}
-    asked |= {"checkpoint_every": checkpoint_every, **options}
-    (training,) = _train(network, recipe, [seed], kept, callbacks=callbacks, report=report, device=device, **asked)
+    _check_options(options, train)
+    directories = None if directory is None else [Path(directory)]
+    settings = {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents}
+    settings |= {"checkpoint_every": checkpoint_every, **options}
+    (training,) = _train(
+        network, recipe, [seed], directories, callbacks=callbacks, report=report, device=device, **settings
+    )
     return training
 
 
@@ -99,9 +101,9 @@ def train_seeds(
     What is learnt does not depend on who learns beside it. Runs are kept in ``directory-seedN``; the other arguments
     are those of ``train``.
     """
-    _check(options, train, train_seeds)
-    kept = None if directory is None else [Path(f"{directory}-seed{seed}") for seed in seeds]
-    return _train(network, recipe, seeds, kept, report=report, device=device, **options)
+    _check_options(options, train, train_seeds)
+    directories = None if directory is None else [Path(f"{directory}-seed{seed}") for seed in seeds]
+    return _train(network, recipe, seeds, directories, report=report, device=device, **options)
 
 
 def _train(
@@ -123,7 +125,7 @@ def _train(
             training.stackable(callbacks or {})
         for directory, training in zip(directories or (), trainings, strict=directories is not None):
             run = _create(directory, training.config, training.env.network)
-            claims.enter_context(run.claimed())
+            claims.enter_context(run.lock())
             training.keep_in(run)
         run_together(trainings, callbacks=callbacks, report=report, device=device)
     return trainings
@@ -143,28 +145,30 @@ def prepare(
     **options: Any,
 ) -> Training:
     """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
-    found = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
-    steps = found.run.steps if steps is None else _whole("steps", steps, 1)
+    resolved = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
+    steps = resolved.run.steps if steps is None else _whole("steps", steps, 1)
     if engine is not None and engine not in ENGINES:
         raise CirlError(unknown("engine", engine, ENGINES))
     if min_service is not None and not 0 <= min_service <= 1:
         raise CirlError(f"min_service must be a level in [0, 1], got {min_service}")
-    asked = {key: value for key, value in {"engine": engine, "min_service": min_service}.items() if value is not None}
-    found = found.model_copy(update={"run": found.run.model_copy(update=asked)})
-    found.check(steps)
+    run_options = {
+        key: value for key, value in {"engine": engine, "min_service": min_service}.items() if value is not None
+    }
+    resolved = resolved.model_copy(update={"run": resolved.run.model_copy(update=run_options)})
+    resolved.check(steps)
     given = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
-    settings = found.environment | given
-    copies = found.run.envs if envs is None else _whole("envs", envs, 1)
+    settings = resolved.environment | given
+    copies = resolved.run.envs if envs is None else _whole("envs", envs, 1)
     env = MultiAgentVectorEnv(network, num_envs=copies, agents=agents, **settings)
     if not env.agents:
         raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
-    found.check_agents(env.agents)
+    resolved.check_agents(env.agents)
     settings.pop("scenario", None)
     config = RunConfig(
         network=env.network.name,
         scenario=env.network.scenario_name,
         agents=env.agents,
-        recipe=found,
+        recipe=resolved,
         seed=_whole("seed", seed, 0),
         steps=steps,
         envs=copies,
@@ -174,7 +178,7 @@ def prepare(
         raise CirlError(f"checkpoint_every must be seconds of at least 0, got {checkpoint_every!r}")
     training = Training(config, env, checkpoint_every=checkpoint_every)
     if not any(learner.spec.share_of_steps for learner in training.learners.values()):
-        raise RecipeError(f"recipe '{found.name}': nobody learns: share_of_steps is 0 for all of {list(env.agents)}")
+        raise RecipeError(f"recipe '{resolved.name}': nobody learns: share_of_steps is 0 for all of {list(env.agents)}")
     return training
 
 
@@ -208,36 +212,38 @@ def resume(
     """
     run = RunDirectory(directory)
     config = run.config
-    with global_streams_claimed(), run.claimed():
-        config = _extended(run, config, steps)
-        if others := run.other_versions():
-            warnings.warn(f"{run.path}: other versions may give other bits: {'; '.join(others)}", stacklevel=2)
-        training, checkpoint = _gone_on(run, config, checkpoint_every)
+    with global_streams_claimed(), run.lock():
+        config = _config_to_go_on(run, config, steps)
+        if version_changes := run.other_versions():
+            warnings.warn(f"{run.path}: other versions may give other bits: {'; '.join(version_changes)}", stacklevel=2)
+        training, checkpoint = _from_newest_checkpoint(run, config, checkpoint_every)
         training.check_callbacks(callbacks or {})
-        run.go_on(config, checkpoint)
+        run.reopen(config, checkpoint)
         training.keep_in(run)
         run_together([training], callbacks=callbacks, report=report, device=device)
     return training
 
 
-def _gone_on(run: RunDirectory, config: RunConfig, every: float | None) -> tuple[Training, Path | None]:
+def _from_newest_checkpoint(
+    run: RunDirectory, config: RunConfig, checkpoint_every: float | None
+) -> tuple[Training, Path | None]:
     """Return the training from the newest checkpoint that is whole, and this; one that is damaged is named."""
-    damaged: list[RunError] = []
+    errors: list[RunError] = []
     for checkpoint in run.resumable():
         try:
-            training = Training(config, run.make_env(config.envs), checkpoint, every)
+            training = Training(config, run.make_env(config.envs), checkpoint, checkpoint_every)
         except RunError as error:
-            damaged.append(error)
+            errors.append(error)
             continue
-        for each in damaged:
-            warnings.warn(f"{each}; going on from {checkpoint.name} instead", stacklevel=3)
+        for problem in errors:
+            warnings.warn(f"{problem}; going on from {checkpoint.name} instead", stacklevel=3)
         return training, checkpoint
-    if damaged:
-        raise damaged[0]
-    return Training(config, run.make_env(config.envs), None, every), None
+    if errors:
+        raise errors[0]
+    return Training(config, run.make_env(config.envs), None, checkpoint_every), None
 
 
-def _extended(run: RunDirectory, config: RunConfig, steps: int | None) -> RunConfig:
+def _config_to_go_on(run: RunDirectory, config: RunConfig, steps: int | None) -> RunConfig:
     """Return the configuration by which a run goes on."""
     status = run.status
     done, complete = status["joint_steps"] * config.envs, status["state"] == "complete"
@@ -247,41 +253,41 @@ def _extended(run: RunDirectory, config: RunConfig, steps: int | None) -> RunCon
     elif complete:
         raise RunError(f"{run.path}: the run is complete ({done:,} environment steps); give more steps to go on")
     if complete:
-        buffered = [group.name for group in run.groups() if has_replay_buffer(group.spec.algorithm)]
-        if buffered:
-            raise RunError(f"{run.path}: complete runs keep no replay buffers, without which {buffered} cannot go on")
+        off_policy = [group.name for group in run.groups() if has_replay_buffer(group.spec.algorithm)]
+        if off_policy:
+            raise RunError(f"{run.path}: complete runs keep no replay buffers, without which {off_policy} cannot go on")
     return config
 
 
 def _create(directory: Path, config: RunConfig, network: Network) -> RunDirectory:
     """Start the run directory; the definition is copied if it is still what was trained on, and written if not."""
     groups = {"horizon": ("episode", network.episode), "circularity_weight": ("objective", network.objective)}
-    asked = {group: {name: getattr(now, name)} for name, (group, now) in groups.items() if name in config.options}
+    changes = {group: {name: getattr(now, name)} for name, (group, now) in groups.items() if name in config.options}
     source = network.source
     if source is not None and source.is_file():
-        read = load_network(network.address, scenario=network.scenario_name).with_options(**asked)
+        read = load_network(network.address, scenario=network.scenario_name).with_options(**changes)
         if read == network:
             data = {**load_network(network.address).data_sha256, **read.data_sha256}  # it is read by its default
-            kept = config.model_copy(update={"region": read.region, "data_sha256": data})
-            return RunDirectory.create(directory, kept, source)
+            resolved = config.model_copy(update={"region": read.region, "data_sha256": data})
+            return RunDirectory.create(directory, resolved, source)
     with tempfile.TemporaryDirectory() as folder:
-        written = Path(folder) / "network.toml"
-        write_network(network, written)
+        definition = Path(folder) / "network.toml"
+        write_network(network, definition)
         try:
-            load_network(written)
+            load_network(definition)
         except CirlError as error:
             raise RunError(f"{directory}: a run on disk needs a network that can be read again: {error}") from error
-        return RunDirectory.create(directory, config.model_copy(update={"scenario": "default"}), written)
+        return RunDirectory.create(directory, config.model_copy(update={"scenario": "default"}), definition)
 
 
-def _check(options: Iterable[str], *functions: Callable[..., object]) -> None:
+def _check_options(options: Iterable[str], *functions: Callable[..., object]) -> None:
     """Refuse options that are neither the environment's nor keywords of these functions."""
-    parameters = [each for function in functions for each in inspect.signature(function).parameters.values()]
-    keywords = (each.name for each in parameters if each.kind is each.KEYWORD_ONLY)
-    known = dict.fromkeys((*OPTIONS, *keywords))
+    parameters = [parameter for function in functions for parameter in inspect.signature(function).parameters.values()]
+    keywords = (parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY)
+    names = dict.fromkeys((*OPTIONS, *keywords))
     for option in options:
-        if option not in known:
-            raise CirlError(unknown("option", option, known))
+        if option not in names:
+            raise CirlError(unknown("option", option, names))
 
 
 def _whole(name: str, value: object, least: int) -> int:
@@ -305,11 +311,11 @@ def complete_run(
     where it was interrupted.
     """
     run = RunDirectory(directory)
-    how: dict[str, Any] = {"report": report, "checkpoint_every": checkpoint_every}
+    settings: dict[str, Any] = {"report": report, "checkpoint_every": checkpoint_every}
     if not (directory / "config.json").is_file():
-        train(network, recipe, directory=directory, **how, **options)
+        train(network, recipe, directory=directory, **settings, **options)
     elif run.status["state"] != "complete":
-        resume(directory, **how)
+        resume(directory, **settings)
     return run
 
 
@@ -322,21 +328,21 @@ def export(run: str | Path | RunDirectory, folder: str | Path) -> list[Path]:
     Raises:
         RunError: if the run is incomplete, or ``folder`` exists and is no folder.
     """
-    found = run if isinstance(run, RunDirectory) else RunDirectory(run)
+    source = run if isinstance(run, RunDirectory) else RunDirectory(run)
     if (target := Path(folder)).exists() and not target.is_dir():
         raise RunError(f"{target}: is no folder")
-    env, written = found.make_env(found.config.envs), list[Path]()
+    env, files = source.make_env(source.config.envs), list[Path]()
     with publish_folder(target) as partial:
-        for group in found.groups():
+        for group in source.groups():
             learner = Learner(
-                AgentVecEnv(env, group.name, group.view(env), wait), group.spec, found.config.seed
+                AgentVecEnv(env, group.name, group.view(env), wait), group.spec, source.config.seed
             ).build()
-            learner.take(found.chosen).model.save(partial / f"{group.name}.zip")
-            written.append(target / f"{group.name}.zip")
+            learner.take(source.acting_checkpoint).model.save(partial / f"{group.name}.zip")
+            files.append(target / f"{group.name}.zip")
             if isinstance(learner.env, VecNormalize):
                 learner.env.save(str(partial / f"{group.name}.normaliser.pkl"))
-                written.append(target / f"{group.name}.normaliser.pkl")
-    return written
+                files.append(target / f"{group.name}.normaliser.pkl")
+    return files
 
 
 class Trained(Policies):
@@ -348,25 +354,27 @@ class Trained(Policies):
     def __init__(self, run: str | Path | RunDirectory) -> None:
         """Load every policy; a ``RunError`` if the run is incomplete or a file of it cannot be read."""
         self.run = run if isinstance(run, RunDirectory) else RunDirectory(run)
-        self.checkpoint = folder = self.run.chosen
+        self.checkpoint = folder = self.run.acting_checkpoint
         env = self.run.make_env(1)
-        self._seen = env.layout.names
+        self._names = env.layout.names
         policies: dict[str, Policy] = {}
         for group in self.run.groups():
             learner = load_acting_learner(folder, group, env)
             normaliser = learner.env if isinstance(learner.env, VecNormalize) else None
-            policies[group.name] = Policy(learner.model, normaliser, learner.seat.view)
+            policies[group.name] = Policy(learner.model, normaliser, learner.agent_env.view)
         super().__init__(policies)
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
-        if set(env.agents) != set(self._seen):
-            raise RunError(f"{self.run.path}: trained {sorted(self._seen)}, not {sorted(env.agents)}")
-        for agent, seen in self._seen.items():
-            if (shown := env.layout.names[agent]) != seen:
-                other = next((name for name in shown if name not in seen), f"{len(shown)} entries, not {len(seen)}")
+        if set(env.agents) != set(self._names):
+            raise RunError(f"{self.run.path}: trained {sorted(self._names)}, not {sorted(env.agents)}")
+        for agent, seen in self._names.items():
+            if (names_here := env.layout.names[agent]) != seen:
+                difference = next(
+                    (name for name in names_here if name not in seen), f"{len(names_here)} entries, not {len(seen)}"
+                )
                 raise RunError(
-                    f"{self.run.path}: '{agent}' learnt from other observations than this environment's ({other}); "
-                    "make the environment with the options of the run, as its make_env() does"
+                    f"{self.run.path}: '{agent}' learnt from other observations than this environment's ({difference})"
+                    "; make the environment with the options of the run, as its make_env() does"
                 )
         super().start(env, seed)

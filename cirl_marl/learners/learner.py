@@ -14,14 +14,14 @@ from sb3_contrib import ARS, MaskablePPO
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import Schedule, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RecipeError, RunError
 from cirl_marl.learners.agent_env import AgentVecEnv, StepResult
 from cirl_marl.learners.algorithms import algorithm_class, build, has_replay_buffer
-from cirl_marl.learners.barrier import CheckpointBarrier
+from cirl_marl.learners.barrier import BarrierCallback, CheckpointBarrier, barrier_at_updates
 from cirl_marl.learners.checkpoint import (
     UNREADABLE,
     buffer_state,
@@ -41,7 +41,7 @@ from cirl_marl.learners.lockstep import BudgetSpent, Streams, wait
 from cirl_marl.learners.recipe import Group, LearnerSettings
 
 ACTING_PARAMETERS = ("policy_kwargs", "use_sde", "ent_coef", "gamma")
-"""Parameters on which it depends what acts."""
+"""Parameters that shape the policy; the others matter to training only."""
 
 
 def derived_seed(seed: int, *names: str | int) -> int:
@@ -57,157 +57,157 @@ def derived_seed(seed: int, *names: str | int) -> int:
 
 
 class Learner:
-    """A learner seated in the joint environment.
+    """An algorithm of Stable-Baselines3 and all that belongs to it, in one agent's view of the joint environment.
 
     Attributes:
         spec: its part of the recipe.
-        seat: its view of the environment, from which it has its name.
-        env: the seat, behind ``VecNormalize`` if the recipe normalises.
+        agent_env: its view of the joint environment, from which it has its name.
+        env: ``agent_env``, behind ``VecNormalize`` if the recipe normalises.
         model: the algorithm, as Stable-Baselines3 made it.
-        demonstrator: whom it follows before it acts itself; None if it needs nobody.
-        boundary: where it can be saved.
-        was_stacked: of one that goes on: whether it was one of a stack; None of others.
-        shown: whether it follows its demonstrator now.
+        demonstrator: the controller that it follows before it acts itself; None if there is none.
+        barrier: where it can be saved.
+        was_in_stack: of a resumed learner: whether it was one of a stack; None of others.
+        follows_demonstrator: whether the controller acts in its place now.
     """
 
     model: BaseAlgorithm
     env: VecEnv
     demonstrator: Demonstrator | None = None
 
-    def __init__(self, seat: AgentVecEnv, spec: LearnerSettings, seed: int, *, done: int = 0) -> None:
+    def __init__(self, agent_env: AgentVecEnv, spec: LearnerSettings, seed: int, *, done: int = 0) -> None:
         """Give the learner its streams, others after each number of joint steps ``done`` before.
 
         ``build`` or ``load`` makes the algorithm.
         """
-        self.name = seat.name
+        self.name = agent_env.name
         self.spec = spec
-        self.seat = seat
-        seat.bootstrap = spec.bootstrap
-        self._seed = derived_seed(seed, seat.name, done)
-        self.boundary = CheckpointBarrier(seat)
-        self._begun = 0
-        self.was_stacked: bool | None = None
-        self.shown = False
+        self.agent_env = agent_env
+        agent_env.bootstrap = spec.bootstrap
+        self._seed = derived_seed(seed, agent_env.name, done)
+        self.barrier = CheckpointBarrier(agent_env)
+        self._first_timestep = 0
+        self.was_in_stack: bool | None = None
+        self.follows_demonstrator = False
         noisy = spec.parameters.get("action_noise") is not None
         self.streams = Streams(self._seed, keep_gaussian=noisy)
 
     def build(self) -> Learner:
         """Make a fresh algorithm; a ``RecipeError`` names the learner if the algorithm refuses its parameters."""
         spec = self.spec
-        self.env = wrap_in_normaliser(self.seat, spec)
+        self.env = wrap_in_normaliser(self.agent_env, spec)
         parameters = dict(spec.parameters)
         if issubclass(algorithm_class(spec.algorithm), ARS):
-            parameters.setdefault("n_eval_episodes", self.seat.num_envs)
+            parameters.setdefault("n_eval_episodes", self.agent_env.num_envs)
         with self.streams.active():
             try:
                 self.model = build(spec.algorithm, spec.policy, self.env, parameters, seed=self._seed, device="cpu")
             except RecipeError as error:
-                raise RecipeError(f"{self.seat.title}: {error}") from error
-        frequency = getattr(self.model, "train_freq", None)
-        if self.seat.num_envs > 1 and isinstance(frequency, TrainFreq) and frequency.unit is TrainFrequencyUnit.EPISODE:
+                raise RecipeError(f"{self.agent_env.title}: {error}") from error
+        frequency, rows = getattr(self.model, "train_freq", None), self.agent_env.num_envs
+        if rows > 1 and isinstance(frequency, TrainFreq) and frequency.unit is TrainFrequencyUnit.EPISODE:
             raise RecipeError(
-                f"{self.seat.title}: parameters.train_freq: {spec.algorithm} learns after whole episodes in a single "
-                f"environment only, not in {self.seat.num_envs}; give a number of steps"
+                f"{self.agent_env.title}: parameters.train_freq: {spec.algorithm} learns after whole episodes in a "
+                f"single environment only, not in {rows}; give a number of steps"
             )
         return self
 
     def load(self, folder: Path) -> Learner:
-        """Make the algorithm, and go on with what it knew when it had learnt enough.
+        """Make the algorithm, and load the state that it had at the end of a training.
 
         Raises:
             RunError: if a file is missing, cannot be read, or is of another learner.
         """
         self.build()
-        told = read_tree(folder, f"{self.name}.state")
-        with self._naming(folder):
-            self._set(told)
+        state = read_tree(folder, f"{self.name}.state")
+        with self._errors_name_file(folder):
+            self._set(state)
         self.model._last_obs = None  # the episode that was under way is over
-        self._begun = self.model.num_timesteps
+        self._first_timestep = self.model.num_timesteps
         return self
 
-    def go_on(self, folder: Path) -> Learner:
-        """Make the algorithm, and go on to the bit from where it was saved in the middle of a training.
+    def restore(self, folder: Path) -> Learner:
+        """Make the algorithm, and resume, to the bit, from where it was saved in the middle of a training.
 
-        One of a stack is brought into its state at once, one that learns by itself at its first boundary.
+        A learner of a stack loads its state at once, one that learns by itself at its first barrier.
 
         Raises:
             RunError: if a file is missing, cannot be read, or is of another learner.
         """
         self.build()
-        told, noted = read_tree(folder, f"{self.name}.state"), read_tree(folder, f"{self.name}.journal")
+        state, log = read_tree(folder, f"{self.name}.state"), read_tree(folder, f"{self.name}.journal")
 
-        def read() -> None:
-            with self._naming(folder):
-                self._set(told)
-                self.streams.go_on(told["streams"], active=not self.was_stacked)
+        def load() -> None:
+            with self._errors_name_file(folder):
+                self._set(state)
+                self.streams.load_state_dict(state["streams"], active=not self.was_in_stack)
 
-        with self._naming(folder):
-            self.was_stacked = told["stacked"]
-            self._begun = told["model"]["values"]["_num_timesteps_at_start"]
-            self.model.num_timesteps = self._begun
-            self.boundary.again = [(action, StepResult(**handed)) for action, handed in noted]
-            self.boundary.begins_at(read, StepResult(**told["handed"]), told["acting"])
-            if self.was_stacked:
-                read()
-                self.boundary.begins_at(lambda: None, StepResult(**told["handed"]), told["acting"])
+        with self._errors_name_file(folder):
+            self.was_in_stack = state["stacked"]
+            self._first_timestep = state["model"]["values"]["_num_timesteps_at_start"]
+            self.model.num_timesteps = self._first_timestep
+            self.barrier.replay_log = [(action, StepResult.from_state(step)) for action, step in log]
+            if self.was_in_stack:
+                load()
+            at_barrier = (lambda: None) if self.was_in_stack else load
+            self.barrier.resume_from(at_barrier, StepResult.from_state(state["handed"]), state["acting"])
         return self
 
     @contextmanager
-    def _naming(self, folder: Path) -> Iterator[None]:
-        """Say of what cannot be read which file it is."""
+    def _errors_name_file(self, folder: Path) -> Iterator[None]:
+        """Name the file in errors that reading the state raises."""
         try:
             yield
         except (*UNREADABLE, RuntimeError, AssertionError) as error:
             path = folder / f"{self.name}.state.json"
-            raise RunError(f"{path}: cannot be read: {error}; it holds what {self.seat.title} knew") from error
+            raise RunError(f"{path}: cannot be read: {error}; it holds what {self.agent_env.title} knew") from error
 
-    def _set(self, told: Mapping[str, Any]) -> None:
-        set_model_state(self.model, told["model"])
+    def _set(self, state: Mapping[str, Any]) -> None:
+        set_model_state(self.model, state["model"])
         if isinstance(self.env, VecNormalize):
             if self.spec.start is not None and self.env.norm_obs:
                 freeze_statistics(self.env)
-            set_normaliser_state(self.env, told["normaliser"])
+            set_normaliser_state(self.env, state["normaliser"])
         buffer = getattr(self.model, "replay_buffer", None)
-        if buffer is not None and told["buffer"] is not None:
-            set_buffer_state(buffer, told["buffer"])
+        if buffer is not None and state["buffer"] is not None:
+            set_buffer_state(buffer, state["buffer"])
 
-    def write_state(self, folder: Path, more: Mapping[str, Any], *, stacked: bool = False, last: bool = False) -> None:
-        """Write all that the learner goes on from, with its policy, between two rollouts.
+    def write_state(self, folder: Path, more: Mapping[str, Any], *, in_stack: bool = False, last: bool = False) -> None:
+        """Write policy and state, from which the learner resumes; at a barrier or at the end.
 
         Args:
             folder: of the checkpoint.
-            more: what else belongs to the state.
-            stacked: whether it is one of a stack, whose streams are put away, as they are at the end.
-            last: whether the training is over, of which no replay buffer is kept.
+            more: further entries of the state.
+            in_stack: whether the learner is one of a stack; its random streams are not the active ones then.
+            last: whether the training is over: no replay buffer is kept, and the streams are not active.
         """
         self.save(folder)
-        kept = None if last else getattr(self.model, "replay_buffer", None)
-        told = {
+        buffer = None if last else getattr(self.model, "replay_buffer", None)
+        state = {
             "model": model_state(self.model),
             "normaliser": normaliser_state(self.env) if isinstance(self.env, VecNormalize) else None,
-            "buffer": None if kept is None else buffer_state(kept),
-            "streams": self.streams.told(active=not stacked and not last),
-            "stacked": stacked,
+            "buffer": None if buffer is None else buffer_state(buffer),
+            "streams": self.streams.state_dict(active=not in_stack and not last),
+            "stacked": in_stack,
         }
-        write_tree(folder, f"{self.name}.state", {**told, **more})
+        write_tree(folder, f"{self.name}.state", {**state, **more})
 
     def write_journal(self, folder: Path) -> None:
-        """Write what came after the state that it wrote."""
-        noted = self.boundary.noted or []
-        write_tree(folder, f"{self.name}.journal", [(action, handed.told()) for action, handed in noted])
+        """Write the steps since the state was written: the replay log."""
+        log = [(action, step.state_dict()) for action, step in self.barrier.log or []]
+        write_tree(folder, f"{self.name}.journal", log)
 
     def budget(self, steps: int) -> int:
         """Joint steps after which it is stopped; only ARS, which may be in mid-update then, does not stop by itself."""
         if isinstance(self.model, ARS):
-            return math.ceil(self.spec.steps_of(steps) / self.seat.copies)
+            return math.ceil(self.spec.steps_of(steps) / self.agent_env.copies)
         return 2**62
 
     @property
     def demonstrations(self) -> int:
         """Number of the learner's own steps by which its demonstrations are over; 0 if it needs none, or no more."""
-        asked = self.spec.demonstrations
-        joint = 0 if asked is None else math.ceil(asked.steps / self.seat.copies)
-        steps = joint * steps_counted(self.model, self.seat.num_envs)
+        settings = self.spec.demonstrations
+        joint = 0 if settings is None else math.ceil(settings.steps / self.agent_env.copies)
+        steps = joint * steps_counted(self.model, self.agent_env.num_envs)
         return steps if steps > self.model.num_timesteps else 0
 
     def learn(self, steps: int, callback: BaseCallback | None) -> None:
@@ -215,74 +215,73 @@ class Learner:
 
         A shared policy makes one step of its own for each of its agents. Demonstrations come first, and count.
         """
-        if self.boundary.acting is not None:
+        if self.barrier.acting_state is not None:
             return
-        if self.demonstrator is not None and not self.boundary.resuming:
-            leader, view = self.demonstrator, self.seat.view
-            self.shown = True
-            demonstrate(self.model, self.demonstrations, lambda: view.join(leader.act()))
-            self.shown, self._begun = False, self.model.num_timesteps
-        rows = self.seat.num_envs // self.seat.copies
-        total = self.spec.steps_of(steps) * rows - self._begun
+        if (controller := self.demonstrator) is not None and not self.barrier.is_restoring:
+            self.follows_demonstrator = True
+            demonstrate(self.model, self.demonstrations, lambda: self.agent_env.view.join(controller.act()))
+            self.follows_demonstrator, self._first_timestep = False, self.model.num_timesteps
+        rows = self.agent_env.num_envs // self.agent_env.copies
+        total = self.spec.steps_of(steps) * rows - self._first_timestep
         if isinstance(self.model, ARS):
             # It counts each step of its copies once for every copy, and schedules by this number, done before or not.
-            total = self.budget(steps) * steps_counted(self.model, self.seat.num_envs)
+            total = self.budget(steps) * steps_counted(self.model, self.agent_env.num_envs)
         self._learn(total, callback)
 
     def learn_on(self, steps: int, callback: BaseCallback | None) -> None:
-        """Run the algorithm's own ``learn()`` for so many steps more, from what its seat shows now."""
-        self._begun, self.model._last_obs = self.model.num_timesteps, None
-        counted = steps_counted(self.model, self.seat.num_envs) if isinstance(self.model, ARS) else self.seat.num_envs
-        self._learn(math.ceil(steps / self.seat.copies) * counted, callback)
+        """Run the algorithm's own ``learn()`` for so many steps more, from the present observation."""
+        self._first_timestep, self.model._last_obs = self.model.num_timesteps, None
+        joint_steps = math.ceil(steps / self.agent_env.copies)
+        self._learn(joint_steps * steps_counted(self.model, self.agent_env.num_envs), callback)
 
     def _learn(self, total: int, callback: BaseCallback | None) -> None:
         """Run the algorithm's own ``learn()`` for ``total`` steps as it counts them, or until it is stopped."""
         if total > 0:
-            callbacks = [each for each in (AtRollouts(self.boundary), callback) if each is not None]
+            callbacks = [hook for hook in (BarrierCallback(self.barrier), callback) if hook is not None]
             try:
-                with at_updates(self.model, self.boundary):
-                    self.model.learn(total, callback=callbacks, reset_num_timesteps=self._begun == 0)
+                with barrier_at_updates(self.model, self.barrier):
+                    self.model.learn(total, callback=callbacks, reset_num_timesteps=self._first_timestep == 0)
             except BudgetSpent:
                 if callback is not None:
                     callback.on_training_end()
 
     def act(self) -> None:
-        """Act for ever by the learnt policy, learning nothing."""
-        known = self.boundary.acting or {"memory": None, "starts": np.ones(self.seat.num_envs, dtype=bool)}
-        state, done = known["memory"], known["starts"]
+        """Act by the learnt policy until the training ends, learning nothing."""
+        fresh = {"memory": None, "starts": np.ones(self.agent_env.num_envs, dtype=bool)}
+        state = dict(self.barrier.acting_state or fresh)
         while True:
-            self.boundary.reached({"memory": state, "starts": done})
-            observation = self.seat.reset()
+            self.barrier.arrive(dict(state))
+            observation = self.agent_env.reset()
             if isinstance(self.env, VecNormalize):
                 observation = self.env.normalize_obs(observation)  # type: ignore[arg-type]
-            action, state = predict_action(self.model, observation, state, done, self.seat)
-            _, _, done, _ = self.seat.step(action)
+            action, state["memory"] = predict_action(self.model, observation, **state, env=self.agent_env)
+            _, _, state["starts"], _ = self.agent_env.step(action)
 
     def save(self, folder: Path) -> None:
-        """Write what acts: policy and normaliser, and a learnt entropy coefficient for who starts from it."""
-        told = {
+        """Write policy, normaliser and a learnt entropy coefficient: enough to act, and to start another run from."""
+        state = {
             "algorithm": self.spec.algorithm,
             "policy": dict(self.model.policy.state_dict()),
             "variables": variables(self.model),
             "normaliser": normaliser_state(self.env) if isinstance(self.env, VecNormalize) else None,
         }
-        write_tree(folder, self.name, told)
+        write_tree(folder, self.name, state)
 
     def take(self, folder: Path) -> Learner:
-        """Take over what ``save`` wrote.
+        """Load what ``save`` wrote.
 
         Raises:
             RunError: if a file is missing, cannot be read, or is of another learner.
         """
-        told, path = read_tree(folder, self.name), folder / f"{self.name}.json"
+        state, path = read_tree(folder, self.name), folder / f"{self.name}.json"
         try:
-            if told["algorithm"] != self.spec.algorithm:
-                raise RunError(f"it is of {told['algorithm']}, not {self.spec.algorithm}")
-            self.model.policy.load_state_dict(told["policy"])
-            set_variables(self.model, told["variables"])
+            if state["algorithm"] != self.spec.algorithm:
+                raise RunError(f"it is of {state['algorithm']}, not {self.spec.algorithm}")
+            self.model.policy.load_state_dict(state["policy"])
+            set_variables(self.model, state["variables"])
             keep_parameters(self.model)
             if isinstance(self.env, VecNormalize):
-                set_normaliser_state(self.env, told["normaliser"], returns=False)
+                set_normaliser_state(self.env, state["normaliser"], returns=False)
         except (RunError, RuntimeError) as error:
             message = f"{path}: '{self.name}' is for other observations or actions: {error}"
             raise RunError(message) from error
@@ -294,7 +293,7 @@ class Learner:
 def predict_action(
     model: BaseAlgorithm, observation: Any, memory: Any, starts: Any, env: VecEnv, *, deterministic: bool = True
 ) -> tuple[Any, Any]:
-    """Return what a policy does and remembers; only what is legal if it knows of masks and ``env`` has some."""
+    """Return actions and recurrent state of a policy; legal actions only if it takes masks and ``env`` has some."""
     masks: dict[str, Any] = {}
     if isinstance(model, MaskablePPO) and is_masking_supported(env):
         masks = {"action_masks": get_action_masks(env)}
@@ -302,7 +301,7 @@ def predict_action(
 
 
 def load_acting_learner(folder: Path, group: Group, env: MultiAgentVectorEnv) -> Learner:
-    """Return a learner that acts by what a checkpoint holds of ``group``, and is not made to learn."""
+    """Return the learner of ``group`` with the policy of a checkpoint, to act only."""
     parameters = {key: value for key, value in group.spec.parameters.items() if key in ACTING_PARAMETERS}
     if has_replay_buffer(group.spec.algorithm):
         parameters["buffer_size"] = 1
@@ -310,58 +309,10 @@ def load_acting_learner(folder: Path, group: Group, env: MultiAgentVectorEnv) ->
     return Learner(AgentVecEnv(env, group.name, group.view(env), wait), spec, 0).build().take(folder)
 
 
-class AtRollouts(BaseCallback):
-    """Tells of the beginning of every rollout of an algorithm that collects them."""
-
-    def __init__(self, boundary: CheckpointBarrier) -> None:
-        """Tell ``boundary``."""
-        super().__init__()
-        self._boundary = boundary
-
-    def _on_rollout_start(self) -> None:
-        if not isinstance(self.model, ARS):
-            self._boundary.reached()
-
-    def _on_step(self) -> bool:
-        return True
-
-
-class _ScheduleAtUpdates:
-    """A schedule that ARS asks for at the beginning of every update, before it draws; it is saved as it was."""
-
-    def __init__(self, schedule: Schedule, model: ARS, boundary: CheckpointBarrier) -> None:
-        self._schedule, self._model, self._boundary = schedule, model, boundary
-
-    def __call__(self, _remaining: float) -> float:
-        self._boundary.reached()
-        return self._schedule(self._model._current_progress_remaining)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _itself, (self._schedule,)
-
-
-def _itself(value: Any) -> Any:
-    return value
-
-
-@contextmanager
-def at_updates(model: BaseAlgorithm, boundary: CheckpointBarrier) -> Iterator[None]:
-    """Tell ``boundary`` of the beginning of every update of ARS, which draws its candidates before its rollouts."""
-    if not isinstance(model, ARS):
-        yield
-        return
-    schedule = model.delta_std_schedule
-    model.delta_std_schedule = _ScheduleAtUpdates(schedule, model, boundary)  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        model.delta_std_schedule = schedule
-
-
 def wrap_in_normaliser(env: VecEnv, spec: LearnerSettings, keys: list[str] | None = None) -> VecEnv:
     """Return ``env`` behind the normaliser that the settings ask for, if they do; of a dict ``keys`` are normalised."""
     normalise = spec.normalise
-    if not normalise.any:
+    if not normalise.is_on:
         return env
     return VecNormalize(
         env,

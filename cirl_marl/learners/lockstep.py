@@ -65,18 +65,18 @@ class Streams:
     def torch_state(self, state: torch.Tensor) -> None:
         self._torch = state
 
-    def told(self, *, active: bool) -> dict[str, Any]:
+    def state_dict(self, *, active: bool) -> dict[str, Any]:
         """Return the state of the streams, which are the ``active`` ones or put away."""
         if active:
             self._leave()
         numpy = self._numpy.state if self._numpy_state is None else self._numpy_state
         return {"torch": self._torch, "numpy": numpy, "gaussian": self._numpy_state is not None}
 
-    def go_on(self, told: Mapping[str, Any], *, active: bool) -> None:
+    def load_state_dict(self, saved: Mapping[str, Any], *, active: bool) -> None:
         """Bring the streams into a state."""
-        self._torch, state = told["torch"], told["numpy"]
+        self._torch, state = saved["torch"], saved["numpy"]
         self._numpy.state = {"bit_generator": state["bit_generator"], "state": state["state"]}
-        self._numpy_state = state if told["gaussian"] else None
+        self._numpy_state = state if saved["gaussian"] else None
         if active:
             self._enter()
 
@@ -90,10 +90,10 @@ class Streams:
             finally:
                 self._leave()
 
-    def switch_to(self, other: Streams) -> None:
-        """Put these away and make ``other`` the active ones."""
+    def switch_to(self, successor: Streams) -> None:
+        """Put these away and make ``successor`` the active ones."""
         self._leave()
-        other._enter()
+        successor._enter()
 
     def _leave(self) -> None:
         self._torch = torch.get_rng_state()
@@ -154,15 +154,17 @@ class World:
     ``joint_steps`` are steps done, each in every copy, those of a run that is resumed included.
     """
 
-    def __init__(self, env: JointEnv, seeds: Sequence[int], seats: Mapping[str, AgentVecEnv], *, done: int = 0) -> None:
+    def __init__(
+        self, env: JointEnv, seeds: Sequence[int], agent_envs: Mapping[str, AgentVecEnv], *, done: int = 0
+    ) -> None:
         """Reset ``env`` with one of ``seeds`` per copy for those in ``seats``, after ``done`` joint steps before.
 
         Together they act for every agent once.
         """
-        self.env, self.seats, self.joint_steps = env, dict(seats), done
+        self.env, self.agent_envs, self.joint_steps = env, dict(agent_envs), done
         observations = env.reset(seed=list(seeds))
-        for seat in self.seats.values():
-            seat.show(observations, env.state)
+        for agent_env in self.agent_envs.values():
+            agent_env.receive_reset(observations, env.state)
         self._returns = np.zeros((len(env.agents), env.num_envs))
         self._lengths = np.zeros((len(env.agents), env.num_envs), dtype=int)
 
@@ -173,17 +175,17 @@ class World:
             LearnerError: if an action cannot be used.
         """
         actions: dict[str, NDArray[np.floating]] = {}
-        for seat in self.seats.values():
-            if not seat.absent:
-                assert seat.action is not None
-                actions.update(seat.view.act(seat.action))
+        for agent_env in self.agent_envs.values():
+            if not agent_env.absent:
+                assert agent_env.action is not None
+                actions.update(agent_env.view.act(agent_env.action))
         try:
             observations, rewards, terminations, truncations, infos = self.env.step(actions)
         except ControlError as error:
             raise LearnerError(f"a learner failed at joint step {self.joint_steps}: {error}") from error
         self.joint_steps += 1
         truncated = np.array(list(truncations.values()))
-        ended = truncated | list(terminations.values())
+        dones = truncated | list(terminations.values())
         self._returns = self._returns + list(rewards.values())
         self._lengths = self._lengths + self._took_part()
         returns = self._by_agent(self._returns)
@@ -191,20 +193,20 @@ class World:
             observations,
             self.env.state,
             rewards,
-            self._by_agent(ended),
+            self._by_agent(dones),
             self._by_agent(truncated),
             returns,
             self._by_agent(self._lengths),
             infos,
         )
-        for seat in self.seats.values():
-            seat.hand(step)
+        for agent_env in self.agent_envs.values():
+            agent_env.receive_step(step)
         if hook is not None:
-            if ended.any():
+            if dones.any():
                 for agent, total in returns.items():
                     infos[agent]["episode_return"] = total.copy()
-            hook(infos, ended.all(axis=0))
-        self._returns, self._lengths = np.where(ended, 0.0, self._returns), np.where(ended, 0, self._lengths)
+            hook(infos, dones.all(axis=0))
+        self._returns, self._lengths = np.where(dones, 0.0, self._returns), np.where(dones, 0, self._lengths)
 
     def _took_part(self) -> int | NDArray[np.integer]:
         """Return 1 for each agent and copy in which it acted."""
@@ -231,19 +233,19 @@ class NetworkWorld(World):
             env, seeds, {name: AgentVecEnv(env, name, view, wait) for name, view in views.items()}, done=done
         )
 
-    def told(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """Return all that a world goes on from, but for its learners."""
         now = self.env.snapshot()
-        state = {each.name: getattr(now.state, each.name) for each in fields(State)}
-        own = {"returns": self._returns, "lengths": self._lengths, "weight": self.env.circularity_weight}
-        return {"state": state, "streams": list(now.streams), "joint_steps": self.joint_steps, **own}
+        state = {part.name: getattr(now.state, part.name) for part in fields(State)}
+        progress = {"returns": self._returns, "lengths": self._lengths, "weight": self.env.circularity_weight}
+        return {"state": state, "streams": list(now.streams), "joint_steps": self.joint_steps, **progress}
 
-    def go_on(self, told: Mapping[str, Any]) -> None:
+    def load_state_dict(self, saved: Mapping[str, Any]) -> None:
         """Go on from what a world of the same environment told; seats are handed what came last by others."""
-        streams = tuple(told["streams"])
-        self.env.restore(Snapshot(State(**told["state"]), streams, self.env.agents, self.env.network))
-        self.env.circularity_weight = told["weight"]
-        self.joint_steps, self._returns, self._lengths = told["joint_steps"], told["returns"], told["lengths"]
+        streams = tuple(saved["streams"])
+        self.env.restore(Snapshot(State(**saved["state"]), streams, self.env.agents, self.env.network))
+        self.env.circularity_weight = saved["weight"]
+        self.joint_steps, self._returns, self._lengths = saved["joint_steps"], saved["returns"], saved["lengths"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +267,7 @@ class Participant:
     learn: Callable[[], None]
     act: Callable[[], None]
     streams: Streams
-    boundaries: Sequence[CheckpointBarrier] = ()
+    barriers: Sequence[CheckpointBarrier] = ()
     busy: Callable[[], bool] = lambda: False
     budget: Callable[[], int] = lambda: 2**62
     absent: Callable[[], bool] = lambda: False
@@ -277,19 +279,19 @@ class Lockstep:
     def __init__(self, worlds: Sequence[World], participants: Sequence[Participant]) -> None:
         """``participants`` are resumed in their order; together they occupy every seat of ``worlds``."""
         self._worlds, self._participants = worlds, participants
-        self._own = Streams()
+        self._caller_streams = Streams()
         self._coroutines: list[greenlet] = []
-        self._learning: set[int] = set()
+        self._learners: set[int] = set()
 
     @property
-    def saved(self) -> bool:
+    def all_have_saved(self) -> bool:
         """Whether every learner has written the state that was asked for."""
-        return all(each.noted is not None for some in self._participants for each in some.boundaries)
+        return all(barrier.log is not None for participant in self._participants for barrier in participant.barriers)
 
     @property
     def busy(self) -> bool:
         """Whether somebody will come to no boundary soon."""
-        return any(each.busy() for each in self._participants)
+        return any(participant.busy() for participant in self._participants)
 
     def run(self, hooks: Sequence[StepHook] | None = None, after: Callable[[], None] = lambda: None) -> None:
         """Run every learner to its end.
@@ -302,20 +304,20 @@ class Lockstep:
             LearnerError: if a learner raises; names it and the joint step.
             TrainingInterrupted: if it was enough.
         """
-        self._learning = set(range(len(self._participants)))
+        self._learners = set(range(len(self._participants)))
         try:
             for i, participant in enumerate(self._participants):
                 self._coroutines.append(greenlet(self._task(i, participant)))
                 self._coroutines[i].gr_context = copy_context()
                 if not participant.absent():
                     self._resume(i)
-                    self._again(i)
-            while self._learning:
+                    self._replay(i)
+            while self._learners:
                 for place, world in enumerate(self._worlds):
                     world.step(hooks[place] if hooks is not None else None)
                 for participant in self._participants:
-                    for boundary in participant.boundaries:
-                        boundary.note()
+                    for boundary in participant.barriers:
+                        boundary.record()
                 after()
                 for i in range(len(self._participants)):
                     self._turn(i, self._joint_steps)
@@ -326,19 +328,19 @@ class Lockstep:
         """Let a participant go on after a joint step, and stop it if it has used up its steps."""
         if not self._participants[i].absent():
             self._resume(i)
-        if i in self._learning and step >= self._participants[i].budget():
+        if i in self._learners and step >= self._participants[i].budget():
             self._stop_learning(i)
 
-    def _again(self, i: int) -> None:
+    def _replay(self, i: int) -> None:
         """Hand a participant that goes on again what it was handed before."""
-        boundaries = self._participants[i].boundaries
-        count = max((len(each.again) for each in boundaries), default=0)
+        boundaries = self._participants[i].barriers
+        count = max((len(barrier.replay_log) for barrier in boundaries), default=0)
         for place in range(count):
-            for each in boundaries:
-                each.repeat(place)
+            for barrier in boundaries:
+                barrier.replay_step(place)
             self._turn(i, self._joint_steps - count + place + 1)
-        for each in boundaries:
-            each.again = []
+        for barrier in boundaries:
+            barrier.replay_log = []
 
     @property
     def _joint_steps(self) -> int:
@@ -350,9 +352,9 @@ class Lockstep:
             try:
                 participant.learn()
             except GreenletExit:
-                if i in self._learning:
+                if i in self._learners:
                     return  # training is over for everyone
-            self._learning.discard(i)
+            self._learners.discard(i)
             participant.act()
 
         return run
@@ -368,14 +370,14 @@ class Lockstep:
 
     def _stop_learning(self, i: int) -> None:
         """End ``learn()`` of a learner that has used up its steps; it goes on acting from its next turn."""
-        self._learning.discard(i)
+        self._learners.discard(i)
         if self._coroutines[i]:
             self._enter(i, lambda: self._coroutines[i].throw(BudgetSpent))
         else:  # it was absent from the beginning, and has not begun
             self._coroutines[i] = greenlet(self._participants[i].act)
 
     def _end(self) -> None:
-        self._learning = set(range(len(self._participants)))
+        self._learners = set(range(len(self._participants)))
         for i, coroutine in enumerate(self._coroutines):
             if not coroutine.dead:
                 self._enter(i, lambda: coroutine.throw(GreenletExit))  # noqa: B023 (called at once)
@@ -384,8 +386,8 @@ class Lockstep:
     def _enter(self, i: int, action: Callable[[], object]) -> None:
         """Do something in the random streams of a participant."""
         streams = self._participants[i].streams
-        self._own.switch_to(streams)
+        self._caller_streams.switch_to(streams)
         try:
             action()
         finally:
-            streams.switch_to(self._own)
+            streams.switch_to(self._caller_streams)

@@ -57,12 +57,12 @@ class Policies(Controller):
         actions: dict[str, NDArray[np.floating]] = {}
         for name, policy in self._policies.items():
             view = policy.view
-            seen = view.observe(observations, self._state)
+            rows = view.observe(observations, self._state)
             if policy.normaliser is not None:
-                seen = policy.normaliser.normalize_obs(seen)
+                rows = policy.normaliser.normalize_obs(rows)
             starts = np.tile(self._starts, max(1, len(view.row_agents)))
-            chosen, self._memory[name] = policy.model.predict(seen, self._memory[name], starts, deterministic=True)
-            actions.update(view.act(chosen))
+            action, self._memory[name] = policy.model.predict(rows, self._memory[name], starts, deterministic=True)
+            actions.update(view.act(action))
         self._starts = np.zeros_like(self._starts)
         return actions
 
@@ -80,14 +80,14 @@ class DifferentiablePolicy(torch.nn.Module):
         self._policy, self._view = policy.model.policy, policy.view
         self._policy.set_training_mode(False)
         normaliser = policy.normaliser
-        self._scaled: tuple[torch.Tensor, torch.Tensor, float] | None = None
+        self._normaliser: tuple[torch.Tensor, torch.Tensor, float] | None = None
         if normaliser is not None and normaliser.norm_obs:
             statistics: Any = normaliser.obs_rms
             if isinstance(statistics, dict):
                 statistics = statistics.get("observation")
             if statistics is not None:
                 spread = (torch.as_tensor(statistics.var) + normaliser.epsilon).sqrt()
-                self._scaled = torch.as_tensor(statistics.mean), spread, normaliser.clip_obs
+                self._normaliser = torch.as_tensor(statistics.mean), spread, normaliser.clip_obs
 
     @property
     def remembers(self) -> bool:
@@ -99,16 +99,16 @@ class DifferentiablePolicy(torch.nn.Module):
 
         ``memory`` are what it remembers, hidden and cell states, shape (rows, layers, units) each.
         """
-        if self._scaled is not None:
-            mean, spread, clip = self._scaled
+        if self._normaliser is not None:
+            mean, spread, clip = self._normaliser
             rows = ((rows - mean) / spread).clamp(-clip, clip).to(rows.dtype)
-        seen: Any = rows
+        inputs: Any = rows
         if self._view.state_entries:
             # no action depends on the state (``central_critic``)
-            seen = {"observation": rows, "state": rows.new_zeros((len(rows), self._view.state_entries))}
+            inputs = {"observation": rows, "state": rows.new_zeros((len(rows), self._view.state_entries))}
         policy: Any = self._policy
         if not self.remembers:
-            acted: torch.Tensor = policy._predict(seen, deterministic=True)
-            return acted
-        states = tuple(each.transpose(0, 1).contiguous() for each in memory)
-        return policy._predict(seen, states, rows.new_zeros(len(rows)), deterministic=True)[0]  # type: ignore[no-any-return]
+            action: torch.Tensor = policy._predict(inputs, deterministic=True)
+            return action
+        states = tuple(state.transpose(0, 1).contiguous() for state in memory)
+        return policy._predict(inputs, states, rows.new_zeros(len(rows)), deterministic=True)[0]  # type: ignore[no-any-return]

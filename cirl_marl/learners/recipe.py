@@ -66,7 +66,7 @@ class Normalisation(Settings):
     clip_reward: Limit = 10.0
 
     @property
-    def any(self) -> bool:
+    def is_on(self) -> bool:
         """Whether anything is normalised."""
         return self.observation or self.reward
 
@@ -167,8 +167,8 @@ class Match(LearnerSettings):
         """Return whether the match names ``agent``."""
         compartment = network.compartments[agent]
         kind, role = ("node", compartment.role) if isinstance(compartment, Node) else ("arc", None)
-        named = self.agents is None or agent in self.agents
-        return named and self.kind in (None, kind) and self.role in (None, role)
+        is_listed = self.agents is None or agent in self.agents
+        return is_listed and self.kind in (None, kind) and self.role in (None, role)
 
 
 class Run(Settings):
@@ -257,20 +257,20 @@ class Recipe(Settings):
     def groups(self, network: Network, agents: Sequence[str]) -> tuple[Group, ...]:
         """Return the learners of ``agents``, in the order of their first agents."""
         specs = [self.learner, *self.match]
-        found: dict[str, Group] = {}
+        groups: dict[str, Group] = {}
         for agent in agents:
             spec = self.learner_of(agent, network)
             name = agent
             if spec.scheme != "independent":
-                alike = sum(other.scheme == spec.scheme for other in specs)
-                number = next(i for i, other in enumerate(specs) if other is spec)
+                alike = sum(settings.scheme == spec.scheme for settings in specs)
+                number = next(i for i, settings in enumerate(specs) if settings is spec)
                 name = f"{spec.scheme}-learner" + (f"-{number}" if alike > 1 else "")
                 if spec.among == "copies":
                     self._has_copies(network)
                     name += f"-{network.counterpart(agent) or agent}"
-            members = found[name].agents if name in found else ()
-            found[name] = Group(name, (*members, agent), spec)
-        return tuple(found.values())
+            members = groups[name].agents if name in groups else ()
+            groups[name] = Group(name, (*members, agent), spec)
+        return tuple(groups.values())
 
     def _has_copies(self, network: Network) -> None:
         if not network.copies:
@@ -290,9 +290,9 @@ class Recipe(Settings):
         )
 
     def _refuse(self, mistakes: Iterable[str]) -> None:
-        found = "; ".join(mistakes)
-        if found:
-            raise RecipeError(f"recipe '{self.name}': {found}")
+        text = "; ".join(mistakes)
+        if text:
+            raise RecipeError(f"recipe '{self.name}': {text}")
 
     def mistakes(self, steps: int) -> Iterator[str]:
         """Yield what is wrong whatever the network, in a run of ``steps``: key, value and what would do."""
@@ -306,8 +306,8 @@ class Recipe(Settings):
         if self.run.price_rate and (self.run.min_service is None or not self.run.evaluations):
             lacks = "evaluations are 0" if self.run.min_service is not None else "min_service is not given"
             yield f"run.price_rate: moves the price of service after evaluations to reach min_service, but {lacks}"
-        for where, learner in self.learners():
-            yield from (f"{where}.{mistake}" for mistake in learner.mistakes(steps))
+        for place, learner in self.learners():
+            yield from (f"{place}.{mistake}" for mistake in learner.mistakes(steps))
 
     def learners(self) -> tuple[tuple[str, LearnerSettings], ...]:
         """Return every learner and what messages call its table."""
@@ -348,5 +348,5 @@ def load_recipe(name: str | Path) -> Recipe:
 def _sound_part(document: Mapping[str, Any], faulty: Set[str]) -> Recipe:
     """Return a recipe of the keys that are not ``faulty``, so that mistakes in what they hold are named as well."""
     stand_in = {"name": "?", "title": "?", "run": {"steps": 2**53}, "learner": {"algorithm": "PPO"}}
-    kept = {key: value for key, value in document.items() if key not in faulty}
-    return Recipe.model_validate(kept | {key: stand_in[key] for key in faulty & stand_in.keys()})
+    sound = {key: value for key, value in document.items() if key not in faulty}
+    return Recipe.model_validate(sound | {key: stand_in[key] for key in faulty & stand_in.keys()})

@@ -48,12 +48,19 @@ from cirl_marl.records.machine import versions
 STATES = ("running", "complete", "interrupted", "failed")
 CHECKPOINT = re.compile(r"\d{9,}-(start|running|interrupted|complete|best|failed)")
 """Names of checkpoints."""
-BEGUN = {"network", "network.toml", "versions.json", ".versions.partial.json", "status.json", ".status.partial.json"}
-BEGUN |= {".config.partial.json", ".lock"}
+FILES_BEFORE_CONFIG = {
+    "network",
+    "network.toml",
+    "versions.json",
+    ".versions.partial.json",
+    "status.json",
+    ".status.partial.json",
+}
+FILES_BEFORE_CONFIG |= {".config.partial.json", ".lock"}
 """What is in the directory of a run before its description is."""
 PARTIAL = "next.partial"
 """Folder of a checkpoint that is being written."""
-KEPT = 3
+CHECKPOINTS_TO_KEEP = 3
 """Checkpoints that are kept, should the newest be damaged."""
 
 
@@ -113,7 +120,7 @@ class RunDirectory:
             RunError: if the directory already holds something, or the configuration cannot be written to a file.
         """
         run = cls(path)
-        if run._begun_only():
+        if run._is_half_made():
             shutil.rmtree(run.path)
         if run.path.exists() and (not run.path.is_dir() or any(run.path.iterdir())):
             raise RunError(f"{run.path}: already exists and is not empty; choose another directory, or resume it")
@@ -124,25 +131,25 @@ class RunDirectory:
         except (TypeError, ValueError) as error:
             raise RunError(f"{run.path}: a run on disk needs a recipe of plain values: {error}") from error
         run.path.mkdir(parents=True, exist_ok=True)
-        kept = run.path / "network" if config.data_sha256 else run.path
+        folder = run.path / "network" if config.data_sha256 else run.path
         data = {name: definition.parent / name for name in config.data_sha256}
         for name, source in {"network.toml": definition, **data}.items():
-            (kept / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, kept / name)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, folder / name)
         write_json(run.path / "versions.json", versions())
         run.set_status("running", 0, None)
         write_json(run.path / "config.json", plain)  # the last: with it the directory is a run
         return run
 
-    def _begun_only(self) -> bool:
+    def _is_half_made(self) -> bool:
         """Return whether the directory is what a crash left when it was made: parts of a run, no description."""
         if self.path.is_symlink() or not self.path.is_dir():
             return False
         names = {each.name for each in self.path.iterdir()}
-        return "versions.json" in names and names <= BEGUN
+        return "versions.json" in names and names <= FILES_BEFORE_CONFIG
 
     @contextmanager
-    def claimed(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Keep other processes from training this run at the same time; a ``RunError`` if one does."""
         lock = FileLock(self.path / ".lock", blocking=False)
         try:
@@ -163,8 +170,8 @@ class RunDirectory:
         try:
             return RunConfig.model_validate(plain)
         except ValidationError as error:
-            found = "; ".join(validation_mistakes(error, RunConfig))
-            raise RunError(f"{self.path / 'config.json'}: is not a run configuration: {found}") from error
+            mistakes = "; ".join(validation_mistakes(error, RunConfig))
+            raise RunError(f"{self.path / 'config.json'}: is not a run configuration: {mistakes}") from error
 
     @property
     def status(self) -> dict[str, Any]:
@@ -193,7 +200,7 @@ class RunDirectory:
             raise RunError(f"{self.path / 'versions.json'}: is no table of versions")
         return [f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]]
 
-    def go_on(self, config: RunConfig, checkpoint: Path | None) -> None:
+    def reopen(self, config: RunConfig, checkpoint: Path | None) -> None:
         """Say that the run goes on from ``checkpoint``, to the steps of ``config``, which is its own but for these."""
         write_json(self.path / "config.json", config.model_dump(mode="json"))
         done, name = (0, None) if checkpoint is None else (steps_of(checkpoint), checkpoint.name)
@@ -216,12 +223,12 @@ class RunDirectory:
         return self._checkpoint(self.status["checkpoint"])
 
     @property
-    def chosen(self) -> Path:
+    def acting_checkpoint(self) -> Path:
         """The checkpoint that acts: the best by evaluation, or the newest if none was evaluated; errors likewise."""
         status = self.status
         name = status["best"]["checkpoint"] if status["best"] is not None else status["checkpoint"]
-        failed = [each.name for each in self._saved() if each.name.endswith("-failed")]
-        return self._checkpoint(failed[-1] if name is None and failed else name)
+        failures = [path.name for path in self._checkpoints() if path.name.endswith("-failed")]
+        return self._checkpoint(failures[-1] if name is None and failures else name)
 
     def resumable(self) -> list[Path]:
         """Return the checkpoints from which the run can go on, the newest first."""
@@ -229,10 +236,10 @@ class RunDirectory:
         if newest is None:
             return []
         _check_name(newest, self.path)
-        older = [each for each in self._saved() if each.name < newest and not _acts_only(each)]
+        older = [each for each in self._checkpoints() if each.name < newest and not _acts_only(each)]
         return [self.path / "checkpoints" / newest, *reversed(older)]
 
-    def _saved(self) -> list[Path]:
+    def _checkpoints(self) -> list[Path]:
         """Return the folders of checkpoints in the order of their steps; strangers among them are left alone."""
         folder = self.path / "checkpoints"
         return sorted(each for each in folder.glob("*") if CHECKPOINT.fullmatch(each.name) and each.is_dir())
@@ -242,9 +249,9 @@ class RunDirectory:
             raise RunError(f"{self.path}: nothing was saved in this run yet (state: {self.status['state']})")
         _check_name(name, self.path)
         folder: Path = self.path / "checkpoints" / name
-        missing = [group.name for group in self.groups() if not (folder / f"{group.name}.json").is_file()]
-        if missing:
-            raise RunError(f"{folder}: the checkpoint lacks the policies of {', '.join(missing)}")
+        absentees = [group.name for group in self.groups() if not (folder / f"{group.name}.json").is_file()]
+        if absentees:
+            raise RunError(f"{folder}: the checkpoint lacks the policies of {', '.join(absentees)}")
         return folder
 
     def groups(self) -> tuple[Group, ...]:
@@ -263,8 +270,8 @@ class RunDirectory:
         if config.definition_sha256:
             files[self.definition] = config.definition_sha256
         for file, sha256 in files.items():
-            if (given := hashlib.sha256(file.read_bytes()).hexdigest()) != sha256:
-                raise RunError(f"{file}: is not the file of this training, whose SHA-256 was {sha256}; it is {given}")
+            if (actual := hashlib.sha256(file.read_bytes()).hexdigest()) != sha256:
+                raise RunError(f"{file}: is not the file of this training, whose SHA-256 was {sha256}; it is {actual}")
         address = f"{self.definition}:{config.region}" if config.region else self.definition
         return load_network(address, scenario=config.scenario)
 
@@ -325,13 +332,15 @@ class RunDirectory:
     def _drop(self) -> None:
         """Remove all checkpoints but the newest few, and the best ones to which they would go back."""
         status = self.status
-        newest, saved = status["checkpoint"], self._saved()
-        counted = [each for each in saved if newest is not None and each.name <= newest and not _acts_only(each)]
-        counted = counted[-1 if status["state"] == "complete" else -KEPT :]
-        kept = {each.name for each in counted} | {newest, (status["best"] or {}).get("checkpoint")}
-        kept |= {(_best_at(each) or {}).get("checkpoint") for each in counted}
-        for each in saved:
-            if each.name not in kept:
+        newest, checkpoints = status["checkpoint"], self._checkpoints()
+        resumable = [
+            each for each in checkpoints if newest is not None and each.name <= newest and not _acts_only(each)
+        ]
+        resumable = resumable[-1 if status["state"] == "complete" else -CHECKPOINTS_TO_KEEP :]
+        needed = {each.name for each in resumable} | {newest, (status["best"] or {}).get("checkpoint")}
+        needed |= {(_best_at(each) or {}).get("checkpoint") for each in resumable}
+        for each in checkpoints:
+            if each.name not in needed:
                 shutil.rmtree(each)
         for each in (self.path / "checkpoints").glob("*.partial"):
             if CHECKPOINT.fullmatch(each.stem):  # a crash left it
@@ -359,8 +368,8 @@ class RunDirectory:
     def _json(self, name: str) -> dict[str, Any]:
         if not (self.path / "config.json").is_file():
             beside = sorted(str(config.parent) for config in self.path.parent.glob("*/config.json"))
-            others = f": {unknown('run', self.path, beside)}" if beside else ""
-            raise RunError(f"no run in {self.path} (it has no config.json){others}")
+            hint = f": {unknown('run', self.path, beside)}" if beside else ""
+            raise RunError(f"no run in {self.path} (it has no config.json){hint}")
         path = self._file(name)
         try:
             value: dict[str, Any] = json.loads(path.read_text())
@@ -407,8 +416,8 @@ def _check_name(name: str, run: Path) -> None:
 
 def _links(folder: Path) -> Iterator[Path]:
     """Yield what is a link in a folder or below, which is never followed."""
-    for found, folders, files in os.walk(folder):
-        yield from (Path(found) / name for name in (*folders, *files) if (Path(found) / name).is_symlink())
+    for folder_path, folders, files in os.walk(folder):
+        yield from (Path(folder_path) / name for name in (*folders, *files) if (Path(folder_path) / name).is_symlink())
 
 
 def _acts_only(checkpoint: Path) -> bool:
@@ -466,6 +475,6 @@ class EvaluationsFile:
 
     def append(self, joint_step: int, copies: int, figures: dict[str, float], best: bool) -> None:
         """Write a row."""
-        own = [joint_step, joint_step * copies, *(f"{figures[name]:.10g}" for name in self.COLUMNS[2:-1]), int(best)]
+        cells = [joint_step, joint_step * copies, *(f"{figures[name]:.10g}" for name in self.COLUMNS[2:-1]), int(best)]
         with self._path.open("a", newline="") as file:
-            file.write(",".join(map(str, own)) + "\n")
+            file.write(",".join(map(str, cells)) + "\n")

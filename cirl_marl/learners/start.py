@@ -25,7 +25,7 @@ from cirl_marl.learners.recipe import LearnerSettings, Start
 from cirl_marl.learners.run_directory import Origin, RunDirectory
 from cirl_marl.learners.views import CENTRAL_CRITIC
 
-SHOWN = 3
+NAMES_LISTED = 3
 """Entries that a message lists of those that differ."""
 
 Bounds = tuple[float, float]
@@ -43,20 +43,23 @@ def begin_from(start: Start, learner: Learner, env: MultiAgentVectorEnv, seed: i
         run = RunDirectory(start.run.replace("{seed}", str(seed)))
         return _begin_from(run, start.agent or learner.name, learner, env)
     except CirlError as error:
-        raise RecipeError(f"{learner.seat.title}: start: {error}") from error
+        raise RecipeError(f"{learner.agent_env.title}: start: {error}") from error
 
 
 def _begin_from(run: RunDirectory, name: str, learner: Learner, env: MultiAgentVectorEnv) -> Origin:
     groups = {group.name: group for group in run.groups()}
     if name not in groups:
         raise RecipeError(f"{run.path}: {unknown('agent', name, groups)}")
-    there, source, folder = groups[name], run.make_env(1), run.chosen
+    there, source, folder = groups[name], run.make_env(1), run.acting_checkpoint
     _refuse(f"{run.path}: '{name}'", [*_other_settings(there.spec, learner.spec)])
-    seen = [_entries(*pair, learner.spec) for pair in ((source, there.agents), (env, learner.seat.view.agents))]
-    _refuse(f"{run.path}: '{name}'", [*_other_entries(*seen), *_other_actions(there.view(source), learner.seat.view)])
-    theirs = load_acting_learner(folder, there, source)
-    _refuse(f"{folder / name}.json:", [*_other_shapes(theirs.model, learner.model)])
-    _take_over(theirs, learner)
+    entries = [_entries(*pair, learner.spec) for pair in ((source, there.agents), (env, learner.agent_env.view.agents))]
+    _refuse(
+        f"{run.path}: '{name}'",
+        [*_other_entries(*entries), *_other_actions(there.view(source), learner.agent_env.view)],
+    )
+    source_learner = load_acting_learner(folder, there, source)
+    _refuse(f"{folder / name}.json:", [*_other_shapes(source_learner.model, learner.model)])
+    _take_over(source_learner, learner)
     files = [folder / f"{name}.{kind}" for kind in ("json", "safetensors")]
     hashes = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
     return Origin(run=str(run.path.resolve()), agent=name, checkpoint=folder.name, sha256=hashes)
@@ -69,29 +72,29 @@ def begin_again(folder: Path, learner: Learner) -> None:
         freeze_statistics(learner.env)
 
 
-def _refuse(what: str, mistakes: Sequence[str]) -> None:
+def _refuse(subject: str, mistakes: Sequence[str]) -> None:
     if mistakes:
-        raise RecipeError(f"{what} {'; '.join(mistakes)}")
+        raise RecipeError(f"{subject} {'; '.join(mistakes)}")
 
 
-def _take_over(theirs: Learner, learner: Learner) -> None:
+def _take_over(source: Learner, learner: Learner) -> None:
     """Copy the policy, a learnt entropy coefficient and the statistics of observations."""
-    mine, there = learner.model, theirs.model
-    mine.policy.load_state_dict(there.policy.state_dict())
+    mine, source_model = learner.model, source.model
+    mine.policy.load_state_dict(source_model.policy.state_dict())
     keep_parameters(mine)
-    known = variables(there)
-    set_variables(mine, {name: known.get(name, own) for name, own in variables(mine).items()})
-    if isinstance(theirs.env, VecNormalize) and isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
-        learner.env.obs_rms = copy.deepcopy(theirs.env.obs_rms)
+    source_variables = variables(source_model)
+    set_variables(mine, {name: source_variables.get(name, variable) for name, variable in variables(mine).items()})
+    if isinstance(source.env, VecNormalize) and isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
+        learner.env.obs_rms = copy.deepcopy(source.env.obs_rms)
         freeze_statistics(learner.env)
 
 
-def _other_settings(there: LearnerSettings, here: LearnerSettings) -> Iterator[str]:
+def _other_settings(source: LearnerSettings, target: LearnerSettings) -> Iterator[str]:
     """Yield which settings that a policy depends on differ."""
     for key in ("scheme", "algorithm", "policy", "normalise.observation", "normalise.clip_observation"):
-        old, new = (_at(settings, key) for settings in (there, here))
-        if old != new and not (key == "normalise.clip_observation" and not there.normalise.observation):
-            yield f"has {key} = {_written(old)}, not {_written(new)}"
+        old, new = (_at(settings, key) for settings in (source, target))
+        if old != new and not (key == "normalise.clip_observation" and not source.normalise.observation):
+            yield f"has {key} = {_toml(old)}, not {_toml(new)}"
 
 
 def _at(settings: Any, key: str) -> Any:
@@ -100,52 +103,54 @@ def _at(settings: Any, key: str) -> Any:
     return settings
 
 
-def _written(value: object) -> str:
+def _toml(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
 def _entries(env: MultiAgentVectorEnv, agents: Sequence[str], spec: LearnerSettings) -> dict[str, Bounds]:
     """Return what a learner of ``agents`` sees, in order, with its bounds."""
-    found: dict[str, Bounds] = {}
+    bounds: dict[str, Bounds] = {}
     for agent in agents:
-        space, whose = env.observation_spaces[agent], f"{agent}: " if spec.scheme != "independent" else ""
+        space, prefix = env.observation_spaces[agent], f"{agent}: " if spec.scheme != "independent" else ""
         for name, low, high in zip(env.layout.names[agent], space.low.tolist(), space.high.tolist(), strict=True):
-            found[whose + name] = low, high
+            bounds[prefix + name] = low, high
     if spec.policy == CENTRAL_CRITIC:
-        found |= {f"state: {name}": (0.0, 0.0) for name in env.state_names}
-    return found
+        bounds |= {f"state: {name}": (0.0, 0.0) for name in env.state_names}
+    return bounds
 
 
-def _other_entries(there: Mapping[str, Bounds], here: Mapping[str, Bounds]) -> Iterator[str]:
+def _other_entries(source: Mapping[str, Bounds], target: Mapping[str, Bounds]) -> Iterator[str]:
     """Yield which entries of the observation are only there or only here, have another place or other bounds."""
-    sides = (("only there", there, here), ("only here", here, there))
-    alone = [(side, [name for name in one if name not in other]) for side, one, other in sides]
+    sides = (("only there", source, target), ("only here", target, source))
+    alone = [(side, [name for name in entries if name not in opposite]) for side, entries, opposite in sides]
     if any(names for _, names in alone):
-        told = (f"{side} {_some(names)}" for side, names in alone if names)
-        yield f"sees other things, {len(there)} entries there and {len(here)} here: {'; '.join(told)}"
-    elif moved := [name for name, other in zip(there, here, strict=True) if name != other]:
-        yield f"sees the same in another order, from {_some(moved)} on"
+        lists = (f"{side} {_first_names(names)}" for side, names in alone if names)
+        yield f"sees other things, {len(source)} entries there and {len(target)} here: {'; '.join(lists)}"
+    elif displaced_names := [name for name, opposite in zip(source, target, strict=True) if name != opposite]:
+        yield f"sees the same in another order, from {_first_names(displaced_names)} on"
     else:
         yield from (
-            f"sees '{name}' in {list(there[name])}, not in {list(here[name])}"
-            for name in here
-            if there[name] != here[name]
+            f"sees '{name}' in {list(source[name])}, not in {list(target[name])}"
+            for name in target
+            if source[name] != target[name]
         )
 
 
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(f"'{name}'" for name in names[:SHOWN]) + more
+def _first_names(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMES_LISTED} more" if len(names) > NAMES_LISTED else ""
+    return ", ".join(f"'{name}'" for name in names[:NAMES_LISTED]) + more
 
 
-def _other_actions(there: Any, here: Any) -> Iterator[str]:
-    if there.action_space != here.action_space:
-        yield f"acts in {there.action_space}, not in {here.action_space}"
+def _other_actions(source: Any, target: Any) -> Iterator[str]:
+    if source.action_space != target.action_space:
+        yield f"acts in {source.action_space}, not in {target.action_space}"
 
 
-def _other_shapes(there: BaseAlgorithm, here: BaseAlgorithm) -> Iterator[str]:
+def _other_shapes(source: BaseAlgorithm, target: BaseAlgorithm) -> Iterator[str]:
     """Yield which weights the policies do not have in common; the first says enough."""
-    old, new = ({key: tuple(value.shape) for key, value in each.policy.state_dict().items()} for each in (there, here))
+    old, new = (
+        {key: tuple(value.shape) for key, value in model.policy.state_dict().items()} for model in (source, target)
+    )
     for key in (*old, *new):
         if old.get(key) != new.get(key):
             shapes = [str(shapes[key]) if key in shapes else "missing" for shapes in (old, new)]

@@ -32,7 +32,7 @@ from cirl_marl.learners.run_directory import EvaluationsFile, MetricsFile, RunCo
 from cirl_marl.learners.stacked.conditions import first_obstacle, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.start import begin_again, begin_from
-from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, ValidationEpisodes, score_of
+from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, ValidationEpisodes
 
 CHECKPOINTS = 10
 """Checkpoints of a run, evenly spaced."""
@@ -88,69 +88,71 @@ class Training:
         self._evaluations: EvaluationsFile | None = None
         self._best: Score | None = None
         self._bring_up_to_date: Callable[[], None] = lambda: None
-        self._told = None
+        self._saved_state = None
         self.done = 0 if checkpoint is None else steps_of(checkpoint)
         if checkpoint is not None and (checkpoint / "training.json").is_file():
-            self._told = read_tree(checkpoint, "training")
-        self.begun = self.done if self._told is None else int(self._told["begun"])
+            self._saved_state = read_tree(checkpoint, "training")
+        self.first_step = self.done if self._saved_state is None else int(self._saved_state["begun"])
         alike = config.recipe.run.common_random_numbers
-        seeds = [derived_seed(config.seed, "copies", 0 if alike else i, self.begun) for i in range(config.envs)]
+        seeds = [derived_seed(config.seed, "copies", 0 if alike else i, self.first_step) for i in range(config.envs)]
         self.groups = {group.name: group for group in config.recipe.groups(env.network, env.agents)}
         views = {name: group.view(env) for name, group in self.groups.items()}
-        self.world = NetworkWorld(env, seeds, views, done=self.begun)
+        self.world = NetworkWorld(env, seeds, views, done=self.first_step)
         self.learners: dict[str, Learner] = {}
         with one_torch_thread():
-            for name, seat in self.world.seats.items():
-                learner = Learner(seat, self.groups[name].spec, config.seed, done=self.begun)
+            for name, agent_env in self.world.agent_envs.items():
+                learner = Learner(agent_env, self.groups[name].spec, config.seed, done=self.first_step)
                 if checkpoint is None or checkpoint.name.endswith("-start"):
                     self.learners[name] = learner.build()
-                elif self._told is None:
+                elif self._saved_state is None:
                     self.learners[name] = learner.load(checkpoint)
                 else:
-                    self.learners[name] = learner.go_on(checkpoint)
+                    self.learners[name] = learner.restore(checkpoint)
         if checkpoint is None:
             self._begin_from_others()
         elif checkpoint.name.endswith("-start"):
             for learner in self.learners.values():
                 if learner.spec.start is not None:
                     begin_again(checkpoint, learner)
-        if self._told is not None:
-            self.world.go_on(self._told["world"])
-        self._price = self._priced(checkpoint)
-        asked = config.recipe.run
+        if self._saved_state is not None:
+            self.world.load_state_dict(self._saved_state["world"])
+        self._multiplier = self._service_multiplier(checkpoint)
+        run_settings = config.recipe.run
         self._evaluation: ValidationEpisodes | None = None
-        if asked.evaluations:
-            own = MultiAgentVectorEnv(env.network, num_envs=asked.episodes, agents=env.agents, **config.options)
-            self._evaluation = ValidationEpisodes(own)
-        self._evaluated = -1
-        self._saving: Path | None = None
-        self._stacked: Container[str] = ()
-        self._due, self._saved_at, self._spent = False, time.monotonic(), 0.0
-        self._asked_every = CHECKPOINT_EVERY if checkpoint_every is None else checkpoint_every
-        self._every = self._asked_every or None
+        if run_settings.evaluations:
+            validation_env = MultiAgentVectorEnv(
+                env.network, num_envs=run_settings.episodes, agents=env.agents, **config.options
+            )
+            self._evaluation = ValidationEpisodes(validation_env)
+        self._last_evaluation = -1
+        self._checkpoint_folder: Path | None = None
+        self._stack_names: Container[str] = ()
+        self._due, self._saved_at, self._checkpoint_seconds = False, time.monotonic(), 0.0
+        self._shortest_interval = CHECKPOINT_EVERY if checkpoint_every is None else checkpoint_every
+        self._checkpoint_interval = self._shortest_interval or None
         self._appoint_demonstrators()
 
-    def _priced(self, checkpoint: Path | None) -> ServiceMultiplier | None:
+    def _service_multiplier(self, checkpoint: Path | None) -> ServiceMultiplier | None:
         """Return the price of service if it moves; a resumed one goes on."""
-        asked = self.config.recipe.run
-        if not asked.price_rate or asked.min_service is None or not self.env.network.services:
+        settings = self.config.recipe.run
+        if not settings.price_rate or settings.min_service is None or not self.env.network.services:
             return None
         if self.env.reward_mode not in CIRCULARITY_REWARDS:
             raise RecipeError(
                 f"recipe '{self.config.recipe.name}': run.price_rate: reward '{self.env.reward_mode}' has no price of "
                 f"service that could move; choose {', '.join(CIRCULARITY_REWARDS)}, or a price_rate of 0"
             )
-        price = ServiceMultiplier(self.env, asked.min_service, asked.price_rate, asked.price_damping)
+        multiplier = ServiceMultiplier(self.env, settings.min_service, settings.price_rate, settings.price_damping)
         if checkpoint is not None:
-            price.load(checkpoint)
-        return price
+            multiplier.load(checkpoint)
+        return multiplier
 
     def _begin_from_others(self) -> None:
         """Give learners their starts, and say in the configuration from where."""
-        asked = {name: each.spec.start for name, each in self.learners.items()}
+        starts = {name: learner.spec.start for name, learner in self.learners.items()}
         origins = {
             name: begin_from(start, self.learners[name], self.env, self.config.seed)
-            for name, start in asked.items()
+            for name, start in starts.items()
             if start is not None
         }
         self.config = self.config.model_copy(update={"origins": origins})
@@ -161,10 +163,10 @@ class Training:
         self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
         self._saved_at = time.monotonic()
         for name, learner in self.learners.items():
-            learner.boundary.keeps(partial(self._written, learner))
+            learner.barrier.write_with(partial(self._write_learner, learner))
             learner.model.set_logger(configure(str(run.path / "tensorboard" / name), ["tensorboard"]))
         best = run.status["best"]
-        self._best = score_of(best["figures"]) if best is not None else None
+        self._best = Score.from_figures(best["figures"]) if best is not None else None
         self._evaluations = EvaluationsFile(run.path / "evaluations.csv", self.done)
         if self.config.origins and self.joint_steps == 0:  # the run shall not need those from which it started
             folder = run.begin_checkpoint()
@@ -173,13 +175,13 @@ class Training:
 
     def _appoint_demonstrators(self) -> None:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
-        known: dict[str, Demonstrator] = {}
+        demonstrators: dict[str, Demonstrator] = {}
         for learner in self.learners.values():
             asked = learner.spec.demonstrations
             if asked is not None and learner.demonstrations:
                 seed = derived_seed(self.config.seed, "demonstrations", asked.controller, self.done)
-                leader = known.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
-                leader.check(learner.seat.view.agents, learner.seat.title)
+                leader = demonstrators.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
+                leader.check(learner.agent_env.view.agents, learner.agent_env.title)
                 learner.demonstrator = leader
 
     def check_callbacks(self, callbacks: Mapping[str, BaseCallback]) -> None:
@@ -188,7 +190,7 @@ class Training:
             if name not in self.learners:
                 raise CirlError(f"callbacks: {unknown('learner', name, self.learners)}")
             if self.config.recipe.run.engine == "stacked":
-                title = self.learners[name].seat.title
+                title = self.learners[name].agent_env.title
                 raise CirlError(f"callbacks: {title}: engine stacked calls none; use engine lockstep or auto")
 
     def stackable(self, callbacks: Mapping[str, BaseCallback]) -> list[Learner]:
@@ -199,36 +201,38 @@ class Training:
         """
         engine = self.config.recipe.run.engine
         learners = list(self.learners.values())
-        if engine == "stacked" and (why := first_obstacle(learners)) is not None:
-            raise RecipeError(f"recipe '{self.config.recipe.name}': {why}; use engine auto or lockstep")
-        found = [each for each in learners if each.name not in callbacks and obstacle(each) is None]
-        found = [] if engine == "lockstep" else found
-        for each in learners:
-            if each.spec.start is not None and each.spec.start.last_layer and each not in found:
-                why = obstacle(each) or ("engine lockstep" if engine == "lockstep" else "a callback")
-                raise RecipeError(f"{each.seat.title}: start.last_layer: needs a stacked ARS, which {why} prevents")
-        return found
+        if engine == "stacked" and (reason := first_obstacle(learners)) is not None:
+            raise RecipeError(f"recipe '{self.config.recipe.name}': {reason}; use engine auto or lockstep")
+        members = [learner for learner in learners if learner.name not in callbacks and obstacle(learner) is None]
+        members = [] if engine == "lockstep" else members
+        for learner in learners:
+            if learner.spec.start is not None and learner.spec.start.last_layer and learner not in members:
+                reason = obstacle(learner) or ("engine lockstep" if engine == "lockstep" else "a callback")
+                raise RecipeError(
+                    f"{learner.agent_env.title}: start.last_layer: needs a stacked ARS, which {reason} prevents"
+                )
+        return members
 
     @property
     def joint_steps(self) -> int:
         """Joint steps done, those before a resumption included."""
         return self.world.joint_steps
 
-    def after_step(self, began: float, report: TrainingReport | None, infos: Infos, ended: NDArray[np.bool_]) -> None:
+    def after_step(self, began: float, report: TrainingReport | None, infos: Infos, dones: NDArray[np.bool_]) -> None:
         """TrainingReport, record finished episodes, evaluate, save checkpoints."""
         seconds, copies, steps = time.perf_counter() - began, self.env.num_envs, self.joint_steps
-        finished = bool(ended.any())
-        if finished or report is not None:
-            first, which = infos[self.env.agents[0]], ended if finished else slice(None)
-            names = ("episode_circularity", "episode_service_level") if finished else ("circularity", "service_level")
-            circularity, service = (float(first[name][which].mean()) for name in names)
+        has_ended = bool(dones.any())
+        if has_ended or report is not None:
+            first, rows = infos[self.env.agents[0]], dones if has_ended else slice(None)
+            names = ("episode_circularity", "episode_service_level") if has_ended else ("circularity", "service_level")
+            circularity, service = (float(first[name][rows].mean()) for name in names)
             if report is not None:
                 total = max(self.config.steps, steps * copies) - self.done * copies
-                report(Progress((steps - self.done) * copies, total, seconds, circularity, service, finished))
-            if finished and self._metrics is not None:
-                returns = [float(info["episode_return"][ended].mean()) for info in infos.values()]
-                spent = self._metrics.seconds + seconds
-                self._metrics.append([steps, steps * copies, spent, circularity, service, *returns])
+                report(Progress((steps - self.done) * copies, total, seconds, circularity, service, has_ended))
+            if has_ended and self._metrics is not None:
+                returns = [float(info["episode_return"][dones].mean()) for info in infos.values()]
+                total_seconds = self._metrics.seconds + seconds
+                self._metrics.append([steps, steps * copies, total_seconds, circularity, service, *returns])
         planned = self.config.steps // copies
         if self._evaluation is not None:
             apart = max(self.env.network.episode.horizon, planned // self.config.recipe.run.evaluations)
@@ -239,7 +243,7 @@ class Training:
 
     def finish(self) -> None:
         """Evaluate what was learnt in the end, and keep it."""
-        if self._evaluation is not None and self._evaluated != self.joint_steps:
+        if self._evaluation is not None and self._last_evaluation != self.joint_steps:
             self._evaluate(self._evaluation)
         self._bring_up_to_date()
         if self.run is not None:
@@ -260,65 +264,75 @@ class Training:
     @property
     def due(self) -> bool:
         """Whether it is time for a checkpoint."""
-        passed = time.monotonic() - self._saved_at
-        late = self._every is not None and passed >= self._every
-        return self.run is not None and self._saving is None and (late or (self._due and passed * COST >= self._spent))
+        waiting_time = time.monotonic() - self._saved_at
+        late = self._checkpoint_interval is not None and waiting_time >= self._checkpoint_interval
+        return (
+            self.run is not None
+            and self._checkpoint_folder is None
+            and (late or (self._due and waiting_time * COST >= self._checkpoint_seconds))
+        )
 
     def ask(self) -> None:
         """Ask every learner for its state."""
-        if self.run is not None and self._saving is None:
+        if self.run is not None and self._checkpoint_folder is None:
             began = time.perf_counter()
-            self._saving = self.run.begin_checkpoint()
-            self._spent = time.perf_counter() - began
+            self._checkpoint_folder = self.run.begin_checkpoint()
+            self._checkpoint_seconds = time.perf_counter() - began
             for learner in self.learners.values():
-                learner.boundary.folder = self._saving
+                learner.barrier.folder = self._checkpoint_folder
 
     def keep(self, state: str = "running", reason: str = "") -> None:
         """Write the checkpoint for which every learner has written its state."""
-        if self.run is None or self._saving is None:
+        if self.run is None or self._checkpoint_folder is None:
             return
         began = time.perf_counter()
         for learner in self.learners.values():
-            learner.write_journal(self._saving)
-            learner.boundary.forget()
-        write_tree(self._saving, "training", {"begun": self.begun, "world": self.world.told(), "best": self._kept_best})
-        self._end_checkpoint(self._saving, state, reason)
-        self._saving, self._due, self._saved_at = None, False, time.monotonic()
-        self._spent += time.perf_counter() - began
-        if self._every is not None:
-            self._every = max(self._asked_every, self._spent / COST)
+            learner.write_journal(self._checkpoint_folder)
+            learner.barrier.release()
+        write_tree(
+            self._checkpoint_folder,
+            "training",
+            {"begun": self.first_step, "world": self.world.state_dict(), "best": self._kept_best},
+        )
+        self._end_checkpoint(self._checkpoint_folder, state, reason)
+        self._checkpoint_folder, self._due, self._saved_at = None, False, time.monotonic()
+        self._checkpoint_seconds += time.perf_counter() - began
+        if self._checkpoint_interval is not None:
+            self._checkpoint_interval = max(self._shortest_interval, self._checkpoint_seconds / COST)
 
     def _end_checkpoint(self, folder: Path, state: str, reason: str = "") -> None:
         assert self.run is not None
-        if self._price is not None:
-            self._price.save(folder)
+        if self._multiplier is not None:
+            self._multiplier.save(folder)
         self.run.end_checkpoint(folder, self.joint_steps, state, reason)
 
-    def _written(self, learner: Learner, folder: Path, more: dict[str, Any]) -> None:
+    def _write_learner(self, learner: Learner, folder: Path, more: dict[str, Any]) -> None:
         """Write the state of a learner, and note how long it took."""
         began = time.perf_counter()
-        learner.write_state(folder, more, stacked=learner.name in self._stacked)
-        self._spent += time.perf_counter() - began
+        learner.write_state(folder, more, in_stack=learner.name in self._stack_names)
+        self._checkpoint_seconds += time.perf_counter() - began
 
     def _evaluate(self, evaluation: ValidationEpisodes) -> None:
         """Play its episodes by the policies of now, keep these if they are the best so far, and move the price."""
         self._bring_up_to_date()
         policies = {
-            name: Policy(each.model, each.env if isinstance(each.env, VecNormalize) else None, each.seat.view)
-            for name, each in self.learners.items()
+            name: Policy(
+                learner.model, learner.env if isinstance(learner.env, VecNormalize) else None, learner.agent_env.view
+            )
+            for name, learner in self.learners.items()
         }
         score, demanded = evaluation.score(Policies(policies)), self.config.recipe.run.min_service
-        self._evaluated = self.joint_steps
+        self._last_evaluation = self.joint_steps
         better = self._best is None or score.rank(demanded) > self._best.rank(demanded)
         if better:
             self._best = score
             if self.run is not None:
-                self.run.save_best(self.joint_steps, self._write_policies, score.said())
+                self.run.save_best(self.joint_steps, self._write_policies, score.figures())
         if self._evaluations is not None:
-            figures = score.said() | {"circularity_weight": self.env.circularity_weight}
+            figures = score.figures() | {"circularity_weight": self.env.circularity_weight}
             self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
-        if self._price is not None and self.joint_steps * self.config.envs >= MULTIPLIER_FROM * self.config.steps:
-            self._price.heed(score.assured)
+        if self._multiplier is not None and self.joint_steps * self.config.envs >= MULTIPLIER_FROM * self.config.steps:
+            self._multiplier.update(score.service_bound)
 
     @property
     def _kept_best(self) -> dict[str, Any] | None:
@@ -328,20 +342,22 @@ class Training:
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():
             learner.save(folder)
-        if self._price is not None:
-            self._price.save(folder)
+        if self._multiplier is not None:
+            self._multiplier.save(folder)
 
-    def runs_stacked(self, bring_up_to_date: Callable[[], None], stacked: Container[str]) -> None:
-        """Have models of the ``stacked`` learners brought up to date before they are saved or act.
+    def runs_stacked(self, bring_up_to_date: Callable[[], None], names: Container[str]) -> None:
+        """Have models of the ``names`` learners brought up to date before they are saved or act.
 
         Raises:
             RunError: if a learner goes on that ran by itself, and now would not, or the other way round.
         """
-        self._bring_up_to_date, self._stacked = bring_up_to_date, stacked
+        self._bring_up_to_date, self._stack_names = bring_up_to_date, names
         for name, learner in self.learners.items():
-            if learner.was_stacked is not None and learner.was_stacked != (name in stacked):
-                before, now = ("stacked", "by itself") if learner.was_stacked else ("by itself", "stacked")
-                raise RunError(f"{learner.seat.title} learnt {before} and would go on {now}: give the same callbacks")
+            if learner.was_in_stack is not None and learner.was_in_stack != (name in names):
+                before, now = ("stacked", "by itself") if learner.was_in_stack else ("by itself", "stacked")
+                raise RunError(
+                    f"{learner.agent_env.title} learnt {before} and would go on {now}: give the same callbacks"
+                )
 
 
 def run_together(
@@ -364,22 +380,24 @@ def run_together(
         RecipeError: if the engine cannot stack a learner that it should.
     """
     callbacks = callbacks or {}
-    stacked = stacks([each for training in trainings for each in training.stackable(callbacks)], device)
+    stacks_of_learners = stacks([each for training in trainings for each in training.stackable(callbacks)], device)
     began = time.perf_counter()
 
     def bring_up_to_date() -> None:
-        for stack in stacked:
+        for stack in stacks_of_learners:
             stack.give()
 
-    names = {id(each): each.name for stack in stacked for each in stack.members}
+    names = {id(each): each.name for stack in stacks_of_learners for each in stack.members}
     for training in trainings:
         training.runs_stacked(bring_up_to_date, {each.name for each in training.learners.values() if id(each) in names})
     reports: list[TrainingReport | None] = [report] + [None] * (len(trainings) - 1)
     try:
-        with one_torch_thread(), _interruption() as interrupted:
-            hooks = [partial(t.after_step, began, told) for t, told in zip(trainings, reports, strict=True)]
-            lockstep = Lockstep([t.world for t in trainings], list(_participants(trainings, stacked, callbacks)))
-            lockstep.run(hooks, partial(_keep, trainings, lockstep, interrupted))
+        with one_torch_thread(), _interruption() as stop_requested:
+            hooks = [partial(t.after_step, began, observer) for t, observer in zip(trainings, reports, strict=True)]
+            lockstep = Lockstep(
+                [t.world for t in trainings], list(_participants(trainings, stacks_of_learners, callbacks))
+            )
+            lockstep.run(hooks, partial(_keep, trainings, lockstep, stop_requested))
             for training in trainings:
                 training.finish()
     except TrainingInterrupted:
@@ -396,22 +414,22 @@ def run_together(
                 learner.model.logger.close()
 
 
-def _keep(trainings: Sequence[Training], lockstep: Lockstep, interrupted: Callable[[], bool]) -> None:
+def _keep(trainings: Sequence[Training], lockstep: Lockstep, stop_requested: Callable[[], bool]) -> None:
     """Ask for checkpoints when it is time, or when somebody wants to stop, and write those that are complete.
 
     Raises:
         TrainingInterrupted: when everything is written, or if somebody who is shown what to do cannot be saved.
     """
-    stopping = interrupted()
-    if stopping and (lockstep.busy or all(training.run is None for training in trainings)):
+    stops = stop_requested()
+    if stops and (lockstep.busy or all(training.run is None for training in trainings)):
         raise TrainingInterrupted
-    if stopping or (any(training.due for training in trainings) and not lockstep.busy):
+    if stops or (any(training.due for training in trainings) and not lockstep.busy):
         for training in trainings:
             training.ask()
-    if lockstep.saved:
+    if lockstep.all_have_saved:
         for training in trainings:
-            training.keep("interrupted" if stopping else "running")
-        if stopping:
+            training.keep("interrupted" if stops else "running")
+        if stops:
             raise TrainingInterrupted
 
 
@@ -421,24 +439,26 @@ def _participants(
     """Yield who acts: each stack, then everyone else, in the order of their seats."""
     steps = trainings[0].config.steps
     for stack in stacks:
-        title = ", ".join(each.seat.title for each in stack.members[:3]) + (", …" if len(stack.members) > 3 else "")
+        title = ", ".join(member.agent_env.title for member in stack.members[:3]) + (
+            ", …" if len(stack.members) > 3 else ""
+        )
         yield Participant(
             f"the stack of {title}",
             partial(stack.learn, steps, wait),
             partial(stack.act, wait),
             Streams(),
-            [each.boundary for each in stack.members],
+            [member.barrier for member in stack.members],
         )
-    stacked = {id(each) for stack in stacks for each in stack.members}
+    member_ids = {id(member) for stack in stacks for member in stack.members}
     for training in trainings:
         for name, learner in training.learners.items():
-            if id(learner) not in stacked:
+            if id(learner) not in member_ids:
                 yield Participant(
-                    learner.seat.title,
+                    learner.agent_env.title,
                     partial(learner.learn, steps, callbacks.get(name)),
                     learner.act,
                     learner.streams,
-                    [learner.boundary],
+                    [learner.barrier],
                     partial(getattr, learner, "shown"),
                     partial(learner.budget, steps),
                 )
@@ -447,24 +467,24 @@ def _participants(
 @contextmanager
 def _interruption() -> Iterator[Callable[[], bool]]:
     """Yield what says whether somebody wants to stop: Ctrl-C, SIGTERM or SIGHUP; the second time they act as usual."""
-    asked = threading.Event()
+    request = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
+        yield request.is_set
         return
-    before = {each: signal.getsignal(each) for each in STOPS}
+    before = {number: signal.getsignal(number) for number in STOPS}
 
     def note(_signal: int, _frame: FrameType | None) -> None:
-        asked.set()
+        request.set()
         back()
 
     def back() -> None:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
-    for each in STOPS:
-        signal.signal(each, note)
+    for number in STOPS:
+        signal.signal(number, note)
     try:
-        yield asked.is_set
+        yield request.is_set
     finally:
         back()
 

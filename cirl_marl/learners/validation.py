@@ -1,12 +1,17 @@
-"""Which checkpoint of a run counts: the best by evaluation episodes of their own, not the last."""
+"""Validation during a training: episodes of their own choose the checkpoint that counts and move the multiplier.
+
+The last policies of a run are seldom the best ones. Validation episodes, the same each time and unlike those of
+training and of reports, decide which checkpoint acts; a multiplier turns the service that a recipe demands into a constraint.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,34 +30,42 @@ QUANTILE_95 = 1.645
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Figures of an evaluation.
+    """Figures of a validation.
 
     Attributes:
         circularity: mean λ̄ of the episodes; mass.
         service: mean level of the service that lacks most; 1 without services.
-        assured: the level that this service exceeds with 95 % confidence.
-        paid: mean return of an episode, summed over the agents.
+        service_bound: lower confidence bound of that level, one-sided at 95 %.
+        episode_return: mean return of an episode, summed over the agents.
     """
+
+    NAMES_IN_FILES: ClassVar = {"service_bound": "assured", "episode_return": "paid"}
 
     circularity: float
     service: float
-    assured: float
-    paid: float
+    service_bound: float
+    episode_return: float
 
     def rank(self, min_service: float | None) -> tuple[bool, float]:
-        """Return what the higher of two scores is better by.
+        """Return the key by which scores are compared, the higher the better.
 
-        With a level of service that is demanded: whether it is assured, and then λ̄, or else the level. Without: what
-        the learners are paid.
+        If a level of service is demanded: whether its bound reaches that level, then λ̄ if it does and the bound if
+        not. Otherwise: the return.
         """
         if min_service is None:
-            return True, self.paid
-        served = self.assured >= min_service
-        return served, self.circularity if served else self.assured
+            return True, self.episode_return
+        is_served = self.service_bound >= min_service
+        return is_served, self.circularity if is_served else self.service_bound
 
-    def said(self) -> dict[str, float]:
-        """Return the figures by name."""
-        return asdict(self)
+    def figures(self) -> dict[str, float]:
+        """Return the figures by their names in files."""
+        return {self.NAMES_IN_FILES.get(name, name): getattr(self, name) for name in self.__slots__}
+
+    @classmethod
+    def from_figures(cls, figures: Mapping[str, float] | None) -> Score | None:
+        """Return the score of figures that were written to a file; None if there is none."""
+        names = {written: name for name, written in cls.NAMES_IN_FILES.items()}
+        return None if figures is None else cls(**{names.get(key, key): value for key, value in figures.items()})
 
 
 class ValidationEpisodes:
@@ -67,33 +80,29 @@ class ValidationEpisodes:
         run = rollout(self._env, policies, seed=FIRST_SEED)
         levels = run.episode_levels
         spread = levels.std(axis=0, ddof=1) if len(levels) > 1 else np.zeros(levels.shape[1])
-        assured = levels.mean(axis=0) - QUANTILE_95 * spread / math.sqrt(len(levels))
+        lower_bounds = levels.mean(axis=0) - QUANTILE_95 * spread / math.sqrt(len(levels))
         return Score(
             circularity=float(run.episode_circularity.mean()),
             service=float(levels.mean(axis=0).min(initial=1.0)),
-            assured=float(assured.min(initial=1.0)),
-            paid=float(run.returns.sum(axis=0).mean()),
+            service_bound=float(lower_bounds.min(initial=1.0)),
+            episode_return=float(run.returns.sum(axis=0).mean()),
         )
 
 
-def score_of(plain: Any) -> Score | None:
-    """Return a score that was written to a file; None if there is none."""
-    return None if plain is None else Score(**plain)
-
-
 MULTIPLIER_FROM = 0.5
-"""Share of a run after which the price moves: a multiplier has to be slower than those who learn under it."""
+"""Share of a run after which the multiplier moves: it has to be slower than those who learn under it."""
 
 LARGEST_MULTIPLIER = 1e3
-"""Largest price."""
+"""Largest value of the multiplier."""
 
 
 class ServiceMultiplier:
-    """The price p of a shortfall in units of circularity, moved by what evaluations find.
+    """The Lagrange multiplier p of the demanded service: what a shortfall costs in units of circularity.
 
-    The reward is w·λ/c − (1 − w)·shortfall, so that p = (1 − w)/w. A level s* that is demanded is a constraint, and p
-    its multiplier (Altman 1999, Constrained Markov Decision Processes), here with a controller that integrates and
-    damps (Stooke et al. 2020, arXiv 2007.03964). After an evaluation that assures the level s of every service::
+    The reward is w·λ/c − (1 − w)·shortfall, so that p = (1 − w)/w. The demanded level s* is a constraint and p its
+    multiplier (Altman 1999, Constrained Markov Decision Processes), moved by a controller with an integral and a
+    proportional part (Stooke et al. 2020, arXiv 2007.03964). After a validation with the lower bound s of every
+    service::
 
         e = clip((s* − s)/(1 − s*), −1, 1),    q ← q · exp(rate · e),    p = q · exp(damping · e)
 
@@ -102,31 +111,32 @@ class ServiceMultiplier:
     drift through it at any other price, and only the damping, which is at once, stops them.
     """
 
-    def __init__(self, env: MultiAgentVectorEnv, demanded: float, rate: float, damping: float) -> None:
+    def __init__(self, env: MultiAgentVectorEnv, min_service: float, rate: float, damping_gain: float) -> None:
         """Begin with the weight that ``env`` has."""
-        self._env, self._demanded, self._rate, self._damping = env, demanded, rate, damping
+        self._env, self._min_service, self._rate, self._damping_gain = env, min_service, rate, damping_gain
         weight = max(env.circularity_weight, 1.0 / (1.0 + LARGEST_MULTIPLIER))
-        self._least = self._lasting = (1.0 - weight) / weight
+        self._least = self._integral = (1.0 - weight) / weight
 
-    def heed(self, assured: float) -> None:
-        """Move the price after an evaluation."""
-        lacks = np.clip((self._demanded - assured) / max(1.0 - self._demanded, 1.0 / LARGEST_MULTIPLIER), -1.0, 1.0)
-        self._lasting = self._within(self._lasting * np.exp(self._rate * lacks))
-        self._env.circularity_weight = 1.0 / (1.0 + self._within(self._lasting * np.exp(self._damping * lacks)))
+    def update(self, service: float) -> None:
+        """Move the multiplier after a validation."""
+        room = max(1.0 - self._min_service, 1.0 / LARGEST_MULTIPLIER)
+        error = np.clip((self._min_service - service) / room, -1.0, 1.0)
+        self._integral = self._within(self._integral * np.exp(self._rate * error))
+        self._env.circularity_weight = 1.0 / (1.0 + self._within(self._integral * np.exp(self._damping_gain * error)))
 
     def _within(self, price: float) -> float:
         return float(np.clip(price, self._least, LARGEST_MULTIPLIER))
 
     def save(self, folder: Path) -> None:
-        """Keep weight and lasting price in a checkpoint."""
-        told = {"circularity_weight": self._env.circularity_weight, "lasting_price": self._lasting}
-        write_json(folder / "price.json", told)
+        """Write the weight and the integral part to a checkpoint."""
+        state = {"circularity_weight": self._env.circularity_weight, "lasting_price": self._integral}
+        write_json(folder / "price.json", state)
 
     def load(self, folder: Path) -> None:
-        """Go on with weight and price of a checkpoint; a ``RunError`` if they are missing or none."""
+        """Load what ``save`` wrote; a ``RunError`` if they are missing or none."""
         path = folder / "price.json"
         try:
-            told = json.loads(path.read_text())
-            self._env.circularity_weight, self._lasting = told["circularity_weight"], told["lasting_price"]
+            state = json.loads(path.read_text())
+            self._env.circularity_weight, self._integral = state["circularity_weight"], state["lasting_price"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunError(f"{path}: cannot be read: {error!r}; it holds the price of service") from error

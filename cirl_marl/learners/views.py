@@ -94,8 +94,8 @@ class OneAgent(View):
 
     def rows(self, observations: Arrays) -> NDArray[np.floating]:
         """Return the agent's observation, shape (B, k), or as its space has it."""
-        seen = observations[self.agents[0]]
-        return seen if isinstance(seen, Mapping) else np.ascontiguousarray(seen)
+        observation = observations[self.agents[0]]
+        return observation if isinstance(observation, Mapping) else np.ascontiguousarray(observation)
 
     def act(self, actions: NDArray[np.floating]) -> Arrays:
         """Return the actions, shape (B, m), as the agent's."""
@@ -136,8 +136,8 @@ class SharedPolicy(View):
         copies = len(observations[self.agents[0]])
         rows = np.zeros((len(self.agents), copies, self._length + len(self.agents)), dtype=np.float32)
         for a, agent in enumerate(self.agents):
-            seen = observations[agent]
-            rows[a, :, : seen.shape[1]] = seen
+            observation = observations[agent]
+            rows[a, :, : observation.shape[1]] = observation
             rows[a, :, self._length + a] = 1.0
         return rows.reshape(-1, rows.shape[2])
 

@@ -18,7 +18,7 @@ from cirl_marl.learners.central_critic import CentralCriticPolicy
 from cirl_marl.learners.learner import Learner
 from cirl_marl.learners.stacked.on_policy import RolloutStack
 from cirl_marl.learners.stacked.perceptrons import ACTIVATIONS, linear_layers
-from cirl_marl.learners.stacked.search import SearchStack, copies_each, parts_of
+from cirl_marl.learners.stacked.search import SearchStack, copies_per_candidate, parts_of
 from cirl_marl.learners.stacked.stack import Stack
 
 OPTIMISERS = (torch.optim.Adam, torch.optim.AdamW, torch.optim.RMSprop, torch.optim.SGD, RMSpropTFLike)
@@ -28,14 +28,14 @@ EXTRACTORS = {ActorCriticPolicy: FlattenExtractor, CentralCriticPolicy: Combined
 
 def stacks(learners: Iterable[Learner], device: str) -> list[Stack]:
     """Return learners that can be stacked as one for each group of the same settings, rows and steps so far."""
-    found: dict[str, list[Learner]] = {}
+    groups: dict[str, list[Learner]] = {}
     for learner in learners:
         settings = learner.spec.model_dump(exclude={"kind", "role", "agents"})
-        key = f"{settings} {learner.seat.num_envs} {learner.model.num_timesteps}"
-        found.setdefault(key, []).append(learner)
+        key = f"{settings} {learner.agent_env.num_envs} {learner.model.num_timesteps}"
+        groups.setdefault(key, []).append(learner)
     return [
         (SearchStack if isinstance(members[0].model, ARS) else RolloutStack)(members, device)
-        for members in found.values()
+        for members in groups.values()
     ]
 
 
@@ -55,11 +55,16 @@ def obstacle(learner: Learner) -> str | None:
 def first_obstacle(learners: Sequence[Learner]) -> str | None:
     """Return what keeps the first learner that cannot be stacked from it; None if all can be."""
     return next(
-        (f"{each.seat.title}: engine stacked: {why}" for each in learners if (why := obstacle(each)) is not None), None
+        (
+            f"{learner.agent_env.title}: engine stacked: {reason}"
+            for learner in learners
+            if (reason := obstacle(learner)) is not None
+        ),
+        None,
     )
 
 
-def _on_policy_obstacle(model: PPO | A2C, asked: str) -> str | None:
+def _on_policy_obstacle(model: PPO | A2C, policy_name: str) -> str | None:
     if model.use_sde:
         return "parameters.use_sde: noise that depends on the state is not stacked"
     if getattr(model, "target_kl", None) is not None:
@@ -68,18 +73,20 @@ def _on_policy_obstacle(model: PPO | A2C, asked: str) -> str | None:
         return f"parameters.rollout_buffer_class: {type(model.rollout_buffer).__name__} is the learner's own"
     policy = model.policy
     if type(policy) not in EXTRACTORS or type(policy.features_extractor) is not EXTRACTORS[type(policy)]:
-        return f"policy {asked} with {type(policy.features_extractor).__name__}: only multilayer perceptrons are"
+        return f"policy {policy_name} with {type(policy.features_extractor).__name__}: only multilayer perceptrons are"
     if type(policy.action_dist) is not DiagGaussianDistribution:
         return f"parameters.policy_kwargs: actions are drawn from a {type(policy.action_dist).__name__}"
     if type(policy.optimizer) not in OPTIMISERS:
         return f"parameters.policy_kwargs: optimiser {type(policy.optimizer).__name__} is not element by element"
     try:
-        kinds = {linear_layers(each)[1] for each in (policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net)}
+        kinds = {
+            linear_layers(network)[1] for network in (policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net)
+        }
     except TypeError as error:
         return f"parameters.policy_kwargs: {error}"
     if len(kinds - {None}) > 1 or not kinds <= {None, *ACTIVATIONS}:
-        known = " or ".join(each.__name__ for each in ACTIVATIONS)
-        return f"parameters.policy_kwargs: hidden layers are not linear with {known} between them"
+        supported = " or ".join(network.__name__ for network in ACTIVATIONS)
+        return f"parameters.policy_kwargs: hidden layers are not linear with {supported} between them"
     return None
 
 
@@ -89,7 +96,7 @@ def _search_obstacle(learner: Learner) -> str | None:
         return f"policy {learner.spec.policy} is not one of ARS"
     try:
         parts_of(policy)
-        copies_each(learner)
+        copies_per_candidate(learner)
     except (TypeError, ValueError) as error:
         return f"parameters: {error}"
     return None

@@ -36,7 +36,7 @@ class StackedRollout:
             seen last, shape (N, B, entries).
     """
 
-    seen: Tensor
+    observations: Tensor
     actions: Tensor
     rewards: Tensor
     log_probabilities: Tensor
@@ -74,20 +74,20 @@ class StackedRollout:
         first = torch.arange(order.shape[0], device=order.device)[:, None] * total
         index = (order + first).flatten()
 
-        def picked(values: Tensor) -> Tensor:
+        def pick(values: Tensor) -> Tensor:
             entries = values.shape[3:]
-            own: Tensor = values[learners].reshape(-1, *entries).index_select(0, index)
-            return own.view(*order.shape, *entries)
+            rows: Tensor = values[learners].reshape(-1, *entries).index_select(0, index)
+            return rows.view(*order.shape, *entries)
 
-        parts = (self.seen, self.actions, self.values, self.log_probabilities, self.advantages, self.returns)
-        return Samples(*map(picked, parts))
+        parts = (self.observations, self.actions, self.values, self.log_probabilities, self.advantages, self.returns)
+        return Samples(*map(pick, parts))
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
     """Samples of some learners; shapes are (learners, samples), with a last axis of entries where there is one."""
 
-    seen: Tensor
+    observations: Tensor
     actions: Tensor
     values: Tensor
     log_probabilities: Tensor
@@ -118,14 +118,14 @@ class Rules:
     rate: float
 
     @classmethod
-    def of(cls, model: PPO | A2C, samples: int, remaining: float) -> Rules:
+    def of(cls, model: PPO | A2C, samples: int, progress_remaining: float) -> Rules:
         """Return those of a model for as many samples, when this share of the run remains."""
         weights = (model.ent_coef, model.vf_coef, model.max_grad_norm)
-        rate, normalises = model.lr_schedule(remaining), model.normalize_advantage
+        rate, normalises = model.lr_schedule(progress_remaining), model.normalize_advantage
         if isinstance(model, A2C):
             return cls(1, samples, None, None, normalises, *weights, rate)
         clip, clip_value = (
-            limit(remaining) if callable(limit) else limit for limit in (model.clip_range, model.clip_range_vf)
+            limit(progress_remaining) if callable(limit) else limit for limit in (model.clip_range, model.clip_range_vf)
         )
         return cls(model.n_epochs, model.batch_size, clip, clip_value, normalises, *weights, rate)
 
@@ -139,7 +139,7 @@ class PolicyLoss:
 
     value: Tensor
     gradient: Tensor
-    clipped: Tensor
+    clip_share: Tensor
     divergence: Tensor
 
 
@@ -156,19 +156,19 @@ def policy_loss(log_probabilities: Tensor, samples: Samples, advantages: Tensor,
     if clip is None:
         value = -(advantages * log_probabilities).mean(dim=1)
         return PolicyLoss(value, -advantages / count, torch.zeros_like(value), divergence)
-    gain, bounded = advantages * ratio, advantages * ratio.clamp(1 - clip, 1 + clip)
+    gain, clipped_gain = advantages * ratio, advantages * ratio.clamp(1 - clip, 1 + clip)
     return PolicyLoss(
-        value=-torch.minimum(gain, bounded).mean(dim=1),
-        gradient=torch.where(gain <= bounded, -gain / count, 0.0),
-        clipped=((ratio - 1).abs() > clip).float().mean(dim=1),
+        value=-torch.minimum(gain, clipped_gain).mean(dim=1),
+        gradient=torch.where(gain <= clipped_gain, -gain / count, 0.0),
+        clip_share=((ratio - 1).abs() > clip).float().mean(dim=1),
         divergence=divergence,
     )
 
 
 def value_loss(values: Tensor, samples: Samples, clip: float | None) -> tuple[Tensor, Tensor]:
     """Return mean((V − R)²) and its gradient by V; V moves from its old value by at most ``clip``, if there is one."""
-    moved = values if clip is None else samples.values + (values - samples.values).clamp(-clip, clip)
-    error = moved - samples.returns
+    clipped_values = values if clip is None else samples.values + (values - samples.values).clamp(-clip, clip)
+    error = clipped_values - samples.returns
     gradient = 2 * error / error.shape[1]
     if clip is not None:
         gradient = torch.where((values - samples.values).abs() <= clip, gradient, 0.0)
@@ -191,49 +191,51 @@ class Update:
         total = self._rollout.rewards[0].numel()
         update_learning_rate(weights.optimiser, rules.rate)
         for _ in range(rules.epochs):
-            order = torch.as_tensor(np.stack([own.permutation(total) for own in shuffles]), device=device)
+            order = torch.as_tensor(np.stack([stream.permutation(total) for stream in shuffles]), device=device)
             for first in range(0, total, rules.batch):
                 part = order[:, first : first + rules.batch]
-                for some in pieces(learners, part.shape[1] * weights.actor.width, device):
-                    self._differentiate(self._rollout.samples(some, part[some]), some)
+                for members in pieces(learners, part.shape[1] * weights.actor.width, device):
+                    self._differentiate(self._rollout.samples(members, part[members]), members)
                 weights.clip(rules.largest_norm)
                 weights.optimiser.step()
                 self._count += 1
 
-    def _differentiate(self, samples: Samples, some: slice) -> None:
+    def _differentiate(self, samples: Samples, members: slice) -> None:
         """Write the gradients of the loss of some learners: L = L_π − c_H H + c_V L_V.
 
         With z = (a − μ)/σ, ∂log π/∂μ = z/σ and ∂log π/∂log σ = z² − 1 for each entry of the action.
         """
-        weights, rules, acts = self._weights, self._rules, self._acts[some]
-        log_std = weights.log_std[some][:, None]
+        weights, rules, acts = self._weights, self._rules, self._acts[members]
+        log_std = weights.log_std[members][:, None]
         std = log_std.exp()
-        units = weights.actor.forward(samples.seen[..., : self._local], some)
+        units = weights.actor.forward(samples.observations[..., : self._local], members)
         z = (samples.actions - units[-1]) / std
         log_probabilities = ((-0.5 * z.square() - log_std - LOG_SQRT_2PI) * acts).sum(dim=-1)
         normalises = rules.normalises and samples.advantages.shape[1] > 1
         advantages = samples.normalised_advantages() if normalises else samples.advantages
         policy = policy_loss(log_probabilities, samples, advantages, rules.clip)
-        each = policy.gradient[..., None] * acts
-        weights.log_std_gradient[some] = ((z.square() - 1) * each).sum(dim=1) - rules.entropy_weight * acts[:, 0]
-        weights.actor.backward(units, z / std * each, some)
-        units = weights.critic.forward(samples.seen, some)
+        action_gradient = policy.gradient[..., None] * acts
+        weights.log_std_gradient[members] = ((z.square() - 1) * action_gradient).sum(
+            dim=1
+        ) - rules.entropy_weight * acts[:, 0]
+        weights.actor.backward(units, z / std * action_gradient, members)
+        units = weights.critic.forward(samples.observations, members)
         loss, gradient = value_loss(units[-1][..., 0], samples, rules.clip_value)
-        weights.critic.backward(units, (rules.value_weight * gradient)[..., None], some)
-        own = torch.stack([policy.value, policy.clipped, policy.divergence, loss], dim=1)
-        self._sums[some] += own.cpu().numpy()
+        weights.critic.backward(units, (rules.value_weight * gradient)[..., None], members)
+        figures = torch.stack([policy.value, policy.clip_share, policy.divergence, loss], dim=1)
+        self._sums[members] += figures.cpu().numpy()
 
     def figures(self) -> Iterator[dict[str, float]]:
         """Yield the figures of each learner that Stable-Baselines3 writes of an update."""
         rollout, log_std = self._rollout, self._weights.log_std
-        unexplained = (rollout.returns - rollout.values).flatten(1).var(dim=1) / rollout.returns.flatten(1).var(dim=1)
+        residual = (rollout.returns - rollout.values).flatten(1).var(dim=1) / rollout.returns.flatten(1).var(dim=1)
         entropy = ((log_std + LOG_SQRT_2PI + 0.5) * self._acts[:, 0]).sum(dim=1)
         std = (log_std.exp() * self._acts[:, 0]).sum(dim=1) / self._acts[:, 0].sum(dim=1)
         for i, sums in enumerate(self._sums / max(1, self._count)):
-            own = dict(zip(FIGURES, sums.tolist(), strict=True))
-            yield own | {
+            means = dict(zip(FIGURES, sums.tolist(), strict=True))
+            yield means | {
                 "entropy_loss": -float(entropy[i]),
-                "explained_variance": 1.0 - float(unexplained[i]),
+                "explained_variance": 1.0 - float(residual[i]),
                 "std": float(std[i]),
                 "learning_rate": self._rules.rate,
             }
@@ -256,12 +258,12 @@ class RolloutStack(Stack):
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
         """Take over what the learners know."""
         super().__init__(members, device)
-        self._models = [_stackable(each) for each in members]
+        self._models = [_stackable(member) for member in members]
         first = self._models[0]
-        self._rows, self._steps = members[0].seat.num_envs, first.n_steps
+        self._rows, self._steps = members[0].agent_env.num_envs, first.n_steps
         self._timesteps, self._updates = first.num_timesteps, first._n_updates
         policies = [_policy(model) for model in self._models]
-        self._weights = Weights(policies, self._inputs.seen, self._inputs.criticised, self._device)
+        self._weights = Weights(policies, self._inputs.actor_columns, self._inputs.critic_columns, self._device)
         self._acts = torch.zeros(len(members), 1, self._weights.log_std.shape[1], device=self._device)
         for own, space in zip(self._acts, self._inputs.spaces, strict=True):
             own[:, : space.shape[0]] = 1.0
@@ -274,17 +276,17 @@ class RolloutStack(Stack):
     def learn(self, steps: int, wait: Callable[[], None]) -> None:
         """Learn for the share of ``steps`` that is the learners'; ``wait`` returns when the environments have moved."""
         first = self.members[0]
-        total = first.spec.steps_of(steps) * (self._rows // first.seat.copies)
+        total = first.spec.steps_of(steps) * (self._rows // first.agent_env.copies)
         if self._timesteps >= total:
             return
-        resuming = self._resuming
-        if not resuming:
+        is_restoring = self._is_restoring
+        if not is_restoring:
             self._current = self._inputs.begin()
         while self._timesteps < total:
-            self._reached()
-            if resuming:
-                self._current, resuming = self._inputs.observed(learning=False), False
-            starts = np.stack([each.seat.handed.ended for each in self.members])
+            self._arrive()
+            if is_restoring:
+                self._current, is_restoring = self._inputs.observe(update_moments=False), False
+            starts = np.stack([member.agent_env.last_step.dones for member in self.members])
             self._starts = torch.as_tensor(starts, dtype=torch.float32, device=self._device)
             self._collect(wait)
             rules = Rules.of(self._models[0], self._rows * self._steps, 1.0 - self._timesteps / total)
@@ -293,8 +295,8 @@ class RolloutStack(Stack):
             self._updates += rules.epochs
             self._log(update)
 
-    def _best(self, seen: Tensor) -> Tensor:
-        return self._weights.actor.forward(seen[..., : self._inputs.local])[-1]
+    def _deterministic_actions(self, observations: Tensor) -> Tensor:
+        return self._weights.actor.forward(observations[..., : self._inputs.local])[-1]
 
     def _give_models(self) -> None:
         self._weights.give()
@@ -307,43 +309,43 @@ class RolloutStack(Stack):
         rollout.cut.clear()
         std, rest = log_std.exp(), -log_std - LOG_SQRT_2PI
         for t in range(self._steps):
-            noise = self._drawn()
-            actions = self._best(self._current) + std * noise
-            rollout.seen[:, :, t], rollout.actions[:, :, t] = self._current, actions
+            noise = self._draw_noise()
+            actions = self._deterministic_actions(self._current) + std * noise
+            rollout.observations[:, :, t], rollout.actions[:, :, t] = self._current, actions
             rollout.log_probabilities[:, :, t] = ((rest - 0.5 * noise.square()) * self._acts).sum(dim=-1)
             rollout.starts[:, :, t] = self._starts
             self._current = self._move(actions, wait)
-            rollout.rewards[:, :, t], ended = self._inputs.paid()
-            self._starts = torch.as_tensor(ended, dtype=torch.float32, device=self._device)
-            if ended.any():
-                for episodes, learner, own in zip(self._episodes, self.members, ended, strict=True):
-                    if learner.seat.handed.returns is not None:
-                        episodes.extend(learner.seat.handed.returns[own])
+            rollout.rewards[:, :, t], dones = self._inputs.rewards_and_dones()
+            self._starts = torch.as_tensor(dones, dtype=torch.float32, device=self._device)
+            if dones.any():
+                for episodes, learner, rows in zip(self._episodes, self.members, dones, strict=True):
+                    if learner.agent_env.last_step.returns is not None:
+                        episodes.extend(learner.agent_env.last_step.returns[rows])
                 if self.members[0].spec.bootstrap:
-                    rollout.cut.append((t, self._starts, self._inputs.last_seen(ended)))
+                    rollout.cut.append((t, self._starts, self._inputs.final_observations(dones)))
         self._timesteps += self._steps * self._rows
         model = self._models[0]
-        rollout.values = self._values(rollout.seen)
+        rollout.values = self._values(rollout.observations)
         for t, cut, last in rollout.cut:
             rollout.rewards[:, :, t] += model.gamma * self._values(last) * cut
         rollout.estimate(self._values(self._current), self._starts, model.gamma, model.gae_lambda)
 
-    def _drawn(self) -> Tensor:
+    def _draw_noise(self) -> Tensor:
         """Return standard normal noise, each learner's from its own stream, in the shape in which it draws it."""
         noise = torch.zeros(len(self.members), self._rows, self._acts.shape[2])
-        for own, stream, space in zip(noise, self._noise, self._inputs.spaces, strict=True):
-            own[:, : space.shape[0]] = torch.empty(self._rows, space.shape[0]).normal_(generator=stream)
+        for rows, stream, space in zip(noise, self._noise, self._inputs.spaces, strict=True):
+            rows[:, : space.shape[0]] = torch.empty(self._rows, space.shape[0]).normal_(generator=stream)
         return noise.to(self._device)
 
-    def _values(self, seen: Tensor) -> Tensor:
+    def _values(self, observations: Tensor) -> Tensor:
         """Return the critics' values, (learners, …), of what is seen, (learners, …, entries), a piece at a time."""
-        critic, flat = self._weights.critic, seen.reshape(len(self.members), -1, self._inputs.entries)
+        critic, flat = self._weights.critic, observations.reshape(len(self.members), -1, self._inputs.entries)
         values = torch.empty(flat.shape[:2], device=self._device)
         for some in pieces(len(self.members), min(AT_ONCE, flat.shape[1]) * critic.width, self._device):
             for first in range(0, flat.shape[1], AT_ONCE):
                 part = slice(first, first + AT_ONCE)
                 values[some, part] = critic.forward(flat[some, part], some)[-1][..., 0]
-        return values.view(seen.shape[:-1])
+        return values.view(observations.shape[:-1])
 
     def _log(self, update: Update) -> None:
         """Write what Stable-Baselines3 writes of an update, for each learner that is kept."""

@@ -27,12 +27,12 @@ def _tanh_(values: Tensor) -> Tensor:
     return values.tanh_()
 
 
-def _multiply(left: Tensor, right: Tensor, into: Tensor) -> None:
+def _multiply(first: Tensor, second: Tensor, into: Tensor) -> None:
     """Write the products of matrices; NumPy's are some ten times as fast as torch's on a CPU where one is narrow."""
     if into.is_cpu:
-        np.matmul(left.numpy(), right.numpy(), out=into.numpy())
+        np.matmul(first.numpy(), second.numpy(), out=into.numpy())
     else:
-        into.copy_(torch.bmm(left, right))
+        into.copy_(torch.bmm(first, second))
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +56,9 @@ class Layer:
     weight: Tensor
     bias: Tensor | None
 
-    def __getitem__(self, some: slice) -> Layer:
+    def __getitem__(self, members: slice) -> Layer:
         """Return the layer of some learners."""
-        return Layer(self.weight[some], None if self.bias is None else self.bias[some])
+        return Layer(self.weight[members], None if self.bias is None else self.bias[members])
 
     def of(self, inputs: Tensor) -> Tensor:
         """Return W x + b, shape (learners, samples, out)."""
@@ -80,24 +80,24 @@ class Perceptrons:
         """Units of the widest layer."""
         return max(layer.weight.shape[1] for layer in self.layers)
 
-    def forward(self, inputs: Tensor, some: slice = slice(None)) -> list[Tensor]:
+    def forward(self, inputs: Tensor, members: slice = slice(None)) -> list[Tensor]:
         """Return the inputs, shape (learners, samples, in), the hidden units of each layer, and the outputs."""
         values = [inputs]
         for layer in self.layers:
-            values.append(layer[some].of(values[-1]))
+            values.append(layer[members].of(values[-1]))
             if layer is not self.layers[-1]:
                 self.activation.value(values[-1])
         return values
 
-    def backward(self, values: Sequence[Tensor], gradient: Tensor, some: slice = slice(None)) -> None:
+    def backward(self, values: Sequence[Tensor], gradient: Tensor, members: slice = slice(None)) -> None:
         """Write the gradients of weights and biases, from what ``forward`` gave and the gradient of the outputs."""
         for place in reversed(range(len(self.layers))):
-            into = self.gradients[place][some]
+            into = self.gradients[place][members]
             _multiply(gradient.mT, values[place], into.weight)
             if into.bias is not None:
                 into.bias.copy_(gradient.sum(dim=1))
             if place:
-                gradient = torch.bmm(gradient, self.layers[place].weight[some])
+                gradient = torch.bmm(gradient, self.layers[place].weight[members])
                 gradient = self.activation.gradient(gradient, values[place])
 
 
@@ -155,22 +155,22 @@ class ParameterLayout:
 
     def field(self, parameters: Sequence[Tensor], *indices: Sequence[Integers]) -> Field:
         """Give a parameter of every learner columns; of a padded tensor it fills these rows, columns and so on."""
-        shape = tuple(1 + max(int(own.max()) for own in along) for along in indices)
-        for places, parameter, *own in zip(self._places, parameters, *indices, strict=True):
-            places[parameter] = self.columns + np.ravel_multi_index(np.ix_(*own), shape).ravel()
+        shape = tuple(1 + max(int(index_sets.max()) for index_sets in along) for along in indices)
+        for places, parameter, *index_sets in zip(self._places, parameters, *indices, strict=True):
+            places[parameter] = self.columns + np.ravel_multi_index(np.ix_(*index_sets), shape).ravel()
         first, self.columns = self.columns, self.columns + math.prod(shape)
         return Field(slice(first, self.columns), shape)
 
     def layers(self, networks: Sequence[Sequence[Any]], inputs: Sequence[Integers]) -> list[tuple[Field, Field | None]]:
         """Give the linear layers of a network of every learner columns; it looks at these entries of the inputs."""
-        found: list[tuple[Field, Field | None]] = []
+        fields: list[tuple[Field, Field | None]] = []
         for layers in zip(*networks, strict=True):
             outputs = [np.arange(layer.out_features) for layer in layers]
             weight = self.field([layer.weight for layer in layers], outputs, inputs)
             biases = [layer.bias for layer in layers]
-            found.append((weight, None if biases[0] is None else self.field(biases, outputs)))
+            fields.append((weight, None if biases[0] is None else self.field(biases, outputs)))
             inputs = outputs
-        return found
+        return fields
 
     def places(self, learner: int) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield each parameter of a learner with its columns."""
@@ -201,22 +201,28 @@ class Weights:
     def __init__(
         self,
         policies: Sequence[ActorCriticPolicy],
-        seen: Sequence[Integers],
-        criticised: Sequence[Integers],
+        actor_columns: Sequence[Integers],
+        critic_columns: Sequence[Integers],
         device: torch.device,
     ) -> None:
         """Take over the parameters and what the optimisers remember.
 
-        ``seen`` and ``criticised`` are, by learner, the columns of the padded inputs at which its actor and its critic
-        look.
+        ``actor_columns`` and ``critic_columns`` are, by learner, the columns of the padded inputs at which its actor
+        and its critic look.
         """
         self._policies, self._layout = policies, (layout := ParameterLayout(len(policies)))
         log_std = layout.field([p.log_std for p in policies], [np.arange(len(p.log_std)) for p in policies])
         extractors = [policy.mlp_extractor for policy in policies]
         heads = [(policy.action_net, policy.value_net) for policy in policies]
-        linear = [(linear_layers(each.policy_net)[0], linear_layers(each.value_net)[0]) for each in extractors]
-        actor = layout.layers([[*own, head] for (own, _), (head, _) in zip(linear, heads, strict=True)], seen)
-        critic = layout.layers([[*own, head] for (_, own), (_, head) in zip(linear, heads, strict=True)], criticised)
+        linear = [
+            (linear_layers(extractor.policy_net)[0], linear_layers(extractor.value_net)[0]) for extractor in extractors
+        ]
+        actor = layout.layers(
+            [[*hidden, head] for (hidden, _), (head, _) in zip(linear, heads, strict=True)], actor_columns
+        )
+        critic = layout.layers(
+            [[*hidden, head] for (_, hidden), (_, head) in zip(linear, heads, strict=True)], critic_columns
+        )
         self.matrix = nn.Parameter(torch.zeros(len(policies), layout.columns, device=device), requires_grad=False)
         self.gradient = torch.zeros_like(self.matrix)
         self.matrix.grad = self.gradient
@@ -234,12 +240,12 @@ class Weights:
 
     def clip(self, norm: float) -> None:
         """Scale the gradient of each learner down to at most ``norm``, as torch's ``clip_grad_norm_`` does."""
-        own = torch.linalg.vector_norm(self.gradient, dim=1, keepdim=True)
-        self.gradient.mul_((norm / (own + 1e-6)).clamp(max=1.0))
+        norms = torch.linalg.vector_norm(self.gradient, dim=1, keepdim=True)
+        self.gradient.mul_((norm / (norms + 1e-6)).clamp(max=1.0))
 
     def give(self) -> None:
         """Give each policy its parameters, and its optimiser what it remembers."""
-        remembered = self.optimiser.state.get(self.matrix, {})
+        optimiser_state = self.optimiser.state.get(self.matrix, {})
         rate = self.optimiser.param_groups[0]["lr"]
         for learner, policy in enumerate(self._policies):
             policy.optimizer.param_groups[0]["lr"] = rate
@@ -249,8 +255,8 @@ class Weights:
                 policy.optimizer.state[parameter] = {
                     name: value[learner, columns].view(parameter.shape).to(parameter.device)
                     if _is_like(value, self.matrix)
-                    else _copied(value)
-                    for name, value in remembered.items()
+                    else _copy(value)
+                    for name, value in optimiser_state.items()
                 }
 
     def _take(self) -> None:
@@ -260,10 +266,10 @@ class Weights:
                 self.matrix[learner, columns] = parameter.detach().flatten().to(self.matrix.device)
                 for name, value in policy.optimizer.state.get(parameter, {}).items():
                     if not _is_like(value, parameter):
-                        state[name] = _copied(value)  # a number of steps: the same for all, who learn together
+                        state[name] = _copy(value)  # a number of steps: the same for all, who learn together
                         continue
-                    own = state.setdefault(name, torch.zeros_like(self.matrix))
-                    own[learner, columns] = value.flatten().to(own.device)
+                    rows = state.setdefault(name, torch.zeros_like(self.matrix))
+                    rows[learner, columns] = value.flatten().to(rows.device)
         if state:
             self.optimiser.state[self.matrix] = state
 
@@ -272,5 +278,5 @@ def _is_like(value: object, parameter: Tensor) -> bool:
     return isinstance(value, Tensor) and value.shape == parameter.shape
 
 
-def _copied(value: Any) -> Any:
+def _copy(value: Any) -> Any:
     return value.clone() if isinstance(value, Tensor) else value

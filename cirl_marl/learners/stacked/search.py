@@ -33,12 +33,12 @@ class SearchStack(Stack):
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
         """Take over what the learners know."""
         super().__init__(members, device)
-        self._models = [_search(each) for each in members]
+        self._models = [_ars_model(member) for member in members]
         first = self._models[0]
         self._layout = ParameterLayout(len(members))
         policies = [_policy(model) for model in self._models]
         parts = [parts_of(policy) for policy in policies]
-        self._fields = self._layout.layers([[*linear, head] for linear, head, _ in parts], self._inputs.seen)
+        self._fields = self._layout.layers([[*linear, head] for linear, head, _ in parts], self._inputs.actor_columns)
         self._activation: Activation = parts[0][2]
         self._squashes = policies[0].squash_output
         self._centre = torch.zeros(len(members), self._layout.columns, device=self._device)
@@ -46,11 +46,11 @@ class SearchStack(Stack):
             for parameter, columns in self._layout.places(i):
                 self._centre[i, columns] = parameter.detach().flatten().to(self._device)
         self._columns = [torch.cat([c for _, c in self._layout.places(i)]) for i in range(len(members))]
-        begun = members[0].spec.start
-        self._kept = None if begun is None or not begun.last_layer else slice(self._fields[-1][0].first)
-        seat = members[0].seat
-        self._rows, self._copies = seat.num_envs, seat.copies
-        self._each = copies_each(members[0])
+        source = members[0].spec.start
+        self._fixed_columns = None if source is None or not source.last_layer else slice(self._fields[-1][0].first)
+        agent_env = members[0].agent_env
+        self._rows, self._copies = agent_env.num_envs, agent_env.copies
+        self._copies_per_candidate = copies_per_candidate(members[0])
         # the algorithm counts a step of all its rows once for each of them
         self._before, self._updates = first.num_timesteps // self._rows**2, first._n_updates
 
@@ -62,32 +62,32 @@ class SearchStack(Stack):
             θ ← θ + α/(b σ_R) Σ_k (R_k+ − R_k−) δ_k
         """
         budget, first = self.members[0].budget(steps), self._models[0]
-        if not self._resuming:
+        if not self._is_restoring:
             self._inputs.begin()
         while self._steps < budget:
-            self._reached()
-            remaining = 1.0 - self._steps / budget
-            rate, std = first.lr_schedule(remaining), first.delta_std_schedule(remaining)
-            deltas = self._drawn()
-            moved = std * deltas
+            self._arrive()
+            progress_remaining = 1.0 - self._steps / budget
+            rate, std = first.lr_schedule(progress_remaining), first.delta_std_schedule(progress_remaining)
+            deltas = self._draw_directions()
+            steps_in_weights = std * deltas
             centre = self._centre[:, None]
-            returns = self._returns(torch.cat([centre + moved, centre - moved], dim=1), wait)
+            returns = self._returns(torch.cat([centre + steps_in_weights, centre - steps_in_weights], dim=1), wait)
             better, worse = returns[:, : first.n_delta], returns[:, first.n_delta :]
             top = torch.argsort(torch.maximum(better, worse), dim=1, descending=True)[:, : first.n_top]
             better, worse = better.gather(1, top), worse.gather(1, top)
             spread = torch.cat([better, worse], dim=1).std(dim=1)
             size = rate / (first.n_top * spread + 1e-6)
-            chosen = deltas.gather(1, top[..., None].expand(-1, -1, deltas.shape[2]))
-            self._centre += size[:, None] * torch.einsum("nk,nkp->np", better - worse, chosen)
+            directions = deltas.gather(1, top[..., None].expand(-1, -1, deltas.shape[2]))
+            self._centre += size[:, None] * torch.einsum("nk,nkp->np", better - worse, directions)
             self._updates += 1
             self._log(returns, spread, size, rate, std)
 
     @property
     def _steps(self) -> int:
-        return self._before + self._moves
+        return self._before + self._steps_done
 
-    def _best(self, seen: Tensor) -> Tensor:
-        return self._actions(self._centre, seen)
+    def _deterministic_actions(self, observations: Tensor) -> Tensor:
+        return self._actions(self._centre, observations)
 
     def _give_models(self) -> None:
         for i, model in enumerate(self._models):
@@ -96,53 +96,57 @@ class SearchStack(Stack):
             model.weights = found  # type: ignore[assignment]
             model.num_timesteps, model._n_updates = self._steps * self._rows**2, self._updates
 
-    def _drawn(self) -> Tensor:
+    def _draw_directions(self) -> Tensor:
         """Return the directions of all learners, each drawn as it draws them, shape (learners, K, columns).
 
         Where only the last layer learns, the others do not move.
         """
         count = self._models[0].n_delta
         deltas = torch.zeros(len(self.members), count, self._layout.columns)
-        for own, stream, columns in zip(deltas, self._noise, self._columns, strict=True):
-            own[:, columns] = torch.normal(0.0, 1.0, (count, len(columns)), generator=stream)
-        if self._kept is not None:
-            deltas[:, :, self._kept] = 0.0
+        for directions, stream, columns in zip(deltas, self._noise, self._columns, strict=True):
+            directions[:, columns] = torch.normal(0.0, 1.0, (count, len(columns)), generator=stream)
+        if self._fixed_columns is not None:
+            deltas[:, :, self._fixed_columns] = 0.0
         return deltas.to(self._device)
 
     def _returns(self, candidates: Tensor, wait: Callable[[], None]) -> Tensor:
         """Return what the episodes of each candidate brought each learner, shape (learners, candidates)."""
-        at_once = self._copies // self._each
-        found = [
+        at_once = self._copies // self._copies_per_candidate
+        parts = [
             self._episodes(candidates[:, first : first + at_once], wait)
             for first in range(0, candidates.shape[1], at_once)
         ]
-        return torch.cat(found, dim=1)
+        return torch.cat(parts, dim=1)
 
     def _episodes(self, candidates: Tensor, wait: Callable[[], None]) -> Tensor:
         """Let candidates, shape (learners, C, columns), act for one episode, each in its copies."""
         learners, count = candidates.shape[:2]
         matrix = candidates.reshape(learners * count, -1)
         agents = self._rows // self._copies  # rows of a shared policy, agent by agent
-        shape = (learners, agents, count, self._each)
-        seen, goes_on, total = self._inputs.begin(), True, torch.zeros(learners, count, device=self._device)
+        shape = (learners, agents, count, self._copies_per_candidate)
+        observations, goes_on, total = self._inputs.begin(), True, torch.zeros(learners, count, device=self._device)
         offset = self._models[0].alive_bonus_offset
         while goes_on:
-            by_candidate = seen.view(*shape, -1).transpose(1, 2).reshape(len(matrix), agents * self._each, -1)
+            by_candidate = (
+                observations.view(*shape, -1)
+                .transpose(1, 2)
+                .reshape(len(matrix), agents * self._copies_per_candidate, -1)
+            )
             actions = self._actions(matrix, by_candidate)
-            by_row = actions.view(learners, count, agents, self._each, -1).transpose(1, 2)
-            seen = self._move(by_row.reshape(learners, self._rows, -1), wait)
-            rewards, ended = self._inputs.paid()
+            by_row = actions.view(learners, count, agents, self._copies_per_candidate, -1).transpose(1, 2)
+            observations = self._move(by_row.reshape(learners, self._rows, -1), wait)
+            rewards, dones = self._inputs.rewards_and_dones()
             total += (rewards + offset).view(*shape).sum(dim=(1, 3))
-            goes_on = not ended.all()
+            goes_on = not dones.all()
         return total
 
-    def _actions(self, matrix: Tensor, seen: Tensor) -> Tensor:
-        outputs = Perceptrons(layers_of(self._fields, matrix), self._activation).forward(seen)[-1]
+    def _actions(self, matrix: Tensor, observations: Tensor) -> Tensor:
+        outputs = Perceptrons(layers_of(self._fields, matrix), self._activation).forward(observations)[-1]
         return outputs.tanh() if self._squashes else outputs
 
     def _log(self, returns: Tensor, spread: Tensor, size: Tensor, rate: float, std: float) -> None:
         """Write what the algorithm writes of an update, for each learner that is kept."""
-        episodes = self._rows // self._copies * self._each
+        episodes = self._rows // self._copies * self._copies_per_candidate
         for i, model in enumerate(self._models):
             if model.logger.output_formats:
                 model.logger.record("rollout/ep_rew_mean", float(returns[i].mean()) / episodes)
@@ -168,24 +172,24 @@ def parts_of(policy: ARSPolicy) -> tuple[list[nn.Linear], nn.Linear, Activation]
     return linear, modules[-1], ACTIVATIONS[kind or nn.Tanh]
 
 
-def copies_each(learner: Learner) -> int:
+def copies_per_candidate(learner: Learner) -> int:
     """Return in how many copies a candidate acts, for the episodes that it has; an episode is one row's.
 
     Raises:
         ValueError: if candidates do not fill the copies evenly.
     """
-    model, seat = _search(learner), learner.seat
-    agents = seat.num_envs // seat.copies
-    each, left = divmod(model.n_eval_episodes, agents)
-    if left or not each or seat.copies % each or model.pop_size % (seat.copies // each):
+    model, agent_env = _ars_model(learner), learner.agent_env
+    agents = agent_env.num_envs // agent_env.copies
+    each, remainder = divmod(model.n_eval_episodes, agents)
+    if remainder or not each or agent_env.copies % each or model.pop_size % (agent_env.copies // each):
         raise ValueError(
             f"{model.pop_size} candidates (2 n_delta) of {model.n_eval_episodes} episodes each (n_eval_episodes) "
-            f"do not fill {seat.copies} copies with {agents} rows evenly"
+            f"do not fill {agent_env.copies} copies with {agents} rows evenly"
         )
     return each
 
 
-def _search(learner: Learner) -> ARS:
+def _ars_model(learner: Learner) -> ARS:
     assert isinstance(learner.model, ARS)
     return learner.model
 

@@ -16,7 +16,7 @@ from cirl_marl.network import Floats
 
 MakeEnv = Callable[[], Any]
 """Makes an environment: a PettingZoo ``ParallelEnv`` or ``AECEnv``."""
-Observed = NDArray[Any] | dict[str, NDArray[Any]]
+Observations = NDArray[Any] | dict[str, NDArray[Any]]
 """Observations of an agent in all copies."""
 MASK = "action_mask"
 """Key of an observation, or of the infos, under which PettingZoo's environments tell which actions are legal."""
@@ -62,28 +62,28 @@ class Copies:
         possible = getattr(first, "possible_agents", None)
         if not possible:
             raise CirlError(f"environment '{first}': has no possible_agents, so nobody knows who will need a learner")
-        self._own = {str(agent): agent for agent in possible}
-        if len(self._own) != len(possible):
+        self._native_names = {str(agent): agent for agent in possible}
+        if len(self._native_names) != len(possible):
             raise CirlError(f"environment '{first}': agents share a name: {[str(agent) for agent in possible]}")
-        self.agents = tuple(self._own)
+        self.agents = tuple(self._native_names)
         self._place = {name: place for place, name in enumerate(self.agents)}
-        self.observation_spaces = {name: first.observation_space(own) for name, own in self._own.items()}
-        self.action_spaces = {name: first.action_space(own) for name, own in self._own.items()}
+        self.observation_spaces = {name: first.observation_space(native) for name, native in self._native_names.items()}
+        self.action_spaces = {name: first.action_space(native) for name, native in self._native_names.items()}
         for name, space in self.observation_spaces.items():
             _check(name, space)
         self.present = {name: np.zeros(num_envs, dtype=bool) for name in self.agents}
         self.masks: dict[str, NDArray[np.int8]] = {}
-        self.begun = np.ones(num_envs, dtype=bool)
-        self._seen: dict[str, Observed] = {
+        self.new_episode = np.ones(num_envs, dtype=bool)
+        self._observations: dict[str, Observations] = {
             name: _blank(self.observation_spaces[name], num_envs) for name in self.agents
         }
 
-    def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, Observed]:
+    def reset(self, *, seed: Sequence[int] | None = None) -> dict[str, Observations]:
         """Begin an episode in every copy, with one of the seeds each; return what everybody sees."""
         self._renew()
         for i in range(self.num_envs):
             self._begin(i, None if seed is None else int(seed[i]))
-        return dict(self._seen)
+        return dict(self._observations)
 
     def step(self, actions: Mapping[str, NDArray[Any]]) -> tuple[Any, ...]:
         """Let those who are present act; return observations, rewards, terminations, truncations and infos.
@@ -92,33 +92,33 @@ class Copies:
             LearnerError: if an environment tells of others than it promised; names the copy and them.
         """
         shape = (len(self.agents), self.num_envs)
-        rewards, ended, truncated = np.zeros(shape), np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
-        told: dict[str, list[dict[str, Any]]] = {name: [{} for _ in self.envs] for name in self.agents}
+        rewards, dones, truncated = np.zeros(shape), np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+        copy_infos: dict[str, list[dict[str, Any]]] = {name: [{} for _ in self.envs] for name in self.agents}
         before = self.present
         self._renew()
-        last = {name: _copied(rows) for name, rows in self._seen.items()}
+        last = {name: _copy(rows) for name, rows in self._observations.items()}
         for i, env in enumerate(self.envs):
-            acting = [name for name in self.agents if before[name][i]]
-            observations, paid, terminations, truncations, infos = env.step(
-                {self._own[name]: _action(self.action_spaces[name], actions[name][i]) for name in acting}
+            actors = [name for name in self.agents if before[name][i]]
+            observations, copy_rewards, terminations, truncations, infos = env.step(
+                {self._native_names[name]: _action(self.action_spaces[name], actions[name][i]) for name in actors}
             )
-            for name in acting:
-                own, place = self._own[name], self._place[name]
+            for name in actors:
+                native, place = self._native_names[name], self._place[name]
                 try:
-                    over = bool(terminations[own]) or bool(truncations[own])
-                    rewards[place, i], ended[place, i] = paid[own], over
-                    truncated[place, i] = over and not terminations[own]
+                    over = bool(terminations[native]) or bool(truncations[native])
+                    rewards[place, i], dones[place, i] = copy_rewards[native], over
+                    truncated[place, i] = over and not terminations[native]
                     if over:
-                        _put(last[name], i, observations[own], self.observation_spaces[name], self._where(i, name))
+                        _put(last[name], i, observations[native], self.observation_spaces[name], self._label(i, name))
                 except KeyError:
-                    raise LearnerError(f"{self._where(i, name)}: acted, but step() tells nothing of it") from None
-                told[name][i] = dict(infos.get(own) or {})
-            self._arrive(i, observations, infos, {name for name in acting if ended[self._place[name], i]})
+                    raise LearnerError(f"{self._label(i, name)}: acted, but step() tells nothing of it") from None
+                copy_infos[name][i] = dict(infos.get(native) or {})
+            self._arrive(i, observations, infos, {name for name in actors if dones[self._place[name], i]})
             if not env.agents:
                 self._begin(i, None)
-        shown = {name: {"final_observation": last[name], "copies": told[name]} for name in self.agents}
-        by_agent = [dict(zip(self.agents, each, strict=True)) for each in (rewards, ended & ~truncated, truncated)]
-        return dict(self._seen), *by_agent, shown
+        joint_infos = {name: {"final_observation": last[name], "copies": copy_infos[name]} for name in self.agents}
+        by_agent = [dict(zip(self.agents, each, strict=True)) for each in (rewards, dones & ~truncated, truncated)]
+        return dict(self._observations), *by_agent, joint_infos
 
     def state(self) -> Floats:
         """Refuse: PettingZoo's environments differ in whether they tell their state, and how."""
@@ -132,40 +132,42 @@ class Copies:
     def _renew(self) -> None:
         """Begin new arrays of what changes in a step: learners may have kept those that there were."""
         self.present = {name: np.zeros(self.num_envs, dtype=bool) for name in self.agents}
-        self.begun = np.zeros(self.num_envs, dtype=bool)
-        self._seen = {name: _copied(rows) for name, rows in self._seen.items()}
+        self.new_episode = np.zeros(self.num_envs, dtype=bool)
+        self._observations = {name: _copy(rows) for name, rows in self._observations.items()}
 
     def _begin(self, i: int, seed: int | None) -> None:
         observations, infos = self.envs[i].reset(seed=seed)
-        self.begun[i] = True
+        self.new_episode[i] = True
         self._arrive(i, observations, infos, set())
         if not self.envs[i].agents:
             raise LearnerError(f"copy {i} of the environment: nobody is there after reset()")
 
-    def _arrive(self, i: int, observations: Mapping[Any, Any], infos: Mapping[Any, Any], gone: Iterable[str]) -> None:
+    def _arrive(
+        self, i: int, observations: Mapping[Any, Any], infos: Mapping[Any, Any], finished_agents: Iterable[str]
+    ) -> None:
         """Note who is in a copy now, and what they see."""
-        for own in self.envs[i].agents:
-            name = str(own)
-            if name not in self._own:
+        for native in self.envs[i].agents:
+            name = str(native)
+            if name not in self._native_names:
                 raise LearnerError(
                     f"copy {i} of the environment: possible_agents: {unknown('agent', name, self.agents)}"
                 )
-            if name in gone:
-                raise LearnerError(f"{self._where(i, name)}: its episode has ended, and it is still in env.agents")
-            if own not in observations:
-                raise LearnerError(f"{self._where(i, name)}: is in env.agents, but there is no observation for it")
-            seen = observations[own]
-            _put(self._seen[name], i, seen, self.observation_spaces[name], self._where(i, name))
+            if name in finished_agents:
+                raise LearnerError(f"{self._label(i, name)}: its episode has ended, and it is still in env.agents")
+            if native not in observations:
+                raise LearnerError(f"{self._label(i, name)}: is in env.agents, but there is no observation for it")
+            observation = observations[native]
+            _put(self._observations[name], i, observation, self.observation_spaces[name], self._label(i, name))
             self.present[name][i] = True
-            self._mask(i, name, seen, infos.get(own) or {})
+            self._mask(i, name, observation, infos.get(native) or {})
 
-    def _mask(self, i: int, name: str, seen: Any, info: Mapping[str, Any]) -> None:
-        mask = seen[MASK] if isinstance(seen, Mapping) and MASK in seen else info.get(MASK)
+    def _mask(self, i: int, name: str, observation: Any, info: Mapping[str, Any]) -> None:
+        mask = observation[MASK] if isinstance(observation, Mapping) and MASK in observation else info.get(MASK)
         if mask is not None:
             flat = np.asarray(mask, dtype=np.int8).ravel()
             self.masks.setdefault(name, np.ones((self.num_envs, flat.size), dtype=np.int8))[i] = flat
 
-    def _where(self, i: int, name: str) -> str:
+    def _label(self, i: int, name: str) -> str:
         return f"copy {i} of the environment: agent '{name}'"
 
 
@@ -204,7 +206,7 @@ class AgentInCopy:
         return getattr(self.env, name)
 
 
-def _blank(space: spaces.Space[Any], copies: int) -> Observed:
+def _blank(space: spaces.Space[Any], copies: int) -> Observations:
     """Return zeros in the form of a space, for copies in which nothing was seen yet."""
     if isinstance(space, spaces.Dict):
         return {key: np.zeros((copies, *(part.shape or ())), dtype=part.dtype) for key, part in space.spaces.items()}
@@ -217,27 +219,27 @@ def _check(agent: str, space: spaces.Space[Any]) -> None:
     plain = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
     for key, part in parts.items():
         if not isinstance(part, plain):
-            named = f" '{key}'" if key else ""
+            label = f" '{key}'" if key else ""
             raise CirlError(
-                f"agent '{agent}': learners cannot take its observation{named}, which is {part}; wrap the environment "
+                f"agent '{agent}': learners cannot take its observation{label}, which is {part}; wrap the environment "
                 f"so that it gives a Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these"
             )
 
 
-def _copied(rows: Observed) -> Observed:
+def _copy(rows: Observations) -> Observations:
     return {key: part.copy() for key, part in rows.items()} if isinstance(rows, dict) else rows.copy()
 
 
-def _put(rows: Observed, i: int, seen: Any, space: spaces.Space[Any], where: str) -> None:
+def _put(rows: Observations, i: int, observation: Any, space: spaces.Space[Any], place: str) -> None:
     """Write what an agent sees into a row."""
     parts = [(None, rows)] if not isinstance(rows, dict) else list(rows.items())
     for key, part in parts:
-        if key is not None and not (isinstance(seen, Mapping) and key in seen):
-            raise LearnerError(f"{where}: its observation lacks '{key}', which its space {space} has")
-        value = np.asarray(seen if key is None else seen[key])
+        if key is not None and not (isinstance(observation, Mapping) and key in observation):
+            raise LearnerError(f"{place}: its observation lacks '{key}', which its space {space} has")
+        value = np.asarray(observation if key is None else observation[key])
         if value.shape != part.shape[1:]:
-            named = "" if key is None else f" '{key}'"
-            raise LearnerError(f"{where}: its observation{named} has the shape {value.shape}, not that of {space}")
+            label = "" if key is None else f" '{key}'"
+            raise LearnerError(f"{place}: its observation{label} has the shape {value.shape}, not that of {space}")
         part[i] = value
 
 

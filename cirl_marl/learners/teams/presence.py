@@ -46,7 +46,7 @@ class TeamVecEnv(AgentVecEnv):
         super().__init__(copies, agent, OneAgent(copies, agent), wait, AgentInCopy)
         self._joint = copies
         self.missed_steps = 0
-        self.present = self.counted = np.ones(copies.num_envs, dtype=bool)
+        self.present = self.acted_rows = np.ones(copies.num_envs, dtype=bool)
         self._leave_out: Callable[[], None] | None = None
 
     @property
@@ -54,19 +54,19 @@ class TeamVecEnv(AgentVecEnv):
         """Whether the agent is in no copy."""
         return not self.present.any()
 
-    def show(self, observations: Arrays, state: Callable[[], Floats]) -> None:
+    def receive_reset(self, observations: Arrays, state: Callable[[], Floats]) -> None:
         """Show the first observation."""
-        super().show(observations, state)
+        super().receive_reset(observations, state)
         self._meet(self._joint.present[self.name])
 
-    def hand(self, step: JointStep) -> None:
+    def receive_step(self, step: JointStep) -> None:
         """Hand over what the joint step brought; what came while the agent was away belongs to the step before."""
-        acted, before, away = self.present, self.handed, self.absent
-        super().hand(step)
+        acted, before, away = self.present, self.last_step, self.absent
+        super().receive_step(step)
         if away:
-            self.handed = replace(before, seen=self.handed.seen)
+            self.last_step = replace(before, observation=self.last_step.observation)
         else:
-            self.counted = acted
+            self.acted_rows = acted
         self._meet(self._joint.present[self.name])
 
     def at_first_gap(self, leave_out: Callable[[], None]) -> None:
@@ -80,7 +80,7 @@ class TeamVecEnv(AgentVecEnv):
         self._notice_gap()
 
     def _notice_gap(self) -> None:
-        whole = self.counted.all() and (self.present.all() or self.absent)
+        whole = self.acted_rows.all() and (self.present.all() or self.absent)
         if not whole and self._leave_out is not None:
             leave_out, self._leave_out = self._leave_out, None
             leave_out()
@@ -89,23 +89,23 @@ class TeamVecEnv(AgentVecEnv):
 class _Rollout(RolloutBuffer):
     """Rollouts of which only rows in which the agent acted are learnt."""
 
-    seat: TeamVecEnv
-    acted: NDArray[np.bool_]
+    agent_env: TeamVecEnv
+    row_acted: NDArray[np.bool_]
 
     def reset(self) -> None:
         super().reset()
-        self.acted = np.ones((self.buffer_size, self.n_envs), dtype=bool)
+        self.row_acted = np.ones((self.buffer_size, self.n_envs), dtype=bool)
 
     def add(self, *args: Any, **kwargs: Any) -> None:
-        self.acted[self.pos] = self.seat.counted
+        self.row_acted[self.pos] = self.agent_env.acted_rows
         super().add(*args, **kwargs)
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
-        if self.acted.all():
+        if self.row_acted.all():
             yield from super().get(batch_size)
             return
         next(super().get(1))  # it lays the steps of a row one after the other
-        order = np.random.permutation(np.flatnonzero(self.acted.T))  # noqa: NPY002 (the learner's own stream)
+        order = np.random.permutation(np.flatnonzero(self.row_acted.T))  # noqa: NPY002 (the learner's own stream)
         size = len(order) if batch_size is None else batch_size
         for start in range(0, len(order), size):
             yield self._get_samples(order[start : start + size])
@@ -114,32 +114,36 @@ class _Rollout(RolloutBuffer):
 class _Replay(ReplayBuffer):
     """A replay buffer into which no row goes in which the agent did not act."""
 
-    seat: TeamVecEnv
+    agent_env: TeamVecEnv
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
-        counted = self.seat.counted
+        is_present = self.agent_env.acted_rows
         rows = np.arange(self.n_envs)
-        acted = np.flatnonzero(counted)
-        rows[~counted] = np.resize(acted, self.n_envs - len(acted))
-        told = [infos[row] for row in rows]
-        super().add(_chosen(obs, rows), _chosen(next_obs, rows), action[rows], reward[rows], done[rows], told)
+        present = np.flatnonzero(is_present)
+        rows[~is_present] = np.resize(present, self.n_envs - len(present))
+        row_infos = [infos[row] for row in rows]
+        super().add(_rows_of(obs, rows), _rows_of(next_obs, rows), action[rows], reward[rows], done[rows], row_infos)
 
 
-def _chosen(seen: Any, rows: NDArray[np.integer]) -> Any:
-    return {key: part[rows] for key, part in seen.items()} if isinstance(seen, dict) else seen[rows]
+def _rows_of(observations: Any, rows: NDArray[np.integer]) -> Any:
+    return (
+        {key: part[rows] for key, part in observations.items()}
+        if isinstance(observations, dict)
+        else observations[rows]
+    )
 
 
 class _Moments(RunningMeanStd):
     """Moments of the rows that somebody acts in."""
 
-    seat: TeamVecEnv
-    which: str
+    agent_env: TeamVecEnv
+    rows_attribute: str
 
     def update(self, arr: NDArray[Any]) -> None:
-        super().update(arr[getattr(self.seat, self.which)])
+        super().update(arr[getattr(self.agent_env, self.rows_attribute)])
 
 
-def leave_out_absent(model: BaseAlgorithm, env: Any, seat: TeamVecEnv) -> None:
+def leave_out_absent(model: BaseAlgorithm, env: Any, agent_env: TeamVecEnv) -> None:
     """Let a learner learn only from rows of its ``seat`` in which the agent is present.
 
     Raises:
@@ -148,23 +152,23 @@ def leave_out_absent(model: BaseAlgorithm, env: Any, seat: TeamVecEnv) -> None:
     rollout, replay = getattr(model, "rollout_buffer", None), getattr(model, "replay_buffer", None)
     sequences = isinstance(rollout, RecurrentRolloutBuffer | RecurrentDictRolloutBuffer)
     if isinstance(rollout, RolloutBuffer) and not sequences:
-        _become(rollout, _Rollout, seat)
-        rollout.acted = np.ones((rollout.buffer_size, rollout.n_envs), dtype=bool)  # type: ignore[attr-defined]
+        _add_base(rollout, _Rollout, agent_env)
+        rollout.row_acted = np.ones((rollout.buffer_size, rollout.n_envs), dtype=bool)  # type: ignore[attr-defined]
     elif replay is not None and type(replay) in WHOLE and not replay.optimize_memory_usage:
-        _become(replay, _Replay, seat)
+        _add_base(replay, _Replay, agent_env)
     else:
         raise LearnerError(
-            f"{seat.title}: is absent in some copies while it acts in others, and {type(model).__name__} cannot leave "
-            f"those out; use num_envs=1, or another algorithm"
+            f"{agent_env.title}: is absent in some copies while it acts in others, and {type(model).__name__} cannot "
+            f"leave those out; use num_envs=1, or another algorithm"
         )
     if isinstance(env, VecNormalize):
-        seen = env.obs_rms.values() if isinstance(env.obs_rms, dict) else [env.obs_rms]
-        for which, moments in (("counted", env.ret_rms), *(("present", each) for each in seen)):
-            _become(moments, _Moments, seat)
-            moments.which = which  # type: ignore[attr-defined]
+        observation_moments = env.obs_rms.values() if isinstance(env.obs_rms, dict) else [env.obs_rms]
+        for rows, moments in (("counted", env.ret_rms), *(("present", part) for part in observation_moments)):
+            _add_base(moments, _Moments, agent_env)
+            moments.rows_attribute = rows  # type: ignore[attr-defined]
 
 
-def _become(thing: Any, kind: type, seat: TeamVecEnv) -> None:
+def _add_base(thing: Any, kind: type, agent_env: TeamVecEnv) -> None:
     """Make an object one of ``kind`` as well, with what it has in it."""
     thing.__class__ = type(f"Present{type(thing).__name__}", (kind, type(thing)), {})
-    thing.seat = seat
+    thing.agent_env = agent_env

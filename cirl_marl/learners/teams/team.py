@@ -22,7 +22,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
-from cirl_marl.learners.algorithms import RESERVED, every_algorithm
+from cirl_marl.learners.algorithms import RESERVED_PARAMETERS, every_algorithm
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.learner import Learner, derived_seed, predict_action
 from cirl_marl.learners.lockstep import Lockstep, Participant, Streams, World, global_streams_claimed, wait
@@ -97,14 +97,14 @@ class Team:
         self._make_env, self._settings, self.seed = make_env, dict(settings), seed
         self._copies, self._log = copies, tensorboard_log
         self.agents = copies.agents
-        seats = {agent: TeamVecEnv(copies, agent, wait) for agent in copies.agents}
+        agent_envs = {agent: TeamVecEnv(copies, agent, wait) for agent in copies.agents}
         seeds = [derived_seed(seed, "copies", i) for i in range(copies.num_envs)]
-        self.world = World(copies, seeds, seats)
+        self.world = World(copies, seeds, agent_envs)
         self.learners: dict[str, Learner] = {}
         with one_torch_thread():
-            for agent, seat in seats.items():
-                learner = Learner(seat, settings[agent], seed).build()
-                seat.at_first_gap(partial(leave_out_absent, learner.model, learner.env, seat))
+            for agent, agent_env in agent_envs.items():
+                learner = Learner(agent_env, settings[agent], seed).build()
+                agent_env.at_first_gap(partial(leave_out_absent, learner.model, learner.env, agent_env))
                 self.learners[agent] = learner
 
     def __getitem__(self, agent: str) -> BaseAlgorithm:
@@ -140,26 +140,28 @@ class Team:
         joint = self.world.joint_steps + math.ceil(total_timesteps / self._copies.num_envs)
         with global_streams_claimed(), one_torch_thread(), Bar(disable=not progress_bar) as bar:
             task = bar.add_task(f"{len(self.agents)} learners", total=joint - self.world.joint_steps)
-            everyone = [self._participant(agent, total_timesteps, joint, callbacks or {}) for agent in self.agents]
+            participants = [self._participant(agent, total_timesteps, joint, callbacks or {}) for agent in self.agents]
             try:
-                Lockstep([self.world], everyone).run([lambda _infos, _over: bar.advance(task)])
+                Lockstep([self.world], participants).run([lambda _infos, _over: bar.advance(task)])
             finally:
                 for learner in self.learners.values():
                     learner.model.logger.close()
         return self
 
     def _participant(self, agent: str, steps: int, joint: int, callbacks: Mapping[str, BaseCallback]) -> Participant:
-        learner, seat = self.learners[agent], self.world.seats[agent]
-        assert isinstance(seat, TeamVecEnv)
-        missed = seat.missed_steps
+        learner, agent_env = self.learners[agent], self.world.agent_envs[agent]
+        assert isinstance(agent_env, TeamVecEnv)
+        missed_before = agent_env.missed_steps
         if self._log is not None:
             learner.model.set_logger(configure(str(Path(self._log) / agent), ["tensorboard"]))
 
         def budget() -> int:
-            return joint if isinstance(learner.model, ARS) or seat.missed_steps > missed else 2**62
+            return joint if isinstance(learner.model, ARS) or agent_env.missed_steps > missed_before else 2**62
 
         learn = partial(learner.learn_on, steps, callbacks.get(agent))
-        return Participant(seat.title, learn, learner.act, learner.streams, budget=budget, absent=lambda: seat.absent)
+        return Participant(
+            agent_env.title, learn, learner.act, learner.streams, budget=budget, absent=lambda: agent_env.absent
+        )
 
     def evaluate(
         self, episodes: int = 10, *, seed: int = 0, deterministic: bool = True
@@ -176,39 +178,44 @@ class Team:
         copies = Copies(self._make_env, min(episodes, self._copies.num_envs))
         try:
             with Streams(derived_seed(seed, "evaluation")).active(), one_torch_thread():
-                return self._played(copies, episodes, seed, deterministic)
+                return self._play(copies, episodes, seed, deterministic)
         finally:
             copies.close()
 
-    def _played(self, copies: Copies, episodes: int, seed: int, deterministic: bool) -> dict[str, NDArray[np.floating]]:
+    def _play(self, copies: Copies, episodes: int, seed: int, deterministic: bool) -> dict[str, NDArray[np.floating]]:
         count = copies.num_envs
-        seats = {agent: TeamVecEnv(copies, agent, wait) for agent in self.agents}
-        seen = copies.reset(seed=[derived_seed(seed, "evaluation", i) for i in range(count)])
+        agent_envs = {agent: TeamVecEnv(copies, agent, wait) for agent in self.agents}
+        observations = copies.reset(seed=[derived_seed(seed, "evaluation", i) for i in range(count)])
         starts = {agent: np.ones(count, dtype=bool) for agent in self.agents}
         memory: dict[str, Any] = dict.fromkeys(self.agents)
-        paid, found = np.zeros((len(self.agents), count)), np.zeros((len(self.agents), episodes))
+        returns, episode_returns = np.zeros((len(self.agents), count)), np.zeros((len(self.agents), episodes))
         places = np.arange(count)  # of the episode that runs in each copy; copy i plays i, i + B, i + 2 B …
         while (places < episodes).any():
             actions = {}
             for agent, learner in self.learners.items():
                 if copies.present[agent].any():
-                    rows: Any = seen[agent]
+                    rows: Any = observations[agent]
                     if isinstance(learner.env, VecNormalize):
                         rows = learner.env.normalize_obs(rows)
                     actions[agent], memory[agent] = predict_action(
-                        learner.model, rows, memory[agent], starts[agent], seats[agent], deterministic=deterministic
+                        learner.model,
+                        rows,
+                        memory[agent],
+                        starts[agent],
+                        agent_envs[agent],
+                        deterministic=deterministic,
                     )
             before = copies.present
-            seen, rewards, terminations, truncations, _ = copies.step(actions)
-            paid += list(rewards.values())
+            observations, rewards, terminations, truncations, _ = copies.step(actions)
+            returns += list(rewards.values())
             for agent in self.agents:
                 starts[agent] = terminations[agent] | truncations[agent] | ~before[agent]
-            for i in np.flatnonzero(copies.begun):
+            for i in np.flatnonzero(copies.new_episode):
                 if places[i] < episodes:
-                    found[:, places[i]] = paid[:, i]
+                    episode_returns[:, places[i]] = returns[:, i]
                 places[i] += count
-                paid[:, i] = 0.0
-        return dict(zip(self.agents, found, strict=True))
+                returns[:, i] = 0.0
+        return dict(zip(self.agents, episode_returns, strict=True))
 
     def save(self, folder: str | Path) -> None:
         """Write settings, policies, optimisers, normalisers and streams to a new folder, without replay buffers.
@@ -227,11 +234,11 @@ class Team:
         partial_folder = path.with_name(f".{path.name}.partial")
         shutil.rmtree(partial_folder, ignore_errors=True)
         partial_folder.mkdir(parents=True)
-        told = {agent: spec.model_dump() for agent, spec in self._settings.items()}
+        specs = {agent: spec.model_dump() for agent, spec in self._settings.items()}
         try:
             for learner in self.learners.values():
                 learner.write_state(partial_folder, {}, last=True)
-            write_tree(partial_folder, "team", {"seed": self.seed, "num_envs": self._copies.num_envs, "agents": told})
+            write_tree(partial_folder, "team", {"seed": self.seed, "num_envs": self._copies.num_envs, "agents": specs})
         except TypeError as error:
             shutil.rmtree(partial_folder)
             raise RunError(f"{path}: parameters that are no plain values cannot be kept: {error}") from error
@@ -245,11 +252,11 @@ class Team:
             RunError: if a file is missing, cannot be read, or is of another environment.
         """
         path = Path(folder)
-        told = read_tree(path, "team")
+        saved = read_tree(path, "team")
         try:
-            settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in told["agents"].items()}
-            copies = Copies(make_env, told["num_envs"])
-            seed = int(told["seed"])
+            settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in saved["agents"].items()}
+            copies = Copies(make_env, saved["num_envs"])
+            seed = int(saved["seed"])
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise RunError(f"{path / 'team.json'}: is not what a team wrote: {error}") from error
         if set(settings) != set(copies.agents):
@@ -264,26 +271,28 @@ class Team:
         self._copies.close()
 
 
-def _settings(agent: str, algorithm: Algorithm, seen: spaces.Space[Any], normalise: bool) -> LearnerSettings:
+def _settings(agent: str, algorithm: Algorithm, space: spaces.Space[Any], normalise: bool) -> LearnerSettings:
     """Return what an algorithm, with parameters or without, says of the learner of an agent."""
-    given = algorithm if isinstance(algorithm, partial) else partial(algorithm)
-    name = getattr(given.func, "__name__", repr(given.func))
-    known = every_algorithm()
-    if known.get(name) is not given.func:
-        found = unknown("algorithm of stable_baselines3 or sb3_contrib", name, known)
-        raise RecipeError(f"agent '{agent}': {found}")
-    parameters = dict(given.keywords)
-    asked = [*given.args, *([parameters.pop("policy")] if "policy" in parameters else [])]
-    if len(asked) > 1 or not all(isinstance(policy, str) for policy in asked):
-        raise RecipeError(f"agent '{agent}': {name}: give a policy by its name and parameters by theirs, got {asked}")
-    if reserved := sorted(set(parameters) & set(RESERVED)):
-        raise RecipeError(f"agent '{agent}': {name}: {', '.join(reserved)}: the team sees to that")
-    policy = asked[0] if asked else _policy_for(seen, known[name])
-    own = Normalisation(observation=normalise, reward=normalise)
-    return LearnerSettings(algorithm=name, policy=policy, parameters=parameters, normalise=own)
+    bound_algorithm = algorithm if isinstance(algorithm, partial) else partial(algorithm)
+    name = getattr(bound_algorithm.func, "__name__", repr(bound_algorithm.func))
+    classes = every_algorithm()
+    if classes.get(name) is not bound_algorithm.func:
+        hint = unknown("algorithm of stable_baselines3 or sb3_contrib", name, classes)
+        raise RecipeError(f"agent '{agent}': {hint}")
+    parameters = dict(bound_algorithm.keywords)
+    policy_names = [*bound_algorithm.args, *([parameters.pop("policy")] if "policy" in parameters else [])]
+    if len(policy_names) > 1 or not all(isinstance(policy, str) for policy in policy_names):
+        raise RecipeError(
+            f"agent '{agent}': {name}: give a policy by its name and parameters by theirs, got {policy_names}"
+        )
+    if refused := sorted(set(parameters) & set(RESERVED_PARAMETERS)):
+        raise RecipeError(f"agent '{agent}': {name}: {', '.join(refused)}: the team sees to that")
+    policy = policy_names[0] if policy_names else _policy_for(space, classes[name])
+    normalisation = Normalisation(observation=normalise, reward=normalise)
+    return LearnerSettings(algorithm=name, policy=policy, parameters=parameters, normalise=normalisation)
 
 
-def _policy_for(seen: spaces.Space[Any], kind: type[BaseAlgorithm]) -> str:
+def _policy_for(space: spaces.Space[Any], kind: type[BaseAlgorithm]) -> str:
     """Return the first policy of an algorithm for observations of a space."""
-    prefix = "MultiInput" if isinstance(seen, spaces.Dict) else "Cnn" if is_image_space(seen) else "Mlp"
+    prefix = "MultiInput" if isinstance(space, spaces.Dict) else "Cnn" if is_image_space(space) else "Mlp"
     return next((alias for alias in kind.policy_aliases if alias.startswith(prefix)), f"{prefix}Policy")
