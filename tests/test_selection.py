@@ -86,9 +86,8 @@ def test_service_comes_first(figures: list[tuple[float, float, float]], demanded
         assert best in serving and best.circularity == max(score.circularity for score in serving)
     else:
         assert best.service_bound == max(score.service_bound for score in scores)
-    assert max(scores, key=lambda score: score.rank(None)).episode_return == max(
-        score.episode_return for score in scores
-    )
+    returns = [score.episode_return for score in scores]
+    assert max(scores, key=lambda score: score.rank(None)).episode_return == max(returns)
 
 
 def test_without_evaluations_the_last_checkpoint_acts(tmp_path: Path) -> None:

@@ -459,7 +459,7 @@ def _participants(
                     learner.act,
                     learner.streams,
                     [learner.barrier],
-                    partial(getattr, learner, "shown"),
+                    partial(getattr, learner, "follows_demonstrator"),
                     partial(learner.budget, steps),
                 )
 

@@ -1,7 +1,8 @@
 """Validation during a training: episodes of their own choose the checkpoint that counts and move the multiplier.
 
 The last policies of a run are seldom the best ones. Validation episodes, the same each time and unlike those of
-training and of reports, decide which checkpoint acts; a multiplier turns the service that a recipe demands into a constraint.
+training and of reports, decide which checkpoint acts; a multiplier makes the service that a recipe demands a
+constraint.
 """
 
 from __future__ import annotations
