@@ -1,4 +1,4 @@
-"""The tables of docs/bound.md: how tight the bound is, what plans, search and MPC reach, what service costs.
+"""The tables of docs/plans.md: how tight the bound is, what plans, search and MPC reach, what service costs.
 
 ``python benchmarks/bound.py`` measures all of them and writes them into the document; ``--only SECTION`` measures some.
 """
@@ -26,7 +26,7 @@ from cirl_marl.evaluation.comparison import starting_stocks
 from cirl_marl.optimum import Bound, Envelope, Incumbent, Plan, achieved, bound, envelope, gap, improved, search
 from cirl_marl.optimum.mpc import MPC
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "bound.md"
+DOCUMENT = Path(__file__).parent.parent / "docs" / "plans.md"
 NETWORKS = ("copper_net", "carbo_net")
 SERVICE = 0.99
 """Mean level demanded of every service, but in the section on its price."""
@@ -59,7 +59,7 @@ def main(
     only: Annotated[list[str] | None, typer.Option(help="Sections; default: all.")] = None,
     document: Annotated[Path, typer.Option(help="Whose tables are written.")] = DOCUMENT,
 ) -> None:
-    """Measure the tables of docs/bound.md and write them into it."""
+    """Measure the tables of docs/plans.md and write them into it."""
     known = _sections()
     for name in only or known:
         if name not in known:

@@ -1,4 +1,4 @@
-"""Bounds and plans of real cycles at full service, as tables of ``docs/data.md``.
+"""Bounds and plans of real cycles at full service, as tables of ``docs/cycles.md``.
 
 python -m benchmarks.plans    # of the world's copper, aluminium and plastics (some minutes)
 """
@@ -15,7 +15,7 @@ from cirl_marl.controllers import Neutral
 from cirl_marl.controllers.rollout import episode_start, rollout
 from cirl_marl.optimum import achieved, bound, gap, improved
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "data.md"
+DOCUMENT = Path(__file__).parent.parent / "docs" / "cycles.md"
 CYCLES = ("copper_world", "aluminium_world", "plastics_world")
 
 

@@ -2,7 +2,7 @@
 
 python -m benchmarks.steel             # writes envs/steel.csv, steel_regions.csv and steel_demand.csv anew
 python -m benchmarks.steel --hindcast  # old scrap in 2015-2024, in docs/data.md
-python -m benchmarks.steel --plans     # bounds and plans of every country, in docs/data.md (half an hour)
+python -m benchmarks.steel --plans     # bounds and plans of every country, in docs/cycles.md (half an hour)
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.document import write_sections
+from benchmarks.plans import DOCUMENT as CYCLES
 from benchmarks.plans import plan_lines
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
@@ -380,7 +381,7 @@ def hindcast_lines(found: Sequence[Past]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Write the data files, or a table of ``docs/data.md``."""
+    """Write the data files, or a table of ``docs/data.md`` or ``docs/cycles.md``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--table", type=Path, default=TABLE, help="the published table of flows")
     parser.add_argument("--hindcast", action="store_true", help="write the table of hindcasts instead")
@@ -392,7 +393,7 @@ def main() -> None:
     if asked.plans:
         found = identifiers([each.name for each in everyone])
         networks = {name: load_network(f"{ENVS / 'steel.toml'}:{region}") for name, region in found.items()}
-        write_sections(DOCUMENT, {"plans": "\n".join(plan_lines("country", networks, unit=1e3))})
+        write_sections(CYCLES, {"plans": "\n".join(plan_lines("country", networks, unit=1e3))})
     if not asked.hindcast and not asked.plans:
         write_all(everyone)
 

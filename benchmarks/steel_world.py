@@ -1,7 +1,7 @@
 """The data of ``envs/steel_world.toml``, and what was measured with it; ``docs/data.md`` has the sources.
 
 python -m benchmarks.steel_world           # writes envs/steel_world.csv and steel_world_rest.csv anew
-python -m benchmarks.steel_world --levers  # what single levers and countries bring, in docs/data.md
+python -m benchmarks.steel_world --levers  # what single levers and countries bring, in docs/cycles.md
 python -m benchmarks.steel_world --plan    # bound and plan, and who brings how much of it, there (ten minutes)
 """
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmarks import steel
 from benchmarks.document import write_sections
+from benchmarks.plans import DOCUMENT as CYCLES
 from benchmarks.steel import ENVS, FUTURE, RECENT, TABLE, YEARS, Country, countries
 from cirl_marl import MultiAgentVectorEnv, load_network
 from cirl_marl.controllers import Neutral
@@ -236,10 +237,10 @@ def main() -> None:
     given = parser.parse_args()
     if given.plan:
         plan, lines = planned()
-        write_sections(steel.DOCUMENT, {"world_plan": "\n".join(lines), "world_gains": "\n".join(gain_lines(plan))})
+        write_sections(CYCLES, {"world_plan": "\n".join(lines), "world_gains": "\n".join(gain_lines(plan))})
         return
     if given.levers:
-        write_sections(steel.DOCUMENT, {"levers": "\n".join(lever_lines())})
+        write_sections(CYCLES, {"levers": "\n".join(lever_lines())})
         return
     everyone = sorted(countries(read_flows(TABLE)), key=lambda each: each.name)
     found = markets(everyone)

@@ -215,8 +215,8 @@ low = {{ file = "ores.csv", column = "kt", where = {{ country = "China", year = 
 
 
 def test_shares_of_the_guide(tmp_path: Path) -> None:
-    """The split that envs/README.md works out."""
-    guide = (Path(__file__).parent.parent / "envs" / "README.md").read_text(encoding="utf-8")
+    """The split that docs/yearly_networks.md works out."""
+    guide = (Path(__file__).parent.parent / "docs" / "yearly_networks.md").read_text(encoding="utf-8")
     section = guide.split("## Shares")[1].split("\n## ")[0]
     lines = re.findall(r"^    (.*)$", section, re.M)
     *arcs, control = lines
