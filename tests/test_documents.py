@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import typer.main
 from imports import arrows, modules, rooms
+from readability import ALL, PAGE, words
 
 import cirl_marl
 from cirl_marl import cli
@@ -22,7 +23,7 @@ from cirl_marl.definitions.reader import Definition
 from cirl_marl.learners import load_recipe, train
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("[a-z]*/README.md")])
+DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md"), *ROOT.glob("[a-z]*/README.md")])
 WIDTH = 120
 COMMANDS: dict[str, Any] = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
 
@@ -101,6 +102,14 @@ def test_readme_is_short() -> None:
     assert len(text.split()) <= 700
     (code,) = blocks(text, "python")
     assert len([line for line in code.splitlines() if line]) <= 10
+
+
+def test_pages_are_short() -> None:
+    """A page answers one question; the words that are written by hand fit in a few minutes."""
+    counts = words(ROOT)
+    limits = {name: PAGE for name in counts} | {"CHANGELOG.md": sum(counts.values())}
+    assert {name: count for name, count in counts.items() if count > limits[name]} == {}
+    assert sum(counts.values()) <= ALL
 
 
 def test_every_page_is_found_from_the_readme() -> None:
@@ -233,12 +242,12 @@ def test_readme_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.medium
-def test_reference_example_of_one_agent_runs() -> None:
+def test_example_of_one_agent_runs() -> None:
     """One compartment learns as printed, but for a shorter training."""
-    (code,) = blocks((ROOT / "docs" / "reference.md").read_text(), "python")
+    (code,) = blocks((ROOT / "docs" / "environments.md").read_text(), "python")
     assert ".learn(20_000)" in code
     names: dict[str, Any] = {}
-    exec(compile(code.replace("20_000", "2_048"), "reference.md", "exec"), names)
+    exec(compile(code.replace("20_000", "2_048"), "environments.md", "exec"), names)
     assert names["model"].num_timesteps == 2_048
 
 
@@ -277,7 +286,8 @@ def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:
 
 def test_own_model_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The tables shown for a model of one's own belong to a network that can be run."""
-    whole, parts = blocks((ROOT / "envs" / "README.md").read_text(), "toml")
+    (whole,) = blocks((ROOT / "envs" / "README.md").read_text(), "toml")
+    (parts,) = blocks((ROOT / "docs" / "compartments.md").read_text(), "toml")
     definition = tmp_path / "brewery.toml"
     definition.write_text(re.sub(r"\[episode\].*?\n\n", "", whole.split("[nodes.")[0], flags=re.DOTALL) + parts)
     env = cirl_marl.parallel_env(cirl_marl.load_network(definition, allow_code=True))

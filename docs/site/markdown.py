@@ -13,7 +13,7 @@ from benchmarks.document import markdown_table
 
 ROOT = Path(__file__).parent.parent.parent
 WRITTEN = (
-    *(ROOT / name for name in ("README.md", "CHANGELOG.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     *sorted(ROOT.glob("docs/*.md")),
     *sorted(ROOT.glob("[a-z]*/README.md")),
     *sorted(ROOT.glob("examples/notebooks/*.md")),
