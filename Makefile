@@ -49,8 +49,9 @@ docs: $(VENV)/.docs  ## the documents as a site in build/site; what is broken or
 notebooks: $(VENV)/.docs  ## run the notebooks whose scripts have changed and keep what comes out (minutes each)
 	$(BIN)/python -m docs.site.notebooks
 
-written: $(VENV)/.runtime  ## the JSON schema of networks and docs/format.md, from the declarations of fields
-	$(BIN)/python -m cirl_marl.definitions.format_guide
+written: $(VENV)/.runtime  ## the JSON schema of networks, docs/format.md and tables of docs/reference.md, from the code
+	$(BIN)/python -m cirl_marl.definitions.guide
+	$(BIN)/python -m docs.site.reference
 
 fuzz: $(VENV)/.dev  ## 10 000 mutated definitions and recipes, each refused or one that works (half an hour)
 	$(BIN)/python tests/fuzz.py 10000

@@ -21,9 +21,12 @@ from cirl_marl import cli
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.reader import Definition
 from cirl_marl.learners import load_recipe, train
+from docs.site.reference import reference_tables
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md"), *ROOT.glob("[a-z]*/README.md")])
+DOCUMENTS = sorted(
+    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md"), *ROOT.glob("[a-z]*/README.md")]
+)
 WIDTH = 120
 COMMANDS: dict[str, Any] = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
 
@@ -190,6 +193,13 @@ def test_reference_lists_the_catalogue_and_the_commands() -> None:
         assert f"| {len(network.agents)} |" in row
     section = text.split("## Learner recipes")[1].split("## ")[0]
     assert set(re.findall(r"^\| `(\w+)`", section, re.MULTILINE)) == set(cirl_marl.recipes())
+
+
+def test_reference_is_written_from_the_code() -> None:
+    """Its tables are those of ``make written``."""
+    text = (ROOT / "docs" / "reference.md").read_text()
+    for name, lines in reference_tables().items():
+        assert text.split(f"<!-- {name} -->\n")[1].split(f"\n<!-- /{name} -->")[0] == lines, "make written"
 
 
 def test_architecture_draws_the_imports() -> None:
