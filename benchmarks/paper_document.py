@@ -13,31 +13,21 @@ from cirl_marl.paper.table import COLUMNS, distinct, notes, table_rows
 
 INTRODUCTION = f"""# The paper's tables, repeated
 
-Published figures: {SOURCE}. Written by `python benchmarks/paper.py --table`, from the rows in
-`benchmarks/results/paper`.
+Published figures: {SOURCE}. `python benchmarks/paper.py --table` writes this page from `benchmarks/results/paper`.
 
-- **paper**: what it reports. **ours**: the same run here, `A("MlpPolicy", gymnasium.make(id))` with the library's
-  default hyperparameters (goal tasks: `MultiInputPolicy`, `HerReplayBuffer`). **tuned**: our recipe
-  `agents/paper_….toml`, with as many environment steps.
-- r_s, r_e: mean return of the first and the last {WINDOW} training episodes, at most half of them each,
-  exploration included; ζ = r_e − r_s; ψ = ζ / steps.
-- s: share of evaluation episodes with a success at any step, deterministic policy.
-- final policy: mean return of the trained policy, deterministic, on fresh episodes that no training saw.
-- Several seeds: mean ± standard deviation over them. Where starts are drawn, a mean over n episodes varies by the
-  standard deviation of one episode, which the notes give, over √n. Figures above the optimum, which is a mean over all
-  starts, are such chance, and are marked.
-- difference: tuned less the paper's best, ± its error, which is {ERRORS:g} standard errors. better: "yes" or "no" where
-  the difference exceeds its error.
-- standard error: one run varies by the standard deviation over seeds or by that of one episode over √n, whichever is
-  more, and a mean over k runs by 1/√k of that. The paper's figure is of one run. It is taken to vary as ours do, or as
-  its algorithm does over seeds here, whichever is more.
-- Minutes: training alone, on the machines named below, which did other work at the same time; the paper's on a
-  {HARDWARE}. CPU min: processor time, which other work does not lengthen; blank where it was not recorded, and over
-  the seeds that have it. Speed on an idle machine: [benchmarks](../benchmarks/README.md).
-- Time limits are truncations here. The published CarboNet and CopperNet end their episodes otherwise
+- **paper**: what it reports, of one run. **ours**: the same with the library's default hyperparameters. **tuned**: our
+  recipe `agents/paper_….toml`, with as many environment steps.
+- r_s, r_e: mean return of the first and the last {WINDOW} training episodes, exploration included; ζ = r_e − r_s;
+  ψ = ζ / steps. s: share of evaluation episodes with a success.
+- final policy: mean return of the trained policy, deterministic, on fresh episodes.
+- Several seeds: mean ± standard deviation. Figures above the optimum, a mean over all starts, are chance of the starts.
+- difference: tuned less the paper's best, ± {ERRORS:g} standard errors. One run varies as seeds do, or as a mean of as
+  many episodes, whichever is more; the paper's as ours do, or as its algorithm does here.
+- Minutes: training alone, on busy machines; the paper's on a {HARDWARE}. CPU min: processor time, where recorded.
+- Published CarboNet and CopperNet end their episodes otherwise
   ([networks.md](networks.md#the-published-carbonet-and-coppernet-where-episodes-start-and-end)): the best return
-  there is −1.593e5 and −4.674e7, here −1.072e5 and −4.604e7 (`pytest tests/test_paper_optima.py`). So the difference
-  is there that of the final policy, in episodes that end as the published ones, to the paper's r_e. Elsewhere: of r_e.
+  there is −1.593e5 and −4.674e7, here −1.072e5 and −4.604e7 (`pytest tests/test_paper_optima.py`). There the
+  difference is of the final policy in such episodes, elsewhere of r_e.
 """
 
 
