@@ -5,10 +5,7 @@ Ten days of the copper network; whole episodes take a minute.
 
 from rich import print
 
-from cirl_marl import vector_env
-from cirl_marl.controllers.rollout import rollout
-from cirl_marl.optimum import achieved, bound, envelope, gap, improved
-from cirl_marl.optimum.mpc import MPC
+from cirl_marl import MPC, achieved, bound, envelope, gap, improved, rollout, vector_env
 
 service, horizon = 0.98, 40
 

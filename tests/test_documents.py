@@ -155,6 +155,27 @@ def test_make_targets_exist(document: Path) -> None:
     assert set(shown) <= set(targets)
 
 
+CODE = {
+    **{f"{named(path)} {i}": code for path in DOCUMENTS for i, code in enumerate(blocks(path.read_text(), "python"))},
+    **{named(path): path.read_text() for path in sorted(ROOT.glob("examples/**/*.py"))},
+}
+"""The Python of documents, programs and notebooks."""
+
+
+@pytest.mark.parametrize("code", CODE.values(), ids=CODE)
+def test_code_comes_in_by_one_door(code: str) -> None:
+    """It imports ``cirl_marl`` and nothing below it, and what it takes from there is public."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            assert [alias.name for alias in node.names if alias.name.startswith("cirl_marl.")] == []
+        elif isinstance(node, ast.ImportFrom):
+            assert not str(node.module).startswith("cirl_marl.")
+            if node.module == "cirl_marl":
+                assert {alias.name for alias in node.names} <= set(cirl_marl.__all__)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "cirl_marl":
+            assert node.attr in cirl_marl.__all__ or node.attr.startswith("__")
+
+
 @each_document
 def test_python_names_resolve(document: Path) -> None:
     """Python blocks compile, and what they import exists; so does each dotted name of the library in the prose."""
@@ -294,12 +315,33 @@ def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:
     assert network.scenario("crisis").nodes[0].initial == (1000.0, 1000.0)
 
 
+BREWERY = """
+[episode]
+control_interval = { value = 0.5, unit = "day", source = "two decisions a day" }
+horizon = { value = 20, unit = "1", source = "ten days" }
+solver = "rk4"
+solver_step = { value = 0.05, unit = "day", source = "a tenth of the control interval" }
+
+[nodes.tank]
+role = "technosphere"
+initial = { low = 90, high = 90, unit = "kg", source = "more than ten days give off" }
+control = { kind = "input", low = 0.05, neutral = 0.2, high = 0.5, unit = "1/day", source = "dilution of the tank" }
+
+[nodes.air]
+role = "environment"
+initial = { low = 0, high = 0, unit = "kg", source = "counted from today" }
+"""
+"""The rest of a network for the tables of a model of one's own."""
+
+
 def test_own_model_in_the_guide_is_valid(tmp_path: Path) -> None:
     """The tables shown for a model of one's own belong to a network that can be run."""
     (whole,) = blocks((ROOT / "envs" / "README.md").read_text(), "toml")
     (parts,) = blocks((ROOT / "docs" / "compartments.md").read_text(), "toml")
     definition = tmp_path / "brewery.toml"
-    definition.write_text(re.sub(r"\[episode\].*?\n\n", "", whole.split("[nodes.")[0], flags=re.DOTALL) + parts)
+    definition.write_text(
+        re.sub(r"\[episode\].*?\n\n", "", whole.split("[nodes.")[0], flags=re.DOTALL) + BREWERY + parts
+    )
     env = cirl_marl.parallel_env(cirl_marl.load_network(definition, allow_code=True))
     env.reset(seed=0)
     infos = env.step({"tank": [0.5]})[-1]

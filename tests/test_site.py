@@ -220,6 +220,9 @@ def test_a_changed_notebook_is_noticed(tmp_path: Path) -> None:
     with pytest.raises(CirlError, match="make notebooks"):
         notebooks.kept(script)
     shutil.copy(SCRIPTS[0].with_suffix(".md"), tmp_path)
+    with pytest.raises(CirlError, match="ipynb: is not what"):
+        notebooks.kept(script)
+    shutil.copy(SCRIPTS[0].with_suffix(".ipynb"), tmp_path)
     assert notebooks.kept(script) == script.with_suffix(".md")
     script.write_text(script.read_text(encoding="utf-8") + "\n", encoding="utf-8")
     with pytest.raises(CirlError, match=f"is not what {script.name} comes out as"):

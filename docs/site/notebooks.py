@@ -1,13 +1,15 @@
 """Runs notebooks and keeps what comes out: ``python -m docs.site.notebooks [SCRIPT ...]``.
 
 A notebook is a script in jupytext's percent format in ``examples/notebooks``. Jupyter opens it with jupytext. What a
-run prints and draws is kept beside it as Markdown and pictures, since it takes minutes, with the hash of the script.
+run prints and draws is kept beside it, since it takes minutes: as a notebook, to be read where notebooks are shown, and
+as Markdown and pictures, for the site. Both have the hash of the script.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import re
 import sys
 import tempfile
@@ -35,11 +37,13 @@ class Executed:
     Attributes:
         text: in Markdown.
         pictures: contents of its pictures by name.
+        notebook: the same as a Jupyter notebook, in JSON.
         seconds: processor time.
     """
 
     text: str
     pictures: Mapping[str, bytes]
+    notebook: Mapping[str, Any]
     seconds: float
 
 
@@ -60,7 +64,12 @@ def executed(script: Path) -> Executed:
     with tempfile.TemporaryDirectory() as folder:
         resources = {"metadata": {"path": folder}}
         client = NotebookClient(
-            notebook, timeout=LIMIT_S, startup_timeout=LIMIT_S, kernel_name="python3", resources=resources
+            notebook,
+            timeout=LIMIT_S,
+            startup_timeout=LIMIT_S,
+            kernel_name="python3",
+            resources=resources,
+            record_timing=False,
         )
         kernel = client.create_kernel_manager()
         kernel.transport, kernel.ip = "ipc", f"{folder}/kernel"  # no port is opened
@@ -71,7 +80,21 @@ def executed(script: Path) -> Executed:
     seconds = float(notebook.cells.pop().outputs[0].text)
     pictures: dict[str, bytes] = {}
     parts = [part for cell in notebook.cells for part in _shown(cell, script.stem, pictures)]
-    return Executed("\n\n".join(parts) + "\n", pictures, seconds)
+    return Executed("\n\n".join(parts) + "\n", pictures, _plain(notebook, script), seconds)
+
+
+def _plain(notebook: Any, script: Path) -> dict[str, Any]:
+    """Return a notebook without what differs from run to run or machine to machine, and with the hash of its script."""
+    cells = []
+    for i, cell in enumerate(notebook.cells):
+        plain = {"cell_type": cell.cell_type, "id": f"cell-{i}", "metadata": {}, "source": cell.source}
+        if cell.cell_type == "code":
+            outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+            plain |= {"execution_count": cell.execution_count, "outputs": outputs}
+        cells.append(plain)
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    metadata = {"kernelspec": kernel, "language_info": {"name": "python"}, "script": _hash(script)}
+    return {"cells": cells, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}
 
 
 def _shown(cell: Any, name: str, pictures: dict[str, bytes]) -> Iterator[str]:
@@ -108,20 +131,28 @@ def _printed(output: Any) -> str:
     return re.sub(r"\x1b\[[\d;]*m", "", text).rstrip("\n") + "\n"
 
 
+def _hash(script: Path) -> str:
+    return hashlib.sha256(script.read_bytes()).hexdigest()
+
+
 def mark(script: Path) -> str:
     """Return the first line of what came out of a script: by which it is seen whether the script was changed since."""
-    return f"<!-- {script.name} {hashlib.sha256(script.read_bytes()).hexdigest()} -->"
+    return f"<!-- {script.name} {_hash(script)} -->"
 
 
 def kept(script: Path) -> Path:
-    """Return the document that was kept of a script.
+    """Return the document that was kept of a script, beside its notebook.
 
     Raises:
-        CirlError: if there is none, or the script was changed since.
+        CirlError: if one of the two is missing, or the script was changed since.
     """
-    path = script.with_suffix(".md")
+    path, notebook = script.with_suffix(".md"), script.with_suffix(".ipynb")
     if not path.is_file() or path.read_text(encoding="utf-8").partition("\n")[0] != mark(script):
         raise CirlError(f"{path}: is not what {script.name} comes out as: make notebooks")
+    if not notebook.is_file() or json.loads(notebook.read_text(encoding="utf-8"))["metadata"]["script"] != _hash(
+        script
+    ):
+        raise CirlError(f"{notebook}: is not what {script.name} comes out as: make notebooks")
     return path
 
 
@@ -134,6 +165,8 @@ def keep(script: Path) -> float:
             old.unlink()
     for name, content in found.pictures.items():
         (pictures / name).write_bytes(content)
+    text = json.dumps(found.notebook, indent=1, ensure_ascii=False)
+    script.with_suffix(".ipynb").write_text(text + "\n", encoding="utf-8")
     minutes = f"It took {found.seconds:.0f} seconds of one core. The script is [{script.name}]({script.name})."
     title, rest = found.text.split("\n", 1)
     script.with_suffix(".md").write_text(f"{mark(script)}\n{title}\n\n{minutes}\n{rest}", encoding="utf-8")

@@ -15,7 +15,6 @@ from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO, SAC
 
 import cirl_marl
-from cirl_marl.testing import check_parallel_env
 
 # %% [markdown]
 # ## An environment of one's own
@@ -79,7 +78,7 @@ class Rooms(ParallelEnv):
 # PettingZoo's own tests let much pass. This one is stricter: seeds, spaces, types, endings, snapshots if there are any.
 
 # %%
-check_parallel_env(Rooms)
+cirl_marl.check_parallel_env(Rooms)
 print("no complaints")
 
 # %% [markdown]

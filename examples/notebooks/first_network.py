@@ -10,12 +10,6 @@ from matplotlib import pyplot
 
 import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, Episode, Network, Node, Objective, Role, Service
-from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import interval_ends, rollout
-from cirl_marl.learners import train
-from cirl_marl.learners.interface import Trained
-from cirl_marl.optimum import achieved, bound, gap, improved
-from cirl_marl.report.curves import save_circularity
 
 # %% [markdown]
 # ## Describe it
@@ -78,11 +72,11 @@ pyplot.show()
 # No actions from this start can exceed the bound while they serve as well. Its plan comes close to it in the simulator.
 
 # %%
-best = bound(network, {"households": 100.0}, min_service=1.0)
-plan = achieved(improved(best))
+best = cirl_marl.bound(network, {"households": 100.0}, min_service=1.0)
+plan = cirl_marl.achieved(cirl_marl.improved(best))
 print(best)
 print(f"in the simulator the plan reaches {plan.episode_circularity[0]:.3f} t", end=", ")
-print(f"{gap(best.objective, plan.episode_circularity[0]):.2%} from the bound")
+print(f"{cirl_marl.gap(best.objective, plan.episode_circularity[0]):.2%} from the bound")
 
 # %% [markdown]
 # ## Let agents learn it
@@ -91,25 +85,15 @@ print(f"{gap(best.objective, plan.episode_circularity[0]):.2%} from the bound")
 # They know nothing of the network but what they observe.
 
 # %%
-train(network, directory="runs/bottles", steps=800_000, seed=0)
-env = cirl_marl.vector_env(network, num_envs=16)
-usual, learnt = rollout(env, Neutral(), seed=1), rollout(env, Trained("runs/bottles"), seed=1)
-for name, run in (("neutral", usual), ("learnt", learnt)):
-    print(f"{name:8} λ̄ {run.episode_circularity.mean():7.3f} t, service {run.episode_service.mean():.4f}")
+cirl_marl.train(network, directory="runs/bottles", steps=800_000, seed=0)
+evaluation = cirl_marl.evaluate("runs/bottles", episodes=16, seed=1)
+print(evaluation)
 
 # %% [markdown]
 # λ over time, as a mean over the 16 episodes. The service must be read beside it, always.
 
 # %%
-runs = {"neutral": usual, "learnt": learnt}
-path = save_circularity(
-    "circularity.png",
-    network,
-    interval_ends(network),
-    {name: run.circularity_mean for name, run in runs.items()},
-    {name: run.service for name, run in runs.items()},
-)
-Image(path)
+Image(cirl_marl.draw("circularity.png", evaluation))
 
 # %% [markdown]
 # Next: the same as a TOML file, where every number has a unit and a source, in

@@ -8,11 +8,9 @@
 from pathlib import Path
 
 from IPython.display import Image
+from rich import print as show
 
 import cirl_marl
-from cirl_marl.evaluation import compare
-from cirl_marl.learners import train
-from cirl_marl.report.fronts import comparison_notes, save_comparison
 
 network = cirl_marl.load_network("carbo_net")
 print(f"{len(network.compartments)} compartments, {len(network.agents)} agents: {', '.join(network.agents)}")
@@ -31,7 +29,7 @@ print(f"{len(network.compartments)} compartments, {len(network.agents)} agents: 
 # %%
 budgets = {"independent_ars": 1_000_000, "shared_ppo": 60_000, "joint_ppo": 200_000}
 for recipe, steps in budgets.items():
-    training = train(network, recipe, directory=f"runs/{recipe}", steps=steps, seed=0)
+    training = cirl_marl.train(network, recipe, directory=f"runs/{recipe}", steps=steps, seed=0)
     print(f"{recipe}: {len(training.learners)} learners, {steps:,} environment steps")
 
 # %% [markdown]
@@ -41,15 +39,11 @@ for recipe, steps in budgets.items():
 # service that was delivered. One training seed has no interval.
 
 # %%
-found = compare([Path("runs") / recipe for recipe in budgets], ("neutral", "random"), episodes=16)
-for row in found.rows:
-    circularity, service, gap = (row.figure(name) for name in ("circularity", "service", "gap"))
-    print(f"{row.name:16} λ̄ {circularity.value:8.1f} t  service {service.value:.4f}  gap {gap.value:.1%}")
-for note in comparison_notes(found):
-    print(note)
+comparison = cirl_marl.compare([Path("runs") / recipe for recipe in budgets], ("neutral", "random"), episodes=16)
+show(cirl_marl.summarise(comparison))
 
 # %%
-Image(save_comparison("comparison.png", found))
+Image(cirl_marl.draw("comparison.png", comparison))
 
 # %% [markdown]
 # The line is the bound. Whoever is below it and to the right serves well and could still do better.

@@ -14,15 +14,9 @@ from IPython.display import Image
 from rich import print as show
 
 import cirl_marl
-from cirl_marl.controllers import Neutral
-from cirl_marl.controllers.rollout import rollout
-from cirl_marl.controllers.schedule import schedule
-from cirl_marl.definitions.catalogue import CHECKOUT
-from cirl_marl.importing import import_flows
-from cirl_marl.optimum import Plan, achieved, bound, gap, improved
-from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table
 
-flows = CHECKOUT / "benchmarks" / "data" / "steel_flows_2000_2024.csv"
+checkout = Path(cirl_marl.__file__).parent.parent
+flows = checkout / "benchmarks" / "data" / "steel_flows_2000_2024.csv"
 print(*flows.read_text().splitlines()[:4], sep="\n")
 
 # %% [markdown]
@@ -32,7 +26,7 @@ print(*flows.read_text().splitlines()[:4], sep="\n")
 # have to say. The network is simulated, and its flows are held against the table.
 
 # %%
-found = import_flows(
+report = cirl_marl.import_flows(
     flows,
     Path("steel.toml"),
     regions=["Japan"],
@@ -41,15 +35,15 @@ found = import_flows(
     title="Iron and steel as reported",
     source="Watari et al. 2025",
 )
-print(f"{len(found.table.pairs)} flows, {found.table.years[0]} to {found.table.years[-1]}")
-print(f"simulated, no flow is further than {found.largest_error:.2g} {found.table.unit} from the table")
+print(f"{len(report.table.pairs)} flows, {report.table.years[0]} to {report.table.years[-1]}")
+print(f"simulated, no flow is further than {report.largest_error:.2g} {report.table.unit} from the table")
 
 # %% [markdown]
 # The definition is a text file beside a data file. `cirl check` and `cirl show` take it, and so does the library.
 
 # %%
 reported = cirl_marl.load_network("steel.toml:japan")
-run = rollout(cirl_marl.vector_env(reported, num_envs=1), Neutral())
+run = cirl_marl.rollout(cirl_marl.vector_env(reported, num_envs=1), cirl_marl.Neutral())
 into_use = [k for k, arc in enumerate(reported.arcs) if arc.recipient == "use_phase"]
 print(f"{len(reported.nodes)} nodes, {len(reported.arcs)} arcs")
 print(f"into use in 2000 and 2024: {run.flow[[0, -1]][:, into_use].sum(axis=1).round()} kt/year")
@@ -74,14 +68,14 @@ for service in network.services:
 # carried out in the simulator. λ counts what is extracted and lost in a year.
 
 # %%
-best = bound(network, min_service=1.0)
+best = cirl_marl.bound(network, min_service=1.0)
 print(best)
-better = improved(best)
-episode = achieved(better)
-usual = rollout(cirl_marl.vector_env(network, num_envs=1), Neutral())
+better = cirl_marl.improved(best)
+episode = cirl_marl.achieved(better)
+usual = cirl_marl.rollout(cirl_marl.vector_env(network, num_envs=1), cirl_marl.Neutral())
 print(f"as usual λ̄ = {usual.episode_circularity[0] / 1e3:.1f} Mt")
 print(f"plan     λ̄ = {episode.episode_circularity[0] / 1e3:.1f} Mt, lowest service {episode.least_service[0]:.4f}")
-print(f"the plan is at most {gap(best.objective, episode.episode_circularity[0]):.2%} from the best there is")
+print(f"the plan is at most {cirl_marl.gap(best.objective, episode.episode_circularity[0]):.2%} from the best there is")
 
 # %% [markdown]
 # ## What to do, and when
@@ -89,12 +83,11 @@ print(f"the plan is at most {gap(best.objective, episode.episode_circularity[0])
 # The levers that differ most from business as usual, in words and as a picture.
 
 # %%
-plan = schedule(cirl_marl.vector_env(network, num_envs=1), Plan(better))
-show(savings_table(plan))
-show(decisions_table(plan))
+plan = cirl_marl.plan(network, cirl_marl.Plan(better))
+show(cirl_marl.summarise(plan))
 
 # %%
-Image(save_decisions("plan.png", plan, title="Steel of Japan: the plan beside business as usual"))
+Image(cirl_marl.draw("plan.png", plan, title="Steel of Japan: the plan beside business as usual"))
 
 # %% [markdown]
 # The same from the command line, with workbook and report for the browser:
