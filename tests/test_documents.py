@@ -301,7 +301,7 @@ def test_getting_started_prints_what_it_says(
             cli.main()
         assert shown in capsys.readouterr().out
     exec(compile(blocks(text, "python")[0], "getting_started.md", "exec"), {})
-    assert capsys.readouterr().out.startswith(text.split("print(bound(")[1].split("```\n")[2].split("...")[0])
+    assert capsys.readouterr().out.startswith(text.split("print(cirl_marl.bound(")[1].split("```\n")[2].split("...")[0])
 
 
 def test_definition_in_the_guide_is_valid(tmp_path: Path) -> None:

@@ -149,9 +149,8 @@ def kept(script: Path) -> Path:
     path, notebook = script.with_suffix(".md"), script.with_suffix(".ipynb")
     if not path.is_file() or path.read_text(encoding="utf-8").partition("\n")[0] != mark(script):
         raise CirlError(f"{path}: is not what {script.name} comes out as: make notebooks")
-    if not notebook.is_file() or json.loads(notebook.read_text(encoding="utf-8"))["metadata"]["script"] != _hash(
-        script
-    ):
+    text = notebook.read_text(encoding="utf-8") if notebook.is_file() else "{}"
+    if json.loads(text).get("metadata", {}).get("script") != _hash(script):
         raise CirlError(f"{notebook}: is not what {script.name} comes out as: make notebooks")
     return path
 
