@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo check test test-all docs notebooks written lint types wheel fast unit every fuzz kill study planner speed peers clean
+.PHONY: demo check test test-all docs notebooks written lint types wheel fast unit every fuzz kill study planner speed peers adapters clean
 
 demo: $(VENV)/.runtime  ## train copper_net, compare, open the report (within 5 minutes on 2 cores)
 	rm -rf runs/demo
@@ -14,7 +14,7 @@ check: lint types fast  ## lint, types and the fast tests, in under 2 minutes on
 
 test: lint types wheel unit  ## everything that continuous integration needs: what roams over the catalogue is sampled
 
-test-all: lint types wheel every  ## every test with every parameter, and three times the random examples
+test-all: lint types wheel every adapters  ## every test with every parameter, and three times the random examples
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -34,6 +34,9 @@ unit: $(VENV)/.dev
 
 every: $(VENV)/.dev $(VENV)/.docs
 	$(BIN)/python -m pytest -q -n 2 --hypothesis-profile=all
+
+adapters: $(VENV)/.dev  ## contracts and examples of the adapters, each in an environment of its own (some minutes)
+	$(BIN)/python tests/adapters/run.py
 
 wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clean environment
 	rm -rf dist build/clean

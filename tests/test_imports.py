@@ -22,13 +22,13 @@ LAYERS = (
     ("learners",),
     ("evaluation", "paper"),
     ("reasons",),
-    ("report", "sweeps"),
+    ("adapters", "report", "sweeps"),
     ("__init__", "cli"),
 )
 """From the ground up; a room imports from layers below its own, and from itself."""
 
 MOST_FLOORS = 12
-TRAINING = ("learners", "paper")
+TRAINING = ("learners", "paper", "adapters")
 """Rooms whose modules may load torch."""
 
 
@@ -101,6 +101,7 @@ def test_import_is_light() -> None:
     """What trains nothing loads neither torch nor mujoco; ``learners`` itself only when a training is asked for."""
     light = [name for name in modules(CHECKOUT) if room_of(name) not in TRAINING and ".robots." not in name]
     light += [
+        f"{PACKAGE}.adapters",
         f"{PACKAGE}.learners",
         f"{PACKAGE}.learners.run_directory",
         f"{PACKAGE}.learners.recipe",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -204,7 +205,7 @@ def test_we_run_by_the_interpreter_of_now_and_nothing_is_installed_twice(tmp_pat
     assert python_of(CONTENDERS["stacked"], tmp_path).is_file()
     peer = CONTENDERS["torchrl"]
     (tmp_path / peer.venv).mkdir()
-    (tmp_path / peer.venv / "installed.txt").write_text("\n".join(peer.packages), encoding="utf-8")
+    (tmp_path / peer.venv / "installed.txt").write_text("\n".join([*peer.packages, sys.prefix]), encoding="utf-8")
     assert python_of(peer, tmp_path) == tmp_path / peer.venv / "bin" / "python"
 
 

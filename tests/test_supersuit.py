@@ -1,4 +1,4 @@
-"""SuperSuit: its wrappers work on our environments; the defects of its vector bridge are shown, and not shared."""
+"""SuperSuit: its wrappers work on our environments; the adapter mends the defects of its bridge."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ import pytest
 from stable_baselines3 import PPO
 
 import cirl_marl
-from cirl_marl import MultiAgentVectorEnv
+from cirl_marl import CirlError, MultiAgentVectorEnv, parallel_env
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     from supersuit import agent_indicator_v0, concat_vec_envs_v1, pad_observations_v0, pettingzoo_env_to_vec_env_v1
 
+    from cirl_marl.adapters.supersuit import SharedPolicyEnv
+
 AGENTS = ["refinery", "mine"]
+HORIZON = 4
 
 
 def padded() -> Any:
@@ -79,3 +82,62 @@ def test_three_defects_of_the_vector_bridge_are_not_ours() -> None:
         [ours], [Participant(agent, acting[agent], acting[agent], Streams(0), budget=lambda: 4) for agent in AGENTS]
     ).run()
     assert all(info["TimeLimit.truncated"] and "terminal_observation" in info for info in seen[3])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["copper_net", "solids_net"])
+def test_what_is_seen_and_paid_is_ours(name: str) -> None:
+    """Of each copy, in two episodes on end, padded, and truncated at the end."""
+    env = SharedPolicyEnv(name, copies=2, seed=5, horizon=HORIZON)
+    ours = [parallel_env(name, horizon=HORIZON) for _ in range(2)]
+    agents, longest = env.agents, max(ours[0].action_space(agent).shape[0] for agent in env.agents)
+    assert env.num_envs == 2 * len(agents) and env.action_space.shape == (longest,)
+    random = np.random.default_rng(0)
+    rows: Any = env.reset()
+    expected = [copy.reset(seed=5 + i)[0] for i, copy in enumerate(ours)]
+    for step in range(1, 2 * HORIZON + 1):
+        shown = [expected[copy][agent] for copy in range(2) for agent in agents]
+        assert all(np.array_equal(row[: len(seen)], seen) for row, seen in zip(rows, shown, strict=True))
+        actions = random.uniform(-1, 1, (env.num_envs, longest)).astype(np.float32)
+        rows, rewards, ends, infos = env.step(actions)
+        paid = []
+        for i, copy in enumerate(ours):
+            acts = {a: actions[i * len(agents) + j][: copy.action_space(a).shape[0]] for j, a in enumerate(agents)}
+            expected[i], given, *_ = copy.step(acts)
+            paid += [given[agent] for agent in agents]
+        assert rewards.tolist() == np.array(paid, dtype=np.float32).tolist()
+        assert ends.tolist() == [step % HORIZON == 0] * env.num_envs
+        if ends.all():
+            assert all(info["TimeLimit.truncated"] for info in infos)
+            last = [expected[copy][agent] for copy in range(2) for agent in agents]
+            kept = [info["terminal_observation"] for info in infos]
+            assert all(np.array_equal(row[: len(seen)], seen) for row, seen in zip(kept, last, strict=True))
+            expected = [copy.reset()[0] for copy in ours]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_model_seeds_it() -> None:
+    """Two models of a seed learn the same from copies that begin unlike each other; those of another seed do not."""
+    ends = []
+    for seed in (1, 1, 2):
+        env = SharedPolicyEnv("copper_net", copies=2, horizon=HORIZON)
+        model = PPO("MlpPolicy", env, n_steps=HORIZON, batch_size=32, n_epochs=1, seed=seed, device="cpu")
+        first = env.reset()
+        assert not np.array_equal(first[:16], first[16:])
+        model.learn(2 * HORIZON * env.num_envs)
+        ends.append([parameter.detach().numpy() for parameter in model.policy.parameters()])
+    assert all(np.array_equal(one, same) for one, same in zip(ends[0], ends[1], strict=True))
+    assert not all(np.array_equal(one, other) for one, other in zip(ends[0], ends[2], strict=True))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_cannot_be_is_refused() -> None:
+    """An unknown network, and what would be one agent's own."""
+    with pytest.raises(CirlError, match="Did you mean 'copper_net'"):
+        SharedPolicyEnv("coper_net")
+    env = SharedPolicyEnv("copper_net", copies=1)
+    with pytest.raises(AttributeError, match="agents share a copy"):
+        env.set_attr("horizon", 3)
+    with pytest.raises(AttributeError, match="agents share a copy"):
+        env.env_method("reset")
+    assert env.env_is_wrapped(PPO) == [False] * 16

@@ -24,5 +24,5 @@ def needs(package: str, requirement: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as missing:
-        message = f"this adapter needs the package {package}, and {missing.name} is not installed: "
-        raise ModuleNotFoundError(f"{message}pip install {requirement}", name=missing.name) from missing
+        message = f"this adapter needs the package {package}, which is not installed: pip install {requirement}"
+        raise ModuleNotFoundError(message, name=package) from missing

@@ -11,7 +11,7 @@ from cirl_marl.adapters import needs
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Network
 
-with needs("benchmarl", "benchmarl"):
+with needs("benchmarl", "'cirl-marl[benchmarl]'"):
     from benchmarl.environments import TaskClass
 
     from cirl_marl.adapters.torchrl import GROUP, TorchRLEnv

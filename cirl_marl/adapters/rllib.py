@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 from cirl_marl.adapters import needs
 from cirl_marl.environments.parallel import parallel_env
 
-with needs("ray", "'ray[rllib]'"):
+with needs("ray", "'cirl-marl[rllib]'"):
     from ray.rllib.env.multi_agent_env import MultiAgentEnv
 
 

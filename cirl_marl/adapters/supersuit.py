@@ -79,22 +79,20 @@ class SharedPolicyEnv(VecEnv):
         """Close the copies."""
         self._bridge.close()
 
-    def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Return an attribute of the bridge, the same for every agent."""
         return [getattr(self._bridge, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Refuse: agents share a copy."""
         raise AttributeError(f"{attr_name}: agents share a copy, none has attributes of its own")
 
     def env_method(
-        self, method_name: str, *arguments: Any, indices: None | int | Iterable[int] = None, **keywords: Any
+        self, method_name: str, *arguments: Any, indices: int | Iterable[int] | None = None, **keywords: Any
     ) -> list[Any]:
         """Refuse: agents share a copy."""
         raise AttributeError(f"{method_name}: agents share a copy, none has methods of its own")
 
-    def env_is_wrapped(
-        self, wrapper_class: type[Any], indices: None | int | Iterable[int] = None
-    ) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: int | Iterable[int] | None = None) -> list[bool]:
         """No agent is wrapped by a wrapper of Gymnasium."""
         return [False] * len(list(self._get_indices(indices)))

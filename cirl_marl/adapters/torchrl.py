@@ -13,7 +13,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import ControlError
 from cirl_marl.network import Network
 
-with needs("torchrl", "torchrl"):
+with needs("torchrl", "'cirl-marl[torchrl]'"):
     import torch
     from tensordict import TensorDict
     from torchrl.data import Binary, Bounded, Composite, Unbounded

@@ -20,7 +20,9 @@ def test_the_task_makes_the_environment_of_torchrl() -> None:
     assert torch.equal(env.reset()[GROUP, "observation"], same.reset()[GROUP, "observation"])
     assert task.max_steps(env) == 5 and task.group_map(env) == env.group_map
     assert task.group_map(env)[GROUP] == list(load_network("copper_net").agents)
-    assert task.observation_spec(env)[GROUP, "observation"].shape == env.observation_spec[GROUP, "observation"].shape[1:]
+    assert (
+        task.observation_spec(env)[GROUP, "observation"].shape == env.observation_spec[GROUP, "observation"].shape[1:]
+    )
     assert task.action_spec(env)[GROUP, "action"].shape == (16, 1)
     assert task.supports_continuous_actions() and not task.supports_discrete_actions()
     assert (task.name, task.env_name()) == ("copper_net", "cirl_marl")

@@ -13,7 +13,7 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs, step_mdp
 from cirl_marl import CirlError, ControlError, MultiAgentVectorEnv
 from cirl_marl.adapters.torchrl import GROUP, TorchRLEnv
 
-CASES = {"copper_net": {"reward": "team"}, "solids_net": {}}
+CASES: dict[str, dict[str, Any]] = {"copper_net": {"reward": "team"}, "solids_net": {}}
 """Networks whose agents have observations of several lengths, and, the second, actions of several lengths."""
 HORIZON = 4
 
@@ -50,7 +50,7 @@ def test_what_is_seen_and_paid_is_ours(name: str) -> None:
 
 def shape_of_actions(env: TorchRLEnv) -> torch.Size:
     """Return (copies, agents, entries)."""
-    return env.full_action_spec[GROUP, "action"].shape
+    return torch.Size(env.full_action_spec[GROUP, "action"].shape)
 
 
 def assert_padded(tensor: Any, observations: Any) -> None:
