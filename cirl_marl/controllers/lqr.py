@@ -60,7 +60,7 @@ class LinearSystem:
             CirlError: if an agent or node is unknown, no state can be moved, or the laws are not linear in x and u.
         """
         laws = FlowLaws(network)
-        actuators = Actuators(laws, agents, 1)
+        actuators = Actuators(network, agents, 1)
         inputs, acting = actuators.agents, actuators.acting
         if problems := list(_nonlinear(network, inputs)):
             problem = f"is no linear system: {'; '.join(problems)}. {_remedy(network)}"

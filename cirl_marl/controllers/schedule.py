@@ -103,7 +103,7 @@ def schedule(
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     usual = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
     run = rollout(env, recorded, seed=begun.seed, start=begun.initial_state, progress=progress)
-    actuators = Actuators(env.dynamics, env.agents, len(recorded.actions))
+    actuators = Actuators(env.network, env.agents, len(recorded.actions))
     values = actuators.controls(np.array(recorded.actions).T, np.arange(len(recorded.actions)))[actuators.acting]
     ends = interval_ends(network)
     columns = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -19,11 +18,8 @@ from cirl_marl.dynamics.taylor import Taylor
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import with_field_docs
-from cirl_marl.network.elements import MAX_STEPS, Law
+from cirl_marl.network.elements import Law
 from cirl_marl.network.rowsum import RowSum, disposable
-
-MAX_TURNOVER = 1.0
-"""Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
 
 Transfer = Callable[..., Floats]
 """``(rate, settled) → moved``: mass that a substep moves along each arc; flows in ``settled`` hold, but for NaN."""
@@ -70,16 +66,9 @@ class Dynamics(FlowLaws):
         self.inner, self.batches = InnerPhysics(network, rows), BatchTransport(network, rows)
         episode = network.episode
         self.physical = episode.solver != "euler"
-        fastest = float(self.turnover.max(initial=0.0))
-        self._check_turnover(self.turnover)
-        exact = episode.solver == "exact"
-        if exact:
-            self.substeps = max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
-        else:
-            assert episode.solver_step is not None
-            self.substeps = round(episode.control_interval / episode.solver_step)
+        self.substeps = self.solver_steps()
         self.substep = episode.control_interval / self.substeps
-        self._taylor = Taylor(self, self.substep) if exact else None
+        self._taylor = Taylor(self, self.substep) if episode.solver == "exact" else None
         self.terms = self._taylor.terms if self._taylor is not None else 0
         shape = (rows.masses, len(network.arcs))
         self._outgoing = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
@@ -88,27 +77,6 @@ class Dynamics(FlowLaws):
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
         self._timed = (*self.time_dependent, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
         self._compile_orders()
-
-    def _check_turnover(self, turnover: Floats) -> None:
-        """Refuse rates that the solver cannot follow, naming the fastest node, its rate and the largest usable step."""
-        episode = self.network.episode
-        if not self.physical or not len(turnover):
-            return
-        node = int(turnover.argmax())
-        id_ = self.staged_network.nodes[node].id.partition(".")[0]
-        rate = f"{turnover[node]:.4g}/{self.network.time_unit}"
-        where = f"network '{self.network.name}': node '{id_}' turns over {rate}"
-        if turnover[node] * episode.control_interval > MAX_STEPS * MAX_TURNOVER:
-            raise CirlError(
-                f"{where}; a control interval of {episode.control_interval:g} {self.network.time_unit} would need more "
-                f"than {MAX_STEPS:,} solver steps. Is a rate in the wrong unit?"
-            )
-        step = episode.solver_step or 0.0
-        if episode.solver == "rk4" and turnover[node] * step > MAX_TURNOVER:
-            raise CirlError(
-                f"{where}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / turnover[node]:.4g} "
-                f"{self.network.time_unit}, not {step:g}"
-            )
 
     def _compile_orders(self) -> None:
         """Find the donors of scheduled flows, and their outflows by schedule and in proportion to their stock."""

@@ -12,6 +12,7 @@ segment sum treat each column alike, so a column's bits do not depend on the bat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
@@ -23,13 +24,16 @@ from cirl_marl.dynamics.shares import Shares
 from cirl_marl.dynamics.stages import StagedNetwork, simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.dynamics.uncertain_factors import FlowFactors
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import with_field_docs
-from cirl_marl.network.elements import Arc, ControlKind, Law
+from cirl_marl.network.elements import MAX_STEPS, Arc, ControlKind, Law
 from cirl_marl.network.rowsum import RowSum, single_column
 from cirl_marl.network.series import Series, Value
 
 FLOW = ControlKind.FLOW
+MAX_TURNOVER = 1.0
+"""Largest share, rate × substep, that a node may turn over in one substep of the exact solver."""
 SCALING = (ControlKind.RATE, FLOW, ControlKind.STRETCH)
 """Kinds of controls that are factors of flows, a stretch by its inverse."""
 
@@ -67,40 +71,29 @@ LAWS: Mapping[Law, FlowLaw] = {
 }
 
 
-class FlowLaws:
-    """Drivers, rates and controls of every arc; with ``uncertain``, of copies with draws of the uncertain numbers.
+class ArcRates:
+    """Drivers and rates of every arc, but for shares and draws, and how fast stocks can turn over.
 
     Attributes:
-        network: whose laws they are.
-        inside: the same with lifetimes as stages; its arcs begin with those of ``network``.
+        staged_network: whose arcs they are, with lifetimes as stages.
         rows: which row of the masses is what.
-        incidence: S with empty rows for batches and unit, shape (masses, arcs).
         driver: row of the extended stocks that drives each arc, shape (arcs,).
-        scheduled: arcs that flow by schedule, shape (arcs,).
+        is_scheduled: arcs that flow by schedule, shape (arcs,).
         control_low: lower bounds of the controls in each interval, in the rows of ``network.control_rows``, shape
             (controls, horizon).
         control_high: upper bounds.
         neutral: values while nobody acts.
-        timed: arcs whose r depends on the interval, by id.
         max_rate: upper bound of r of each arc, shape (arcs,).
-        driven: arcs that stocks drive; of those that split what a stock releases one stands for all.
+        driven_arcs: arcs that stocks drive; of those that split what a stock releases one stands for all.
         driven_to: stock that each of these fills; the number of stores where it is split or passed on.
         driven_rate: upper bound of r of each of these, of a split as a whole.
         turnover: upper bound of what each stock drives, relative to it, shape (stores,), 1/time.
-        fixed: arcs whose r is the same in all copies and intervals, shape (arcs,).
-        routing: what passes through nodes that store nothing.
     """
 
-    def __init__(self, network: Network, *, uncertain: bool = False) -> None:
-        """Compile ``network``."""
-        self.network = network
-        self.staged_network = network = simulated_network(network)
-        arcs = len(network.arcs)
+    def __init__(self, staged_network: Network, draws: FlowFactors | None = None) -> None:
+        """Compile a network that has its lifetimes as stages if it has any; ``draws`` may raise rates."""
+        self.staged_network = network = staged_network
         self.rows = rows = StateLayout(network)
-        ends, twice = np.concatenate([network.donors, network.recipients]), np.tile(np.arange(arcs), 2)
-        stored = ends < rows.nodes.stop
-        signs = np.repeat([-1.0, 1.0], arcs)
-        self.incidence = RowSum(ends[stored], twice[stored], signs[stored], (rows.masses, arcs))
         laws = [LAWS[arc.law] for arc in network.arcs]
         self.is_scheduled = np.array([law.is_scheduled for law in laws], dtype=bool)
         drivers = [law.driver(arc, network, rows) for law, arc in zip(laws, network.arcs, strict=True)]
@@ -110,36 +103,134 @@ class FlowLaws:
         self._base: Floats = np.array(constant, dtype=float).reshape(-1, 1)
         self._compile_controls()
         # of a series r is the mean over the interval, which ``rate`` multiplies in
-        changing = [(k, network.interval_means(value)) for k, value in enumerate(base) if isinstance(value, Series)]
-        self._series_arcs: Integers = np.array([k for k, _ in changing], dtype=np.intp)
-        self._series = np.array([means for _, means in changing]).reshape(len(changing), network.episode.horizon)
-        self._drawn = FlowFactors(network) if uncertain else None
-        self._shares = Shares(network, uncertain=uncertain)
-        named = [*self._series_arcs, *(self._shares.varying_arcs if self._shares.is_time_varying else ())]
-        self.time_dependent = tuple(network.arcs[k].id for k in named)
-        self._bound_rates()
-        self._share_out()
-        self.routing = Routing(network, self.rate(self.neutral[:, :1]), self.is_fixed)
+        series = [(k, network.interval_means(value)) for k, value in enumerate(base) if isinstance(value, Series)]
+        self._series_arcs: Integers = np.array([k for k, _ in series], dtype=np.intp)
+        self._series = np.array([means for _, means in series]).reshape(len(series), network.episode.horizon)
+        self._bound_rates(draws)
 
-    def _bound_rates(self) -> None:
+    def _bound_rates(self, draws: FlowFactors | None) -> None:
         """Bound what arcs carry and stocks drive with every control at its upper bound."""
         widest = single_column(self.control_high).max(axis=1, keepdims=True)
         widest[self._stretched] = self.control_low[self._stretched].min(axis=1, keepdims=True)
         self.max_rate: Floats = self._unshared(widest)[:, 0]
         if len(self._series_arcs):
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
-        if self._drawn is not None:
-            self.max_rate[self._drawn.arcs] *= self._drawn.highest
-        # the arcs of a split carry together what one of them would carry alone
-        stores = self.rows.nodes.stop
+        if draws is not None:
+            self.max_rate[draws.arcs] *= draws.highest
+        # the arcs of a split carry together what one of them would carry alone: the first without control counts
+        stores, leading = self.rows.nodes.stop, dict[str, int]()
         counted, ends = self.driver < stores, np.minimum(self.staged_network.recipients, stores)
-        counted[self._shares.arcs] = False
-        leading = self._shares.leading_arcs[self.driver[self._shares.leading_arcs] < stores]
-        counted[leading], ends[leading] = True, stores
+        for k, arc in enumerate(self.staged_network.arcs):
+            if arc.law is Law.SHARE:
+                counted[k] = False
+                if arc.control is None and self.driver[k] < stores:
+                    leading.setdefault(arc.donor, k)
+        first = [*leading.values()]
+        counted[first], ends[first] = True, stores
         self.driven_arcs = np.flatnonzero(counted)
         self.driven_to, self.driven_rate = ends[self.driven_arcs], self.max_rate[self.driven_arcs]
         self.turnover: Floats = np.bincount(self.driver[self.driven_arcs], self.driven_rate, stores).astype(float)
+
+    def solver_steps(self) -> int:
+        """Return the solver's steps in a control interval.
+
+        Raises:
+            CirlError: for rates that it cannot follow; names the fastest node, its rate and the largest usable step.
+        """
+        network, episode = self.staged_network, self.staged_network.episode
+        fastest = float(self.turnover.max(initial=0.0))
+        if episode.solver != "euler" and len(self.turnover):
+            node = network.nodes[int(self.turnover.argmax())].id.partition(".")[0]
+            where = f"network '{network.name}': node '{node}' turns over {fastest:.4g}/{network.time_unit}"
+            if fastest * episode.control_interval > MAX_STEPS * MAX_TURNOVER:
+                raise CirlError(
+                    f"{where}; a control interval of {episode.control_interval:g} {network.time_unit} would need more "
+                    f"than {MAX_STEPS:,} solver steps. Is a rate in the wrong unit?"
+                )
+            step = episode.solver_step or 0.0
+            if episode.solver == "rk4" and fastest * step > MAX_TURNOVER:
+                raise CirlError(
+                    f"{where}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / fastest:.4g} "
+                    f"{network.time_unit}, not {step:g}"
+                )
+        if episode.solver == "exact":
+            return max(1, math.ceil(fastest * episode.control_interval / MAX_TURNOVER - 1e-9))
+        assert episode.solver_step is not None
+        return round(episode.control_interval / episode.solver_step)
+
+    def _unshared(self, controls: Floats) -> Floats:
+        """Return r, but for shares and time series."""
+        if len(self._stretched):
+            controls = controls.copy()
+            controls[self._stretched] = 1.0 / controls[self._stretched]
+        if self._partial:  # some arc lacks a control: let a row of ones stand in for it
+            controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
+        own, base, donor = self._own_control, self._base, self._donor_control
+        if sparse := 2 * len(self._acted) < len(base):
+            rate = np.empty((len(base), controls.shape[1]))
+            rate[...] = base
+            own, base, donor = own[self._acted], base[self._acted], donor[self._acted]
+        acted: Floats = controls.take(own, axis=0)
+        acted *= base
+        acted *= controls.take(donor, axis=0)
+        if not sparse:
+            return acted
+        rate[self._acted] = acted
+        return rate
+
+    def _compile_controls(self) -> None:
+        """Find for each arc the rows of the control array that act on it; the row past the last is 1."""
+        network = self.staged_network
+        kinds = {c.id: c.control.kind for c in network.compartments.values() if c.control is not None}
+        position = {id_: network.control_rows[id_].start for id_, kind in kinds.items() if kind in SCALING}
+        stretched = [position[id_] for id_, kind in kinds.items() if kind is ControlKind.STRETCH]
+        self._stretched: Integers = np.array(stretched, dtype=np.intp)
+        self.control_low, self.neutral, self.control_high = network.control_bounds
+        none = len(self.neutral)
+        valves = network.valves if isinstance(network, StagedNetwork) else {}
+
+        def acting_on(arc: Arc) -> tuple[int, int]:
+            if arc.donor in valves:
+                return none, position.get(valves[arc.donor], none)
+            donor = network.compartments[arc.donor]
+            own, valve = position.get(arc.id, none), position.get(arc.donor, none)
+            if donor.control is not None and donor.control.kind is FLOW:
+                return (valve, none) if arc.law is Law.CONTROLLED else (own, none)
+            return own, valve
+
+        rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
+        self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
+        self._partial = bool((rows == none).any())
+        self._acted: Integers = np.flatnonzero((rows < none).any(axis=1))
+
+
+class FlowLaws(ArcRates):
+    """Drivers, rates and controls of every arc; with ``uncertain``, of copies with draws of the uncertain numbers.
+
+    Attributes:
+        network: whose laws they are; arcs of ``staged_network`` begin with its own.
+        incidence: S with empty rows for batches and unit, shape (masses, arcs).
+        time_dependent: arcs whose r depends on the interval, by id.
+        is_fixed: arcs whose r is the same in all copies and intervals, shape (arcs,).
+        routing: what passes through nodes that store nothing.
+    """
+
+    def __init__(self, network: Network, *, uncertain: bool = False) -> None:
+        """Compile ``network``."""
+        staged_network = simulated_network(network)
+        self._drawn = FlowFactors(staged_network) if uncertain else None
+        super().__init__(staged_network, self._drawn)
+        self.network, rows, arcs = network, self.rows, len(staged_network.arcs)
+        ends = np.concatenate([staged_network.donors, staged_network.recipients])
+        stored, both = ends < rows.nodes.stop, np.tile(np.arange(arcs), 2)
+        signs = np.repeat([-1.0, 1.0], arcs)
+        self.incidence = RowSum(ends[stored], both[stored], signs[stored], (rows.masses, arcs))
+        self._shares = Shares(staged_network, uncertain=uncertain)
         self.max_rate[self._shares.arcs] *= self._shares.highest
+        timed = [*self._series_arcs, *(self._shares.varying_arcs if self._shares.is_time_varying else ())]
+        self.time_dependent = tuple(staged_network.arcs[k].id for k in timed)
+        self._share_out()
+        self.routing = Routing(staged_network, self.rate(self.neutral[:, :1]), self.is_fixed)
 
     def _share_out(self) -> None:
         """Multiply constant shares into r, where no control comes before them, and find out which r never change."""
@@ -179,26 +270,6 @@ class FlowLaws:
         table = single_column(self.neutral)  # ``take`` would first write out what is broadcast
         return table.take(step, axis=1) if table.shape[1] > 1 else np.repeat(table, len(step), axis=1)
 
-    def _unshared(self, controls: Floats) -> Floats:
-        """Return r, but for shares and time series."""
-        if len(self._stretched):
-            controls = controls.copy()
-            controls[self._stretched] = 1.0 / controls[self._stretched]
-        if self._partial:  # some arc lacks a control: let a row of ones stand in for it
-            controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
-        own, base, donor = self._own_control, self._base, self._donor_control
-        if sparse := 2 * len(self._acted) < len(base):
-            rate = np.empty((len(base), controls.shape[1]))
-            rate[...] = base
-            own, base, donor = own[self._acted], base[self._acted], donor[self._acted]
-        acted: Floats = controls.take(own, axis=0)
-        acted *= base
-        acted *= controls.take(donor, axis=0)
-        if not sparse:
-            return acted
-        rate[self._acted] = acted
-        return rate
-
     def flow(self, stock: Floats, rate: Floats) -> Floats:
         """Return the flows f = r ∘ y[driver], shape (arcs, B), mass/time; ``routing`` fills in what is passed on."""
         flow: Floats = stock.take(self.driver, axis=0)
@@ -209,28 +280,3 @@ class FlowLaws:
         """Append empty batch rows and the unit row to stocks of shape (stores, B)."""
         batch = stock.shape[1]
         return np.concatenate([stock, np.zeros((len(self.rows.batch_names), batch)), np.ones((1, batch))])
-
-    def _compile_controls(self) -> None:
-        """Find for each arc the rows of the control array that act on it; the row past the last is 1."""
-        network = self.staged_network
-        kinds = {c.id: c.control.kind for c in network.compartments.values() if c.control is not None}
-        position = {id_: network.control_rows[id_].start for id_, kind in kinds.items() if kind in SCALING}
-        stretched = [position[id_] for id_, kind in kinds.items() if kind is ControlKind.STRETCH]
-        self._stretched: Integers = np.array(stretched, dtype=np.intp)
-        self.control_low, self.neutral, self.control_high = network.control_bounds
-        none = len(self.neutral)
-        valves = network.valves if isinstance(network, StagedNetwork) else {}
-
-        def acting_on(arc: Arc) -> tuple[int, int]:
-            if arc.donor in valves:
-                return none, position.get(valves[arc.donor], none)
-            donor = network.compartments[arc.donor]
-            own, valve = position.get(arc.id, none), position.get(arc.donor, none)
-            if donor.control is not None and donor.control.kind is FLOW:
-                return (valve, none) if arc.law is Law.CONTROLLED else (own, none)
-            return own, valve
-
-        rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
-        self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
-        self._partial = bool((rows == none).any())
-        self._acted: Integers = np.flatnonzero((rows < none).any(axis=1))

@@ -8,7 +8,6 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
-from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.rowsum import single_column, spans
@@ -27,9 +26,8 @@ class Actuators:
         spaces: action space of each agent.
     """
 
-    def __init__(self, laws: FlowLaws, agents: Sequence[str] | None, num_envs: int) -> None:
+    def __init__(self, network: Network, agents: Sequence[str] | None, num_envs: int) -> None:
         """Let ``agents`` act, None being the network's own choice; a ``CirlError`` names one unknown or named twice."""
-        network = laws.network
         self.agents = _checked(network, agents)
         self.num_envs = num_envs
         rows = {agent: network.control_rows[agent] for agent in self.agents}
@@ -37,8 +35,8 @@ class Actuators:
         acting = [row for each in rows.values() for row in range(each.start, each.stop)]
         self.acting: Integers = np.array(acting, dtype=np.intp)
         self.spaces = {a: Box(-1.0, 1.0, (each.stop - each.start,), np.float32) for a, each in rows.items()}
-        self._all_act = self.acting.tolist() == list(range(len(laws.neutral)))
-        low, neutral, high = (single_column(each) for each in (laws.control_low, laws.neutral, laws.control_high))
+        self._all_act = self.acting.tolist() == list(range(network.control_bounds.shape[1]))
+        low, neutral, high = (single_column(bound) for bound in network.control_bounds)
         low, high = low[self.acting], high[self.acting]
         tables: tuple[Floats, ...] = (low, (high + low) / 2, (high - low) / 2, high, neutral)
         self._varying = any(bool((each != each[:, :1]).any()) for each in tables)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cirl_marl.dynamics.laws import LAWS, FlowLaws
+from cirl_marl.dynamics.laws import LAWS
 from cirl_marl.dynamics.stages import StagedNetwork
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.errors import CirlError
@@ -141,7 +141,7 @@ class Admissible:
         if reasons:
             name = f"network '{network.name}', scenario '{network.scenario_name}'"
             raise NoCertificate(f"{name}: no bound is proved: {'; '.join(reasons)}")
-        actuators = Actuators(FlowLaws(network), agents, 1)
+        actuators = Actuators(network, agents, 1)
         agents = actuators.agents
         lifetimes = Lifetimes(network, agents)
         network = lifetimes.planned

@@ -109,7 +109,7 @@ def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
     columns = np.repeat(inputs[:, :, None], nodes + entries + 1, axis=2)
     columns[:, np.arange(nodes + entries), np.arange(nodes + entries)] += shift
     flat = np.ascontiguousarray(columns.transpose(1, 0, 2).reshape(nodes + entries, -1))
-    actuators = Actuators(dynamics, bound.agents or None, flat.shape[1])
+    actuators = Actuators(bound.network, bound.agents or None, flat.shape[1])
     when = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
     stocks, supply = dynamics.extend(flat[:nodes]), Supply(dynamics)
@@ -123,7 +123,7 @@ def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
 
 def _path(bound: Bound, dynamics: Dynamics) -> Floats:
     """Return the stocks at the start and after each interval under the bound's actions, shape (steps + 1, stocks)."""
-    actuators, inner = Actuators(dynamics, bound.agents or None, 1), np.empty((0, 1))
+    actuators, inner = Actuators(bound.network, bound.agents or None, 1), np.empty((0, 1))
     masses, supply = dynamics.extend(bound.initial[:, None]), Supply(dynamics)
     idle, found = supply.idle(actuators.agents), [bound.initial]
     for step, actions in enumerate(bound.actions):

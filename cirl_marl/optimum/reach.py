@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 from scipy.sparse.linalg import splu
 
-from cirl_marl.dynamics.integrator import Dynamics
+from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, IntervalRanges, NoCertificate
@@ -199,8 +199,8 @@ class ComparisonSystem:
     def __init__(self, admissible: Admissible) -> None:
         """Compile the system for the ranges of ``admissible``."""
         self.admissible, self.network = admissible, admissible.network
-        dynamics = Dynamics(admissible.network)
-        self.substeps, self.substep = dynamics.substeps, dynamics.substep
+        self.substeps = ArcRates(admissible.network).solver_steps()
+        self.substep = self.network.episode.control_interval / self.substeps
         self._visit_bounds = VisitBounds(admissible.network)
         self._routes: dict[bytes, RouteBounds] = {}
         # shares of what leaves a node that stores nothing; where their ranges are widest the others begin

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from cirl_marl.dynamics.laws import FlowLaws
+from cirl_marl.dynamics.laws import ArcRates
 from cirl_marl.dynamics.stages import StagedNetwork, simulated_network, staged_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.network import Floats, Integers, Network
@@ -123,8 +123,8 @@ class Lifetimes:
 
     def pieces(self, degree: int, most: int) -> int:
         """Return the pieces of an interval, at most ``most``, in which stocks turn over once and kernels are smooth."""
-        laws, interval = FlowLaws(self.planned), self.network.episode.control_interval
-        turnover = laws.turnover.copy()
+        interval = self.network.episode.control_interval
+        turnover = ArcRates(self.planned).turnover
         driven = [each for each in self.passive if len(each.rate)]
         for each in driven:
             turnover[self.planned.donors[each.leaving]] = 0.0

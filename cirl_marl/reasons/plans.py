@@ -135,7 +135,7 @@ class _Given(Controller):
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         self._env, self._step = env, 0
-        self._actuators = Actuators(env.dynamics, env.agents, 1)
+        self._actuators = Actuators(env.network, env.agents, 1)
 
     def act(self, observations: Arrays) -> Arrays:
         step = np.array([self._step])
