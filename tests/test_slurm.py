@@ -190,7 +190,7 @@ def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     folder = tmp_path_factory.mktemp("slurm")
     for parent in (folder, *folder.parents[:2]):
         parent.chmod(0o755)  # the servers' own users look into it
-    script = [str(TESTS / "slurm_node.sh"), str(folder), request.param]
+    script = ["bash", str(TESTS / "slurm_node.sh"), str(folder), request.param]
     before = os.environ.copy()
     try:
         subprocess.run(script, check=True, capture_output=True, text=True, timeout=180)
@@ -200,7 +200,7 @@ def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     finally:
         os.environ.clear()
         os.environ.update(before)
-        subprocess.run([*script[:2], "stop"], check=True, capture_output=True)
+        subprocess.run([*script[:3], "stop"], check=True, capture_output=True)
 
 
 @pytest.mark.slow

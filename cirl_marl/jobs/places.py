@@ -148,7 +148,8 @@ class Ray:
         self._ray = _wanted("ray")
         if not self._ray.is_initialized():
             try:
-                self._ray.init(log_to_driver=False, include_dashboard=False if not _address() else None)
+                dashboard = False if not _address() else None
+                self._ray.init(log_to_driver=False, logging_level="error", include_dashboard=dashboard)
             except (ConnectionError, ValueError) as error:
                 raise CirlError(f"no Ray at RAY_ADDRESS={_address()}: {_last_line(error)}") from error
         found = int(self._ray.cluster_resources().get("CPU", 1))
