@@ -206,7 +206,7 @@ class FreeEnv(MultiAgentVectorEnv):
             {agent: self.reward(agent, self._step) for agent in self.agents},
             dict.fromkeys(self.agents, np.zeros_like(ended)),
             dict.fromkeys(self.agents, ended),
-            {agent: {"final_observation": seen} if over else {} for agent, seen in observations.items()},
+            {agent: {"final_obs": seen} if over else {} for agent, seen in observations.items()},
         )
 
 

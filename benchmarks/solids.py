@@ -93,7 +93,7 @@ def played(act: Act) -> Episodes:
     for t in range(env.network.episode.horizon):
         actions: Actions = dict(script.act(seen))
         seen, _, _, _, infos = env.step(actions | act(env, t, dict(seen), actions))
-        last = infos["sorter"].get("final_state")
+        last = infos["sorter"].get("final_info", {}).get("state")
         state = env.state() if last is None else last
         items += state[:, list(place.values())].T
         loads += (before > 0) & (state[:, bound] == 0)

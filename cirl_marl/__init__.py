@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from cirl_marl.definitions.catalogue import recipes as recipes
     from cirl_marl.definitions.reader import write_network as write_network
     from cirl_marl.environments.goal import GoalEnv as GoalEnv
+    from cirl_marl.environments.joint import JointEnv as JointEnv
+    from cirl_marl.environments.joint import JointVectorEnv as JointVectorEnv
     from cirl_marl.environments.parallel import NetworkParallelEnv as NetworkParallelEnv
     from cirl_marl.environments.parallel import aec_env as aec_env
     from cirl_marl.environments.parallel import parallel_env as parallel_env
@@ -107,8 +109,9 @@ _MODULES = {
     "controllers.schedule": "Schedule",
     "controllers.scripted": "ScriptController",
     "definitions.catalogue": "load_network networks recipes",
-    "definitions.reading": "write_network",
+    "definitions.reader": "write_network",
     "environments.goal": "GoalEnv",
+    "environments.joint": "JointEnv JointVectorEnv",
     "environments.parallel": "NetworkParallelEnv aec_env parallel_env vector_env",
     "environments.single": "SingleAgentEnv single_agent_env",
     "environments.state": "Snapshot",

@@ -44,10 +44,14 @@ TRAININGS = {
 }
 """Recipe → network and environment steps."""
 
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {
+    "final_observation": "final_obs",
+    "_final_observation": "_final_obs",
+    "final_state": "final_info.state",
+}
 """Keys of ``infos`` that had another name before: old → new."""
-ADDED: frozenset[str] = frozenset()
-"""Keys of ``infos`` that came newly."""
+ADDED = ("service_levels", "cost", "cost_", "final_info", "_final_info")
+"""Keys of ``infos`` that came newly; one that ends in ``_`` stands for all that begin so, one for what is in it too."""
 
 
 def named(*places: str) -> Any:
@@ -105,12 +109,27 @@ def digest_of_tensors(paths: Iterable[Path]) -> str:
     return digest(*sorted(digest(tensor) for path in paths for tensor in load_file(path).values()))
 
 
+def flat(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the entries of nested mappings, keys joined by dots."""
+    for key, value in info.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def is_new(what: str) -> bool:
+    """Return whether a hash is of a key of ``infos`` that came newly."""
+    key = what.partition(" infos ")[2]
+    return any(key == new or key.startswith(new if new.endswith("_") else f"{new}.") for new in ADDED)
+
+
 def by_key(infos: Iterable[Mapping[str, Mapping[str, Any]]]) -> Iterator[tuple[str, str]]:
     """Yield for each key of ``infos`` of several steps, agent → key → value, the hash of all that stood under it."""
     values: dict[str, list[Any]] = {}
     for step in infos:
         for of_agent in step.values():
-            for key, value in of_agent.items():
+            for key, value in flat(of_agent):
                 values.setdefault(key, []).append(value)
     for key, parts in values.items():
         yield key, digest(*parts)
@@ -197,7 +216,7 @@ def differences(before: Mapping[str, str], after: Mapping[str, str]) -> list[str
     """Return what differs, is missing or came newly, but for the listed exceptions."""
     expected = renamed(before)
     other = [what for what in expected.keys() | after.keys() if expected.get(what) != after.get(what)]
-    return sorted(what for what in other if what in expected or what.partition(" infos ")[2] not in ADDED)
+    return sorted(what for what in other if what in expected or not is_new(what))
 
 
 def main() -> None:

@@ -71,7 +71,7 @@ def shown_by(controller: Controller, seed: int, view_of: Any, steps: int) -> Ite
         before = view.observe(observations, env.state)
         observations, rewards, _, ends, infos = env.step(exact)
         done = bool(ends[AGENTS[0]].all())
-        seen = {agent: info["final_observation"] for agent, info in infos.items()} if done else observations
+        seen = {agent: info["final_obs"] for agent, info in infos.items()} if done else observations
         after = view.observe(seen, env.state)
         rows = [exact[agent] for agent in view.agents]
         joined = np.concatenate(rows, axis=0 if view.row_agents else 1)

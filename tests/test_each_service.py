@@ -194,7 +194,7 @@ def test_episodes_sum_up_each_service() -> None:
         if step == 1:
             taken = env.snapshot()
         *_, infos = env.step(actions)
-        stock = infos["to_cars"]["final_state"].T if step == 2 else env.physical.stock
+        stock = infos["to_cars"]["final_info"]["state"].T if step == 2 else env.physical.stock
         levels = np.minimum(1.0, stock[1:3] / 10.0)
         expected += levels
         np.testing.assert_allclose(infos["to_cars"]["service_level"], levels.mean(axis=0))

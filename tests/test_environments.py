@@ -219,8 +219,8 @@ def test_copies_restart_by_themselves() -> None:
         for agent in env.agents:
             assert not terminations[agent].any()
             assert (truncations[agent] == ended).all()
-            assert ("final_observation" in infos[agent]) == ended
-            last: NDArray[np.float32] = infos[agent]["final_observation"] if ended else observations[agent]
+            assert ("final_obs" in infos[agent]) == ended
+            last: NDArray[np.float32] = infos[agent]["final_obs"] if ended else observations[agent]
             np.testing.assert_array_equal(last, expected[alone.layout.slices[agent]].T)
         if ended:
             again = alone.reset()  # goes on with the streams, as the restart does

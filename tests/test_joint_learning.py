@@ -185,8 +185,8 @@ def test_rows_of_a_seat_are_agents_in_copies() -> None:
                 last = info["terminal_observation"]
                 agent = env.agents[row // 2]
                 k = env.observation_spaces[agent].shape[0]
-                np.testing.assert_array_equal(last["observation"][:k], theirs[agent]["final_observation"][row % 2])
-                np.testing.assert_array_equal(last["state"], theirs[agent]["final_state"][row % 2])
+                np.testing.assert_array_equal(last["observation"][:k], theirs[agent]["final_obs"][row % 2])
+                np.testing.assert_array_equal(last["state"], theirs[agent]["final_info"]["state"][row % 2])
                 assert last["state"][-1] == 1.0  # the whole time has elapsed; the next episode's share is 0
                 assert info["TimeLimit.truncated"]
                 assert info["episode"]["r"] == pytest.approx(returns[row], rel=1e-12)

@@ -84,7 +84,7 @@ def test_lockstep_equals_the_environment_stepped_by_hand() -> None:
             for copy in range(COPIES):
                 assert info[copy].get("TimeLimit.truncated", False) == bool(done[copy])
                 if done[copy]:
-                    final = infos[agent]["final_observation"][copy]
+                    final = infos[agent]["final_obs"][copy]
                     assert np.array_equal(info[copy]["terminal_observation"], final)
                     assert not np.array_equal(final, observations[agent][copy])
 
@@ -136,7 +136,7 @@ def test_truncation_bootstraps() -> None:
 
     def hook(infos: Any, done: np.ndarray) -> None:
         if done.any():
-            finals.append(infos["use"]["final_observation"].copy())
+            finals.append(infos["use"]["final_obs"].copy())
             last.append(agent_env.rewards_and_dones()[0])
 
     Lockstep([world], [Participant("use", learn, hold(agent_env), streams)]).run([hook])

@@ -73,7 +73,7 @@ def test_scaled_copies_are_the_environment(scaling: Scaling) -> None:
         seen, rewards, _, _, infos = env.step(by_agent(env, actions))
         assert paid == pytest.approx(np.stack([rewards[a] for a in env.agents], axis=1) / scaling.paid, rel=1e-6)
         assert over == (step == SETTINGS.steps)
-    final = padded(env, {agent: infos[agent]["final_observation"] for agent in env.agents})
+    final = padded(env, {agent: infos[agent]["final_obs"] for agent in env.agents})
     assert np.array_equal(last, scaling.seen(final))
     assert not np.array_equal(last, copies.observation)
 

@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 from small_networks import constant
 
 from cirl_marl import CirlError, Law, MultiAgentVectorEnv, load_network, parallel_env, single_agent_env
+from cirl_marl.definitions.ids import ids
 from cirl_marl.dynamics.integrator import Dynamics
 from cirl_marl.environments.registration import PAPER_ENVIRONMENTS
 
@@ -51,7 +52,7 @@ def test_initial_state_in_the_papers_order(name: str) -> None:
     np.testing.assert_allclose(info["state"], states[8], rtol=1e-9)
 
 
-@pytest.mark.parametrize("id_", PAPER_ENVIRONMENTS)
+@pytest.mark.parametrize("id_", [ids()[name] for name in PAPER_ENVIRONMENTS])
 def test_gymnasiums_own_check(id_: str) -> None:
     """check_env passes for every id; it only regrets that states have no bounds, as published."""
     env = gymnasium.make(id_).unwrapped

@@ -293,7 +293,7 @@ def test_views_and_copies_agree(scenario: str) -> None:
             theirs, earned, _, over, info = lone[i].step({"sorter": action["sorter"][i]})
             gym, gained, terminated, truncated, details = single[i].step(action["sorter"][i])
             ended = step % 30 == 0
-            mine = infos["sorter"]["final_observation"] if ended else observations["sorter"]
+            mine = infos["sorter"]["final_obs"] if ended else observations["sorter"]
             np.testing.assert_array_equal(mine[i], theirs["sorter"])
             np.testing.assert_array_equal(mine[i], gym)
             assert rewards["sorter"][i] == earned["sorter"] == gained

@@ -183,7 +183,7 @@ class Alone(AgentVecEnv):
         done = truncations[self.name]
         details: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for copy in np.flatnonzero(done):
-            final = infos[self.name]["final_observation"][copy].copy()
+            final = infos[self.name]["final_obs"][copy].copy()
             details[copy] = {"TimeLimit.truncated": True, "terminal_observation": final}
         return seen, rewards[self.name].astype(np.float32), done, details
 

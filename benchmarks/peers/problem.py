@@ -107,7 +107,7 @@ class Copies:
         self.observation = self._scaling.seen(padded(self.env, observations))
         last = self.observation
         if over:
-            last = self._scaling.seen(padded(self.env, {a: infos[a]["final_observation"] for a in self.env.agents}))
+            last = self._scaling.seen(padded(self.env, {a: infos[a]["final_obs"] for a in self.env.agents}))
         paid = np.stack([rewards[agent] for agent in self.env.agents], axis=1)
         return last, self._scaling.reward(paid), over
 

@@ -61,7 +61,7 @@ class LinearSystem:
         """
         laws = FlowLaws(network)
         actuators = Actuators(network, agents, 1)
-        inputs, acting = actuators.agents, actuators.acting
+        inputs, acting = actuators.agents, actuators.control_rows
         if problems := list(_nonlinear(network, inputs)):
             problem = f"is no linear system: {'; '.join(problems)}. {_remedy(network)}"
             raise CirlError(f"'{network.name}' ({network.scenario_name}) {problem}")

@@ -112,7 +112,7 @@ def rollout(
         outcome = env.advance(env.stack(controller.act(observations)))
         controls[t] = env.controls[:, 0]
         if len(orders):
-            asked = env.dynamics.rate(env.controls, np.full(env.num_envs, t), env.physical.drawn)[orders]
+            asked = env.dynamics.rate(env.controls, np.full(env.num_envs, t), env.physical.factors_if_any)[orders]
             short = asked - outcome.flow[orders]
             unmet[t] = np.where(short > ROUNDING * np.abs(asked), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean

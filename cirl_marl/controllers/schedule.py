@@ -104,7 +104,7 @@ def schedule(
     usual = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
     run = rollout(env, recorded, seed=begun.seed, start=begun.initial_state, progress=progress)
     actuators = Actuators(env.network, env.agents, len(recorded.actions))
-    values = actuators.controls(np.array(recorded.actions).T, np.arange(len(recorded.actions)))[actuators.acting]
+    values = actuators.controls(np.array(recorded.actions).T, np.arange(len(recorded.actions)))[actuators.control_rows]
     ends = interval_ends(network)
     columns = [
         (f"from ({network.time_unit})", ends - network.episode.control_interval),

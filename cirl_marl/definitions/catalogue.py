@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from cirl_marl.definitions.code_permission import code_allowed
+from cirl_marl.definitions.ids import NAMESPACE, network_and_scenario
 from cirl_marl.definitions.reader import Definition
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Network
@@ -50,8 +51,9 @@ def recipes() -> list[str]:
 def load_network(name: str | Path, *, scenario: str | None = None, allow_code: bool = False) -> Network:
     """Return a network of the catalogue, or of a definition file if ``name`` ends in ``.toml`` or ``.toml:REGION``.
 
-    It is under ``scenario``; None is the default, physical one. With ``allow_code`` the file may name models of its
-    own, whose modules are then imported; those that are imported already need no leave.
+    A network of the catalogue has a name, as ``copper_net``, and ids, as ``cirl_marl/copper_net.paper-v0``. It is under
+    ``scenario``; None is the default, physical one, or that of the id. With ``allow_code`` the file may name models of
+    its own, whose modules are then imported; those that are imported already need no leave.
 
     Raises:
         DefinitionError: if the file has mistakes; all are named.
@@ -59,9 +61,15 @@ def load_network(name: str | Path, *, scenario: str | None = None, allow_code: b
     """
     if "\0" in str(name):
         raise CirlError(f"{str(name)!r} is no name of a network or file: it has a character without a sign")
-    path, region = file_and_region(str(name)) or _in_catalogue(str(name))
+    path_and_region, variant = file_and_region(str(name)), None
+    if path_and_region is None:
+        network = str(name)
+        if network.startswith(NAMESPACE):
+            network, variant = network_and_scenario(network)
+        path_and_region = _in_catalogue(network)
+    path, region = path_and_region
     with code_allowed(allow_code):
-        return _definition(path).network(region=region).scenario(scenario)
+        return _definition(path).network(region=region).scenario(variant).scenario(scenario)
 
 
 def file_and_region(name: str) -> tuple[Path, str] | None:

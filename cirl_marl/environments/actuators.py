@@ -22,64 +22,63 @@ class Actuators:
     Attributes:
         agents: compartments that act, in the order of every stacked array.
         entries: rows of each agent's action in a stacked action.
-        acting: row of each entry of a stacked action among all controls, shape (entries,).
+        control_rows: row of each entry of a stacked action among all controls, shape (entries,).
         spaces: action space of each agent.
     """
 
     def __init__(self, network: Network, agents: Sequence[str] | None, num_envs: int) -> None:
         """Let ``agents`` act, None being the network's own choice; a ``CirlError`` names one unknown or named twice."""
-        self.agents = _checked(network, agents)
+        self.agents = _acting_agents(network, agents)
         self.num_envs = num_envs
         rows = {agent: network.control_rows[agent] for agent in self.agents}
-        self.entries = dict(zip(rows, spans(each.stop - each.start for each in rows.values()), strict=True))
-        acting = [row for each in rows.values() for row in range(each.start, each.stop)]
-        self.acting: Integers = np.array(acting, dtype=np.intp)
-        self.spaces = {a: Box(-1.0, 1.0, (each.stop - each.start,), np.float32) for a, each in rows.items()}
-        self._all_act = self.acting.tolist() == list(range(network.control_bounds.shape[1]))
+        self.entries = dict(zip(rows, spans(span.stop - span.start for span in rows.values()), strict=True))
+        control_rows = [row for span in rows.values() for row in range(span.start, span.stop)]
+        self.control_rows: Integers = np.array(control_rows, dtype=np.intp)
+        self.spaces = {a: Box(-1.0, 1.0, (span.stop - span.start,), np.float32) for a, span in rows.items()}
+        self._all_act = control_rows == list(range(network.control_bounds.shape[1]))
         low, neutral, high = (single_column(bound) for bound in network.control_bounds)
-        low, high = low[self.acting], high[self.acting]
+        low, high = low[self.control_rows], high[self.control_rows]
         tables: tuple[Floats, ...] = (low, (high + low) / 2, (high - low) / 2, high, neutral)
-        self._varying = any(bool((each != each[:, :1]).any()) for each in tables)
+        self._vary_in_time = any(bool((table != table[:, :1]).any()) for table in tables)
         # one value per copy: NumPy takes equal shapes about twice as fast as it broadcasts a column
         first = np.zeros(num_envs, dtype=np.intp)
-        if not self._varying:
-            tables = tuple(each.take(first, axis=1) for each in tables)
+        if not self._vary_in_time:
+            tables = tuple(table.take(first, axis=1) for table in tables)
         *self._bounds, self._neutral = tables
 
     def neutral_action(self, step: Integers) -> dict[str, Floats]:
         """Normalised action of each agent that leaves it neutral, shape (B, entries) each, in an interval of each."""
-        _, middle, half, _ = self._held(step)
-        neutral = self._neutral.take(step, axis=1) if self._varying else self._neutral
-        distance = neutral[self.acting] - middle
+        _, middle, half, _ = self._bounds_in(step)
+        neutral = self._neutral.take(step, axis=1) if self._vary_in_time else self._neutral
+        distance = neutral[self.control_rows] - middle
         neutral = np.divide(distance, half, out=np.zeros_like(distance), where=half > 0)
         np.clip(neutral, -1.0, 1.0, out=neutral)  # rounding may lead beyond a bound
         return self.unstack(neutral)
 
     def normalise(self, agent: str, values: Floats, step: Integers) -> Floats:
         """Return the actions that come closest to physical values of an agent's control, shape (its entries, B)."""
-        _, middle, half, _ = (each[self.entries[agent]] for each in self._held(step))
-        actions = np.divide(values - middle, half, out=np.zeros_like(values), where=half > 0)
-        clipped: Floats = np.clip(actions, -1.0, 1.0)
-        return clipped
+        _, middle, half, _ = (table[self.entries[agent]] for table in self._bounds_in(step))
+        actions: Floats = np.divide(values - middle, half, out=np.zeros_like(values), where=half > 0)
+        return np.clip(actions, -1.0, 1.0)
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
         if not isinstance(actions, Mapping):
             raise ControlError(f"actions must be a mapping agent → action, not {actions!r}")
-        stacked = np.empty((len(self.acting), self.num_envs))
+        joint = np.empty((len(self.control_rows), self.num_envs))
         if len(actions) != len(self.agents):
             raise ControlError(self._wrong_agents(actions))
         for agent, entries in self.entries.items():
             if agent not in actions:
                 raise ControlError(self._wrong_agents(actions))
             action = np.asarray(actions[agent])
-            expected = (self.num_envs, entries.stop - entries.start)
-            if action.shape != expected:
-                raise ControlError(wrong_shape(agent, action.shape, expected))
+            shape = (self.num_envs, entries.stop - entries.start)
+            if action.shape != shape:
+                raise ControlError(wrong_shape(agent, action.shape, shape))
             if action.dtype.kind not in "biuf":
                 raise ControlError(f"action of agent '{agent}' is {actions[agent]!r}; it must hold numbers in [-1, 1]")
-            stacked[entries] = action.T
-        return stacked
+            joint[entries] = action.T
+        return joint
 
     def unstack(self, actions: Floats) -> dict[str, Floats]:
         """Split stacked actions, shape (entries, B), into agent → (B, entries of its action)."""
@@ -92,20 +91,20 @@ class Actuators:
         """
         if not (actions.max(initial=0.0) <= BOUND and actions.min(initial=0.0) >= -BOUND):
             raise ControlError(self._wrong_values(actions))
-        low, middle, half, high = self._held(step)
-        acting = actions * half
-        acting += middle
-        np.maximum(acting, low, out=acting)  # with bounds that are arrays, clip is slower
-        np.minimum(acting, high, out=acting)
+        low, middle, half, high = self._bounds_in(step)
+        values = actions * half
+        values += middle
+        np.maximum(values, low, out=values)  # with bounds that are arrays, clip is slower
+        np.minimum(values, high, out=values)
         if self._all_act:
-            return acting
-        controls: Floats = self._neutral.take(step, axis=1) if self._varying else self._neutral.copy()
-        controls[self.acting] = acting
+            return values
+        controls: Floats = self._neutral.take(step, axis=1) if self._vary_in_time else self._neutral.copy()
+        controls[self.control_rows] = values
         return controls
 
-    def _held(self, step: Integers) -> Sequence[Floats]:
-        """Return low, middle, half of the range and high of the acting controls, shape (entries, B) each."""
-        return tuple(each.take(step, axis=1) for each in self._bounds) if self._varying else self._bounds
+    def _bounds_in(self, step: Integers) -> Sequence[Floats]:
+        """Return low, middle, half of the range and high of the agents' controls, shape (entries, B) each."""
+        return tuple(table.take(step, axis=1) for table in self._bounds) if self._vary_in_time else self._bounds
 
     def _wrong_agents(self, actions: Mapping[str, object]) -> str:
         for agent in actions:
@@ -120,23 +119,23 @@ class Actuators:
         return f"action of agent '{agent}' in copy {copy_} is {actions[entry, copy_]}; it must be a number in [-1, 1]"
 
 
-def wrong_shape(agent: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> str:
+def wrong_shape(agent: str, shape: tuple[int, ...], space_shape: tuple[int, ...]) -> str:
     """Say that an agent's action has another shape than it should have."""
-    return f"action of agent '{agent}' has shape {shape}, expected {expected}"
+    return f"action of agent '{agent}' has shape {shape}, expected {space_shape}"
 
 
-def _checked(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:
+def _acting_agents(network: Network, agents: Sequence[str] | None) -> tuple[str, ...]:
     if agents is None:
-        chosen = network.agents
+        ids = network.agents
     elif isinstance(agents, str) or not isinstance(agents, Sequence) or not all(isinstance(a, str) for a in agents):
         raise CirlError(f"agents must be a sequence of ids in a fixed order, such as a list, not {agents!r}")
     else:
-        chosen = tuple(agents)
-    for agent in chosen:
+        ids = tuple(agents)
+    for agent in ids:
         if agent in network.compartments and agent not in network.control_rows:
             raise CirlError(f"network '{network.name}': '{agent}' has no control, so that it cannot act")
         if agent not in network.control_rows:
             raise CirlError(f"network '{network.name}': {unknown('agent', agent, network.controllable)}")
-    if (network.agents and not chosen) or len(set(chosen)) != len(chosen):
-        raise CirlError(f"network '{network.name}': agents {list(chosen)} must be distinct and at least one")
-    return chosen
+    if (network.agents and not ids) or len(set(ids)) != len(ids):
+        raise CirlError(f"network '{network.name}': agents {list(ids)} must be distinct and at least one")
+    return ids

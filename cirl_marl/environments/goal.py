@@ -46,19 +46,21 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         self.agent = self.flat.agent
         model = self.flat.network.compartments[self.agent].model
         names = [name.split(".")[-1] for name in self.flat.parallel.layout.names[self.agent]]
-        who = f"agent '{self.agent}' of '{self.network.name}'"
+        label = f"agent '{self.agent}' of '{self.network.name}'"
         if not isinstance(model, GoalTask):
-            raise CirlError(f"{who} has no goals to observe")
-        self._task, wanted = model, (model.observation_names, model.achieved_names, model.desired_names)
-        if not set().union(*wanted) <= set(names):
-            raise CirlError(f"{who} has no goals to observe")
+            raise CirlError(f"{label} has no goals to observe")
+        self._task, parts = model, (model.observation_names, model.achieved_names, model.desired_names)
+        if not set().union(*parts) <= set(names):
+            raise CirlError(f"{label} has no goals to observe")
         reward = options.get("reward") or self.network.objective.reward
         if reward != "local":  # hindsight would learn from two rewards that disagree
             raise CirlError(f"agent '{self.agent}': a function of the goals is the reward 'local', not '{reward}'")
-        if more := list(_beside_the_goals(self.flat.network, self.agent)):
-            beside = " and ".join(more)
-            raise CirlError(f"{who}: its local reward is no function of the goals alone, as it also contains {beside}")
-        rows = [np.array([names.index(name) for name in entries]) for entries in wanted]
+        if terms := list(_terms_beside_goals(self.flat.network, self.agent)):
+            beside = " and ".join(terms)
+            raise CirlError(
+                f"{label}: its local reward is no function of the goals alone, as it also contains {beside}"
+            )
+        rows = [np.array([names.index(name) for name in entries]) for entries in parts]
         self._parts = dict(zip(PARTS, rows, strict=True))
         box = self.flat.observation_space
         assert isinstance(box, spaces.Box)
@@ -67,6 +69,11 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         )
         self.action_space = self.flat.action_space
         self.render_mode = self.flat.render_mode
+        self.metadata = self.flat.metadata
+
+    def __str__(self) -> str:
+        """Return the name of the network and its scenario."""
+        return str(self.flat)
 
     @property
     def network(self) -> Network:
@@ -119,12 +126,11 @@ class GoalEnv(gymnasium.Env[Goals, NDArray[np.float32]]):
         return {part: observation[rows] for part, rows in self._parts.items()}
 
 
-def _beside_the_goals(network: Network, agent: str) -> Iterator[str]:
+def _terms_beside_goals(network: Network, agent: str) -> Iterator[str]:
     """Yield what the local reward of ``agent`` contains besides that of its model, and how to be rid of it."""
-    tracked = network.objective.tracked
-    if agent in tracked:
+    if agent in network.objective.tracked:
         yield "the distance to its set-point (leave out its set_point and its place in objective.tracked)"
-    elif not tracked and network.compartments[agent].set_point is not None:
+    elif not network.objective.tracked and network.compartments[agent].set_point is not None:
         yield "the distance to its set-point (leave out its set_point)"
     for service in network.services:
         if agent in service.debtors and service.weight > 0.0:

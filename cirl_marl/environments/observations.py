@@ -34,7 +34,7 @@ class Signals:
         arcs, lines, services = len(network.arcs), len(dynamics.batches.lines), len(network.services)
         parts = spans((nodes, arcs, len(inner.names), len(inner.measure_names), lines, 1, services, nodes + arcs))
         self.nodes, self.flows, self.states, self.measures, self.loads, time, self.levels, self.set_points = parts
-        self.stocks, self.passing = slice(0, len(network.stores)), slice(len(network.stores), nodes)
+        self.stocks, self.throughputs = slice(0, len(network.stores)), slice(len(network.stores), nodes)
         self.quantities, self.time, self.rows = self.loads.stop, time.start, self.set_points.stop
         self.inside = self.quantities > self.flows.stop  # whether there are quantities besides stocks and flows
 
@@ -69,8 +69,8 @@ class ObservationLayout:
         for row, name in enumerate(inner.measure_names, signals.measures.start):
             self._inner[name.split(".")[0]].append(row)
         self._load: dict[str, int] = {line.id: signals.loads.start + i for i, line in enumerate(batches.lines)}
-        self._hidden = {*range(first, signals.states.stop)}.difference(*self._inner.values())
-        self._observed = {**network.node_index, **{name: first + i for i, name in enumerate(inner.names)}}
+        self._unobservable = {*range(first, signals.states.stop)}.difference(*self._inner.values())
+        self._state_rows = {**network.node_index, **{name: first + i for i, name in enumerate(inner.names)}}
         self._network = network
         self._incident = _incident_arcs(network)
         names = list(self._signal_names((*inner.names, *inner.measure_names)))
@@ -80,12 +80,12 @@ class ObservationLayout:
             for debtor in service.debtors:
                 self._debts.setdefault(debtor, []).append(row)
         rows = [list(dict.fromkeys(self._rows(agent, mode))) for agent in agents]
-        self._index: Integers = np.array([row for seen in rows for row in seen], dtype=np.intp)
+        self._index: Integers = np.array([row for of_agent in rows for row in of_agent], dtype=np.intp)
         self.slices = dict(zip(agents, spans(map(len, rows)), strict=True))
         low, high = self._bounds(dynamics)
         by_agent = dict(zip(agents, rows, strict=True))
-        self.spaces = {agent: Box(low[seen], high[seen], dtype=np.float32) for agent, seen in by_agent.items()}
-        self.names = {agent: tuple(names[row] for row in seen) for agent, seen in by_agent.items()}
+        self.spaces = {a: Box(low[entries], high[entries], dtype=np.float32) for a, entries in by_agent.items()}
+        self.names = {agent: tuple(names[row] for row in entries) for agent, entries in by_agent.items()}
         self.array_order = self._common_order(agents, mode)
         scales = np.array([c.scale for c in network.compartments.values()])
         inside = np.ones(signals.loads.start - signals.states.start)
@@ -113,7 +113,7 @@ class ObservationLayout:
     def _common_order(self, agents: Sequence[str], mode: str) -> tuple[str, ...]:
         if mode == "stocks":
             return self._network.observation.nodes
-        if mode == "model" and len(agents) == 1 and self._observed.keys() >= set(self.names[agents[0]]):
+        if mode == "model" and len(agents) == 1 and self._state_rows.keys() >= set(self.names[agents[0]]):
             return self.names[agents[0]]
         return ()
 
@@ -127,19 +127,19 @@ class ObservationLayout:
     def _rows(self, agent: str, mode: str) -> Iterator[int]:
         network, signals = self._network, self.signals
         if mode == "stocks":
-            yield from (self._observed[name] for name in network.observation.nodes)
+            yield from (self._state_rows[name] for name in network.observation.nodes)
             return
         if mode == "model":
             yield from self._inner[agent]
             return
         compartment = network.compartments[agent]
-        own = self._position[agent]
-        yield own
+        position = self._position[agent]
+        yield position
         yield from self._inner.get(agent, ())
         if agent in self._load:
             yield self._load[agent]
         if not isinstance(compartment, Arc):
-            arcs, neighbours = self._incident[own], self._across(own)
+            arcs, neighbours = self._incident[position], self._across(position)
         else:
             ends = [network.node_index[compartment.donor], network.node_index[compartment.recipient]]
             yield from ends
@@ -150,9 +150,9 @@ class ObservationLayout:
         if mode == "neighbours":
             yield from neighbours
         if mode == "full":
-            yield from (row for row in range(signals.quantities) if row not in self._hidden)
+            yield from (row for row in range(signals.quantities) if row not in self._unobservable)
         if compartment.set_point is not None:
-            yield signals.set_points.start + own
+            yield signals.set_points.start + position
         if mode == "full":
             yield from range(signals.levels.start, signals.levels.stop)
         yield from self._debts.get(agent, [])
@@ -179,8 +179,8 @@ class ObservationLayout:
         compartments = network.compartments.values()
         scales = np.array([c.scale for c in compartments])
         low, high = np.zeros(signals.rows), np.ones(signals.rows)
-        known = signals.flows.stop
-        low[:known], high[:known] = -np.inf, np.inf
+        conserved = slice(0, signals.flows.stop)
+        low[conserved], high[conserved] = -np.inf, np.inf
         if dynamics.physical:
             mass = network.initial[1].sum()
             drive = np.where(dynamics.driver == dynamics.rows.unit, 1.0, mass)
@@ -192,10 +192,11 @@ class ObservationLayout:
             routing = dynamics.routing
             through = routing.most(flows)
             flows[routing.arcs] = through.take(routing.donors) * dynamics.max_rate[routing.arcs]
-            passed, flows = through[: len(network.nodes) - signals.passing.start], flows[: len(network.arcs)]
-            limits = np.concatenate([np.full(signals.passing.start, mass), passed, flows]) / scales
-            low[:known], high[:known] = 0.0, limits * (1 + 1e-6) + 1e-6
-        low[known : signals.quantities], high[known : signals.quantities] = -np.inf, np.inf
+            stores = signals.throughputs.start
+            through, flows = through[: len(network.nodes) - stores], flows[: len(network.arcs)]
+            limits = np.concatenate([np.full(stores, mass), through, flows]) / scales
+            low[conserved], high[conserved] = 0.0, limits * (1 + 1e-6) + 1e-6
+        low[conserved.stop : signals.quantities], high[conserved.stop : signals.quantities] = -np.inf, np.inf
         low[signals.loads] = 0.0
         set_points = np.abs([c.set_point or 0.0 for c in compartments]) / scales
         low[signals.set_points], high[signals.set_points] = -set_points - 1, set_points + 1

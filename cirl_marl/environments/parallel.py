@@ -14,30 +14,29 @@ from pettingzoo.utils import conversions
 
 from cirl_marl.environments.actuators import wrong_shape
 from cirl_marl.environments.state import Outcome, Snapshot
-from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
+from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv, Observations
 from cirl_marl.errors import CirlError, ControlError, unknown
 from cirl_marl.network import Floats, Network
 
 RENDER_MODES = ("rgb_array", "human")
-_Seen = dict[str, NDArray[np.float32]]
+METADATA: dict[str, Any] = {"name": "cirl_marl", "render_modes": [*RENDER_MODES], "render_fps": 10}
 OPTIONS = ("observe", "circularity", "circularity_weight", "horizon", "uncertain")
 
 
-def check_options(options: Iterable[str], known: Sequence[str], *named: str) -> None:
-    """Refuse options that are not ``known``; ``named`` are those that are arguments of their own."""
+def check_options(options: Iterable[str], choices: Sequence[str], *arguments: str) -> None:
+    """Refuse options that are not among the ``choices``; ``arguments`` are those that have a place of their own."""
     for option in options:
-        if option not in known:
-            raise CirlError(unknown("option", option, (*known, *named)))
+        if option not in choices:
+            raise CirlError(unknown("option", option, (*choices, *arguments)))
 
 
 class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):  # type: ignore[misc]
     """One copy of a material network whose compartments are PettingZoo agents.
 
     Each agent has its own Box(−1, 1) action and its own float32 observation; ``observation_names[agent]`` says what
-    each entry is. Episodes end by truncation at the horizon. ``infos[agent]`` carries ``circularity`` (λ at the end of
-    the step, mass), ``local_reward``, ``flows`` (mean flows in the order of ``network.arcs``, mass/time) and
-    ``service_level``; for an agent whose model has a criterion of success also ``success``; and with ``uncertain`` what
-    was ``drawn``, factors in the order of ``network.uncertain``.
+    each entry is. Episodes end by truncation at the horizon. ``infos[agent]`` has the keys of
+    ``MultiAgentVectorEnv.team_info``, as numbers of this copy, ``local_reward`` and, if the agent's model has a
+    criterion, ``success``.
 
     Attributes:
         network: the network under the chosen scenario.
@@ -47,12 +46,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         batch: the same environment for those who want arrays, with a single copy.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (PettingZoo declares it so)
-        "name": "cirl_marl",
-        "render_modes": list(RENDER_MODES),
-        "render_fps": 10,
-        "is_parallelizable": True,
-    }
+    metadata: dict[str, Any] = {**METADATA, "is_parallelizable": True}  # noqa: RUF012 (PettingZoo declares it so)
 
     def __init__(
         self,
@@ -72,6 +66,7 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             network, num_envs=1, scenario=scenario, agents=agents, reward=reward, **options
         )
         self.network = self.batch.network
+        self.metadata = {**self.metadata, "name": str(self.batch)}
         if not self.batch.agents:
             raise CirlError(f"network '{self.network.name}': no compartment has a control, so nothing can act")
         self.layout = self.batch.layout
@@ -99,18 +94,21 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         """The action of each agent that leaves it neutral in the coming interval."""
         return {agent: action[0].astype(np.float32) for agent, action in self.batch.neutral_action.items()}
 
-    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[_Seen, Infos]:
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start an episode; ``options={"initial_state": {node: stock}}`` starts it from a given state."""
-        observation = self.batch.reset(seed, options)
+        if seed is not None and not isinstance(seed, int | np.integer):
+            raise ControlError(f"seed {seed!r} must be a non-negative integer")
+        observations = self.batch.reset(seed, options)
         self.agents = list(self.possible_agents)
         if self.render_mode == "human":
             self.render()
-        infos: Infos = {agent: self._drawn() for agent in self.agents}
-        return {agent: seen[0] for agent, seen in observation.items()}, infos
+        factors = self.batch.physical.factors_if_any
+        infos: Infos = {agent: {} if factors is None else {"drawn": factors[:, 0]} for agent in self.agents}
+        return first_copy(observations), infos
 
     def step(
         self, actions: Mapping[str, ArrayLike]
-    ) -> tuple[_Seen, dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+    ) -> tuple[Observations, dict[str, float], dict[str, bool], dict[str, bool], Infos]:
         """Hold one action per agent, each in its Box(−1, 1), for one control interval.
 
         Raises:
@@ -120,21 +118,24 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
             if actions:
                 raise ControlError("no episode is running: call reset()")
             return {}, {}, {}, {}, {}
-        agents = self.possible_agents
-        outcome = self.batch.advance(self._stack(actions))
-        truncated = bool(outcome.truncated[0])
-        if truncated:
+        agents, outcome = self.possible_agents, self.advance(self._stack(actions))
+        observation, slices = outcome.observation[:, 0], self.layout.slices
+        return (
+            {agent: observation[slices[agent]] for agent in agents},
+            dict(zip(agents, outcome.reward[:, 0].tolist(), strict=True)),
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, bool(outcome.truncated[0])),
+            self._infos(outcome),
+        )
+
+    def advance(self, actions: Floats) -> Outcome:
+        """Hold the actions of all agents one after the other, shape (entries, 1); see ``MultiAgentVectorEnv``."""
+        outcome = self.batch.advance(actions)
+        if outcome.truncated[0]:
             self.agents = []
         if self.render_mode == "human":
             self.render()
-        seen, slices = outcome.observation[:, 0], self.layout.slices
-        return (
-            {agent: seen[slices[agent]] for agent in agents},
-            dict(zip(agents, outcome.reward[:, 0].tolist(), strict=True)),
-            dict.fromkeys(agents, False),
-            dict.fromkeys(agents, truncated),
-            self._infos(outcome),
-        )
+        return outcome
 
     def state(self) -> Floats:
         """Return the whole physical state: every stock in mass units, then the elapsed share of the episode."""
@@ -149,12 +150,12 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         """Return a copy of the whole environment state, random streams included."""
         return self.batch.snapshot()
 
-    def restore(self, snapshot: Snapshot) -> _Seen:
+    def restore(self, snapshot: Snapshot) -> Observations:
         """Go back to a snapshot and return the observations there."""
-        observation = self.batch.restore(snapshot)
+        observations: Observations = first_copy(self.batch.restore(snapshot))
         over = int(self.batch.physical.step[0]) >= self.network.episode.horizon
         self.agents = [] if over else list(self.possible_agents)
-        return {agent: seen[0] for agent, seen in observation.items()}
+        return observations
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the digraph with its stocks and flows: an image (height, width, 3), or a window for ``human``.
@@ -185,40 +186,39 @@ class NetworkParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float3
         if not isinstance(actions, Mapping):
             raise ControlError(f"actions must be a mapping agent → action, not {actions!r}")
         try:
-            stacked = np.array([actions[agent] for agent in self.possible_agents])
+            joint = np.array([actions[agent] for agent in self.possible_agents])
         except (KeyError, ValueError):
-            stacked = np.empty(0)
-        fits = stacked.shape == (self._entries, 1) and len(actions) == len(self.possible_agents)
-        if not fits or stacked.dtype.kind not in "biuf":
-            return self.batch.stack({agent: self._checked(agent, action)[None] for agent, action in actions.items()})
-        return stacked
+            joint = np.empty(0)
+        fits = joint.shape == (self._entries, 1) and len(actions) == len(self.possible_agents)
+        if not fits or joint.dtype.kind not in "biuf":
+            return self.batch.stack({agent: self._as_row(agent, action) for agent, action in actions.items()})
+        return joint
 
-    def _checked(self, agent: str, action: ArrayLike) -> NDArray[Any]:
+    def _as_row(self, agent: str, action: ArrayLike) -> NDArray[Any]:
         """Refuse an action of the wrong shape; the batch would say it with an axis that is not the user's."""
-        found, space = np.asarray(action), self.batch.action_spaces.get(agent)
-        if space is not None and found.shape != space.shape:
-            raise ControlError(wrong_shape(agent, found.shape, space.shape))
-        return found
+        row, space = np.asarray(action), self.batch.action_spaces.get(agent)
+        if space is not None and row.shape != space.shape:
+            raise ControlError(wrong_shape(agent, row.shape, space.shape))
+        return row[None]
 
     def _infos(self, outcome: Outcome) -> Infos:
-        circularity, service = float(outcome.circularity[0]), float(outcome.service_level[0])
-        flows = outcome.flow[:, 0]
-        infos: Infos = {
-            agent: {"circularity": circularity, "local_reward": local, "flows": flows, "service_level": service}
-            for agent, local in zip(self.possible_agents, outcome.local[:, 0].tolist(), strict=True)
-        }
-        for agent, success in outcome.success.items():
-            if agent in infos:
-                infos[agent]["success"] = bool(success[0])
-        if (year := self.batch.year) is not None:
-            for info in infos.values():
-                info["year"] = float(year[0])
-        return {agent: info | self._drawn() for agent, info in infos.items()}
+        team, local = first_copy(self.batch.team_info(outcome)), outcome.local[:, 0].tolist()
+        infos: Infos = {a: {**team, "local_reward": r} for a, r in zip(self.possible_agents, local, strict=True)}
+        for agent in outcome.success.keys() & infos.keys():
+            infos[agent]["success"] = bool(outcome.success[agent][0])
+        return infos
 
-    def _drawn(self) -> dict[str, Any]:
-        """Return what was drawn, for an info; nothing if nothing is uncertain."""
-        drawn = self.batch.physical.drawn
-        return {} if drawn is None else {"drawn": drawn[:, 0]}
+
+def first_copy(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what arrays with a leading axis for copies hold of the first: numbers, and arrays of one axis less.
+
+    >>> first_copy({"cost": np.array([0.5, 0.0]), "flows": np.array([[1.0, 2.0], [3.0, 4.0]])})
+    {'cost': 0.5, 'flows': array([1., 2.])}
+    """
+    return {
+        key: first_copy(value) if isinstance(value, dict) else value[0] if value.ndim > 1 else value[0].item()
+        for key, value in batch.items()
+    }
 
 
 def parallel_env(network: str | Path | Network, **options: Any) -> NetworkParallelEnv:

@@ -1,28 +1,45 @@
-"""Gymnasium ids of the paper's environments."""
+"""Every environment under its versioned id in Gymnasium's registry: all networks and scenarios, and those of the paper.
+
+Gymnasium 1.x loads no plug-ins, so that ``import cirl_marl`` registers, or ``gymnasium.make("cirl_marl:ID")``.
+"""
 
 from __future__ import annotations
 
-import gymnasium
+from gymnasium.envs.registration import register as register_with_gymnasium
+from gymnasium.envs.registration import registry
+
+from cirl_marl.definitions.ids import ids, network_and_scenario
 
 PAPER_ENVIRONMENTS = {
-    "cirl_marl/CopperNet-v0": ("copper_net", "use_to_collection", "paper"),
-    "cirl_marl/CarboNet-v0": ("carbo_net", "urban_to_capture", "paper"),
-    "cirl_marl/TransportTruck-v0": ("solids_net", "truck", "paper_truck"),
-    "cirl_marl/Incinerator-v0": ("solids_net", "incinerator", "paper_incinerator"),
-    "cirl_marl/Reacher-v0": ("solids_net", "sorter", "paper_reacher"),
-    "cirl_marl/FetchWasteSorting-v0": ("solids_net", "sorter", "paper_fetch"),
-    "cirl_marl/CO2MicroalgaeMonod-v0": ("net_zero", "microalgae", "paper_monod"),
-    "cirl_marl/CO2MicroalgaeDroop-v0": ("net_zero", "microalgae", "paper_droop"),
+    "CopperNet": ("copper_net", "use_to_collection", "paper"),
+    "CarboNet": ("carbo_net", "urban_to_capture", "paper"),
+    "TransportTruck": ("solids_net", "truck", "paper_truck"),
+    "Incinerator": ("solids_net", "incinerator", "paper_incinerator"),
+    "Reacher": ("solids_net", "sorter", "paper_reacher"),
+    "FetchWasteSorting": ("solids_net", "sorter", "paper_fetch"),
+    "CO2MicroalgaeMonod": ("net_zero", "microalgae", "paper_monod"),
+    "CO2MicroalgaeDroop": ("net_zero", "microalgae", "paper_droop"),
 }
-"""Gymnasium id → (network, agent, scenario)."""
-GOAL_TASKS = ("cirl_marl/FetchWasteSorting-v0",)
-"""Ids whose observations are dictionaries with goals, as hindsight needs them."""
+"""Name → (network, agent, scenario) of the environments of the paper, in which one agent acts."""
+FOLDER = "cirl_marl.environments"
+GOAL_TASKS = ("FetchWasteSorting",)
+"""Names of those whose observations are dictionaries with goals, as hindsight needs them."""
 
 
 def register() -> None:
-    """Register every id once; called when ``cirl_marl`` is imported."""
-    for id_, (network, agent, scenario) in PAPER_ENVIRONMENTS.items():
-        if id_ not in gymnasium.registry:
-            kind = "goal:GoalEnv" if id_ in GOAL_TASKS else "single:SingleAgentEnv"
-            arguments = {"network": network, "agent": agent, "scenario": scenario}
-            gymnasium.register(id_, entry_point=f"cirl_marl.environments.{kind}", kwargs=arguments)
+    """Register every id that is not registered yet; called when ``cirl_marl`` is imported."""
+    for name, id_ in ids().items():
+        if id_ in registry:
+            continue
+        if name in PAPER_ENVIRONMENTS:
+            kind = "goal:GoalEnv" if name in GOAL_TASKS else "single:SingleAgentEnv"
+            arguments = dict(zip(("network", "agent", "scenario"), PAPER_ENVIRONMENTS[name], strict=True))
+            register_with_gymnasium(id_, f"{FOLDER}.{kind}", kwargs=arguments)
+        else:
+            network, scenario = network_and_scenario(id_)
+            register_with_gymnasium(
+                id_,
+                f"{FOLDER}.joint:JointEnv",
+                vector_entry_point=f"{FOLDER}.joint:JointVectorEnv",
+                kwargs={"network": network, "scenario": scenario},
+            )

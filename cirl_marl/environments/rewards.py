@@ -64,9 +64,9 @@ class Credit:
         network = self._dynamics.network
         if transition.batch_mass is None:
             return network.circularity(transition.flow), network.circularity(flow), state.batched
-        during = state.batched + transition.batch_mass[0]
-        after = during + transition.batch_mass[1]
-        return network.circularity(transition.flow, after), network.circularity(flow, during), after
+        at_start = state.batched + transition.batch_mass[0]
+        at_end = at_start + transition.batch_mass[1]
+        return network.circularity(transition.flow, at_end), network.circularity(flow, at_start), at_end
 
     def pay(
         self, end: Floats, mean: Floats, local: Floats, terms: Floats, levels: Floats, state: State, controls: Floats
@@ -83,16 +83,16 @@ class Credit:
             return local.copy()
         if self.mode == "local_sum":
             return self._same_for_all(self._scoring.local_sum(terms))
-        paid = end if self._measure == "end" else mean
+        credit = end if self._measure == "end" else mean
         if self.mode in ("difference", "mixed_difference"):
-            paid = paid - self._counterfactuals(state, controls)
+            credit = credit - self._counterfactuals(state, controls)
         if self.mode in ("mixed", "mixed_difference"):
-            mixed: Floats = local * self._rest
-            mixed += paid * self._per_mass
-            return mixed
+            reward: Floats = local * self._rest
+            reward += credit * self._per_mass
+            return reward
         if self.mode == "team":
-            paid = paid * self._per_mass - self._rest * self._scoring.shortfall(levels)
-        return paid if self.mode == "difference" else self._same_for_all(paid)
+            credit = credit * self._per_mass - self._rest * self._scoring.shortfall(levels)
+        return credit if self.mode == "difference" else self._same_for_all(credit)
 
     def _same_for_all(self, reward: Floats) -> Floats:
         return np.repeat(reward[None], len(self._agents), axis=0)
@@ -107,29 +107,25 @@ class Credit:
     def _with_neutral(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
         """λ had each of ``agents`` in turn been neutral, all in one batch, shape (agents, B); errors name the agent."""
         try:
-            return self._imagined(agents, state, controls)
+            return self._simulate_neutral(agents, state, controls)
         except CirlError as error:
             if len(agents) == 1:
                 raise CirlError(f"with agent '{agents[0]}' neutral, for difference rewards: {error}") from error
         return np.concatenate([self._with_neutral([agent], state, controls) for agent in agents])
 
-    def _imagined(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
+    def _simulate_neutral(self, agents: Sequence[str], state: State, controls: Floats) -> Floats:
+        # column i·B + b is copy b in which agent i is neutral
         dynamics, count, batch = self._dynamics, len(agents), controls.shape[1]
-        imagined, neutral = np.tile(controls, (1, count)), dynamics.neutral_in(state.step)
+        counterfactual, neutral = np.tile(controls, (1, count)), dynamics.neutral_in(state.step)
         idle = np.repeat(self._supply.idle(self._agents), count * batch, axis=1)
         for i, agent in enumerate(agents):
             rows, columns = dynamics.network.control_rows[agent], slice(i * batch, (i + 1) * batch)
-            imagined[rows, columns] = neutral[rows]
+            counterfactual[rows, columns] = neutral[rows]
             idle[[arc == agent for arc in self._supply.arcs], columns] = True
-        stock, inner, step = (
-            np.tile(state.stock, (1, count)),
-            np.tile(state.inner, (1, count)),
-            np.tile(state.step, count),
-        )
-        drawn = None if state.drawn is None else np.tile(state.drawn, (1, count))
-        held = self._supply(stock, inner, imagined, step, idle, drawn)
-        transition = dynamics.advance(stock, inner, held, step, drawn)
-        imagined_state = replace(state, batched=np.tile(state.batched, (1, count)))
+        stock, inner, step = np.tile(state.stock, count), np.tile(state.inner, count), np.tile(state.step, count)
+        factors = None if state.factors_if_any is None else np.tile(state.factors, count)
+        counterfactual = self._supply(stock, inner, counterfactual, step, idle, factors)
+        transition = dynamics.advance(stock, inner, counterfactual, step, factors)
         flow = transition.moved_mass / dynamics.network.episode.control_interval
-        end, mean, _ = self.circularity(imagined_state, transition, flow)
+        end, mean, _ = self.circularity(replace(state, batched=np.tile(state.batched, count)), transition, flow)
         return (end if self._measure == "end" else mean).reshape(count, batch)

@@ -31,56 +31,57 @@ class Scoring:
         """Compile the scores of ``agents`` and of the network as a whole, for arrays of ``batch`` columns."""
         compartments = list(network.compartments.values())
         position = {c.id: i for i, c in enumerate(compartments)}
-        chosen = network.objective.tracked or [c.id for c in compartments if c.set_point is not None]
-        tracked = [position[c] for c in chosen]
+        tracked_ids = network.objective.tracked or [c.id for c in compartments if c.set_point is not None]
+        with_set_point = [position[c] for c in tracked_ids]
         set_point = np.array([c.set_point or 0.0 for c in compartments])
         inverse_scale = 1.0 / np.array([c.scale for c in compartments])
         self._set_point = np.repeat(set_point[:, None], batch, axis=1)  # equal shapes are faster than a broadcast
         self._inverse_scale = np.repeat(inverse_scale[:, None], batch, axis=1)
         services = network.services
         self._measure = _measurement(network, layout)
-        self._varying = any(isinstance(band, Series) for s in services for band in (s.low, s.high))
-        width = network.episode.horizon if self._varying else 1
+        self._vary_in_time = any(isinstance(band, Series) for s in services for band in (s.low, s.high))
+        width = network.episode.horizon if self._vary_in_time else 1
         bands = [
             np.array([network.interval_means(getattr(s, end))[:width] for s in services]) for end in ("low", "high")
         ]
-        self._low, self._high = (each.reshape(len(services), width) for each in bands)
-        drawn = [numbers_of(network, "services", end) for end in ("low", "high")]
-        self._drawn = [
-            RowFactors({row: numbers[each.id] for row, each in enumerate(services) if each.id in numbers})
-            for numbers in drawn
+        self._low, self._high = (band.reshape(len(services), width) for band in bands)
+        self._factors = [
+            RowFactors({row: numbers[s.id] for row, s in enumerate(services) if s.id in numbers})
+            for numbers in (numbers_of(network, "services", end) for end in ("low", "high"))
         ]
-        self._bounded = bool(np.isfinite(self._high).any())
-        modelled = [position[c.id] for c in compartments if c.model is not None]
+        self._has_high = bool(np.isfinite(self._high).any())
+        with_model = [position[c.id] for c in compartments if c.model is not None]
         count = len(compartments)
-        terms = count + len(services) + len(modelled)
+        terms = count + len(services) + len(with_model)
         debts = [(position[d], count + i, s.weight) for i, s in enumerate(services) for d in s.debtors]
         inner = range(count + len(services), terms)
-        owners = np.array([*tracked, *(owner for owner, _, _ in debts), *modelled], dtype=np.intp)
-        columns = np.array([*tracked, *(term for _, term, _ in debts), *inner], dtype=np.intp)
-        weights = np.array([*[1.0] * len(tracked), *(weight for _, _, weight in debts), *[-1.0] * len(modelled)])
-        self._everyone = RowSum(owners, columns, -weights, (len(compartments), terms))
-        self._agents = self._everyone.select_rows([position[agent] for agent in agents])
-        sums = self._everyone.column_sums()
-        counted = np.flatnonzero(sums)
-        self._all = RowSum(np.zeros(len(counted), dtype=np.intp), counted, sums[counted], (1, terms))
-        every, shape = range(len(services)), (1, len(services))
-        self._weighted_shortfall = RowSum([0] * len(services), every, [s.weight for s in services], shape)
-        self._sum_of_levels = RowSum([0] * len(services), every, 1.0, shape)
+        owners = np.array([*with_set_point, *(owner for owner, _, _ in debts), *with_model], dtype=np.intp)
+        columns = np.array([*with_set_point, *(term for _, term, _ in debts), *inner], dtype=np.intp)
+        weights = np.array(
+            [*[1.0] * len(with_set_point), *(weight for _, _, weight in debts), *[-1.0] * len(with_model)]
+        )
+        self._by_compartment = RowSum(owners, columns, -weights, (len(compartments), terms))
+        self._by_agent = self._by_compartment.select_rows([position[agent] for agent in agents])
+        sums = self._by_compartment.column_sums()
+        nonzero = np.flatnonzero(sums)
+        self._total = RowSum(np.zeros(len(nonzero), dtype=np.intp), nonzero, sums[nonzero], (1, terms))
+        rows, shape = range(len(services)), (1, len(services))
+        self._weighted_shortfall = RowSum([0] * len(services), rows, [s.weight for s in services], shape)
+        self._sum_of_levels = RowSum([0] * len(services), rows, 1.0, shape)
 
     def levels(self, quantities: Floats, step: Integers, factors: Floats | None = None) -> Floats:
         """Return the level of each service in [0, 1], shape (services, B), in the interval ``step`` of each copy.
 
         ``factors`` are those on the uncertain numbers, shape (numbers, B), if any were drawn.
         """
-        measured = self._measure(quantities)
+        quantity = self._measure(quantities)
         low, high = self._low, self._high
-        if self._varying:
+        if self._vary_in_time:
             low, high = low.take(step, axis=1), high.take(step, axis=1)
-        low, high = (scaled(band, factors) for scaled, band in zip(self._drawn, (low, high), strict=True))
-        level: Floats = np.divide(measured, low, out=np.ones_like(measured), where=low > 0)
-        if self._bounded:
-            np.divide(high, measured, out=level, where=measured > high)
+        low, high = (scale(band, factors) for scale, band in zip(self._factors, (low, high), strict=True))
+        level: Floats = np.divide(quantity, low, out=np.ones_like(quantity), where=low > 0)
+        if self._has_high:
+            np.divide(high, quantity, out=level, where=quantity > high)
         np.minimum(level, 1.0, out=level)
         return np.maximum(level, 0.0, out=level)
 
@@ -98,15 +99,15 @@ class Scoring:
 
     def local(self, terms: Floats) -> Floats:
         """Return the local reward of each agent, shape (agents, B)."""
-        return self._agents(terms)
+        return self._by_agent(terms)
 
     def local_of_all(self, terms: Floats) -> Floats:
         """Return the local reward of each compartment, nodes first, shape (nodes + arcs, B)."""
-        return self._everyone(terms)
+        return self._by_compartment(terms)
 
     def local_sum(self, terms: Floats) -> Floats:
         """Return the sum of the local rewards of all compartments, shape (B,)."""
-        total: Floats = self._all(terms)[0]
+        total: Floats = self._total(terms)[0]
         return total
 
     def shortfall(self, levels: Floats) -> Floats:
@@ -128,9 +129,9 @@ def _measurement(network: Network, layout: ObservationLayout) -> RowSum:
     rows, columns = [], []
     for row, service in enumerate(network.services):
         if service.quantity == "outflow":
-            read = [layout.signals.flows.start + int(k) for k in network.service_arcs(service)]
+            quantities = [layout.signals.flows.start + int(k) for k in network.service_arcs(service)]
         else:
-            read = [layout.row(each, service.quantity, service.measure) for each in service.providers]
-        rows += [row] * len(read)
-        columns += read
+            quantities = [layout.row(c, service.quantity, service.measure) for c in service.providers]
+        rows += [row] * len(quantities)
+        columns += quantities
     return RowSum(rows, columns, 1.0, (len(network.services), layout.signals.quantities))

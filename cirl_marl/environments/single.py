@@ -11,13 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.parallel import OPTIONS, NetworkParallelEnv, check_options
+from cirl_marl.environments.parallel import METADATA, OPTIONS, NetworkParallelEnv, check_options
 from cirl_marl.environments.state import Snapshot
-from cirl_marl.errors import CirlError, ControlError
+from cirl_marl.errors import CirlError
 from cirl_marl.network import Network
-
-SHARED = ("reward", "render_mode")
-"""What the PettingZoo view takes besides its options, and this one as well."""
 
 
 class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -31,7 +28,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         agent: the compartment that acts.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+    metadata: dict[str, Any] = METADATA
 
     def __init__(
         self,
@@ -60,24 +57,29 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if "agents" in options:
             raise CirlError("a single-agent environment takes agent=, not agents=")
-        check_options(options, (*OPTIONS, *SHARED), "agent", "scenario", "legacy_episode")
+        check_options(options, (*OPTIONS, "reward", "render_mode"), "agent", "scenario", "legacy_episode")
         if not isinstance(agent, str | None):
             raise CirlError(f"agent must be the name of one agent, got {agent!r}")
-        chosen = None if agent is None else [agent]
-        found = load_network(network) if isinstance(network, str | Path) else network
-        scenario = _scenario_of(found, scenario, agent)
-        self.parallel = NetworkParallelEnv(found, scenario=scenario, agents=chosen, **options)
+        definition = load_network(network) if isinstance(network, str | Path) else network
+        name = _scenario_of(definition, scenario, agent)
+        agents = None if agent is None else [agent]
+        self.parallel = NetworkParallelEnv(definition, scenario=name, agents=agents, **options)
         if len(self.parallel.possible_agents) != 1:
-            several = ", ".join(self.parallel.possible_agents)
-            raise CirlError(f"network '{self.network.name}' has several agents: give agent=, one of {several}")
+            choices = ", ".join(self.parallel.possible_agents)
+            raise CirlError(f"network '{self.network.name}' has several agents: give agent=, one of {choices}")
         self.agent = self.parallel.possible_agents[0]
-        self._legacy, self._elapsed = legacy_episode, 0
+        self.metadata = self.parallel.metadata
+        self._legacy, self._legacy_steps = legacy_episode, 0
         self.render_mode = self.parallel.render_mode
         self.observation_space = self.parallel.observation_space(self.agent)
         self.action_space = self.parallel.action_space(self.agent)
         self.observation_names = {self.agent: self.parallel.observation_names[self.agent]}
         rows = {name: row for row, name in enumerate(self.parallel.state_names)}
         self._order = np.array([rows[name] for name in self.parallel.layout.array_order or rows], dtype=np.intp)
+
+    def __str__(self) -> str:
+        """Return the name of the network and its scenario."""
+        return str(self.parallel)
 
     @property
     def network(self) -> Network:
@@ -88,19 +90,17 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode; ``options={"initial_state": …}`` takes a mapping or, in the paper scenarios, an array."""
-        if seed is not None and not isinstance(seed, int | np.integer):
-            raise ControlError(f"seed {seed!r} must be a non-negative integer")
         observations, infos = self.parallel.reset(seed=seed, options=options)
         super().reset(seed=None if seed is None else int(seed))
         return observations[self.agent], {**infos[self.agent], "state": self._paper_state()}
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Hold the action, shape (1,) in [−1, 1], for one control interval."""
-        over = self._legacy and self._elapsed >= self.network.episode.horizon
+        over = self._legacy and self._legacy_steps >= self.network.episode.horizon
         if over:
             self.parallel.reset()
-            self._elapsed = 0
-        self._elapsed += 1
+            self._legacy_steps = 0
+        self._legacy_steps += 1
         observations, rewards, terminations, truncations, infos = self.parallel.step({self.agent: action})
         info = {**infos[self.agent], "state": self._paper_state()}
         agent, truncated = self.agent, truncations[self.agent] and not self._legacy
@@ -108,12 +108,12 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the whole environment state, random streams included."""
-        return replace(self.parallel.snapshot(), elapsed=self._elapsed)
+        return replace(self.parallel.snapshot(), legacy_steps=self._legacy_steps)
 
     def restore(self, snapshot: Snapshot) -> NDArray[np.float32]:
         """Go back to a snapshot and return the observation there."""
         observations = self.parallel.restore(snapshot)
-        self._elapsed = snapshot.elapsed
+        self._legacy_steps = snapshot.legacy_steps
         return observations[self.agent]
 
     def render(self) -> Any:
@@ -132,11 +132,11 @@ def _scenario_of(network: Network, scenario: str | None, agent: str | None) -> s
     """Return ``scenario`` or, if there is none of that name, the ``scenario_…`` in which ``agent`` alone acts."""
     if scenario is None or scenario == network.scenario_name or scenario in network.scenarios:
         return scenario
-    alone = [name for name, other in network.scenarios.items() if other.default_agents == (agent,)]
-    fitting = [name for name in alone if name.startswith(f"{scenario}_")]
-    if len(fitting) > 1:
-        raise CirlError(f"network '{network.name}': '{agent}' has scenarios {', '.join(fitting)}: give one of them")
-    return fitting[0] if fitting else scenario
+    of_agent = [name for name, variant in network.scenarios.items() if variant.default_agents == (agent,)]
+    names = [name for name in of_agent if name.startswith(f"{scenario}_")]
+    if len(names) > 1:
+        raise CirlError(f"network '{network.name}': '{agent}' has scenarios {', '.join(names)}: give one of them")
+    return names[0] if names else scenario
 
 
 def single_agent_env(network: str | Path | Network, agent: str | None = None, **options: Any) -> SingleAgentEnv:

@@ -43,65 +43,65 @@ class Starts:
         self._array_order = () if inseparable & set(order) else tuple(order)
         self._physical, self._stocks, self._inner = dynamics.physical, rows.nodes.stop, inner
         stores = len(network.stores)
-        self._drawn = np.concatenate([np.arange(stores), self._stocks + inner.range_rows])
-        self._own = np.setdiff1d(np.arange(self._stocks, len(self.names)), self._drawn)
+        self._uniform = np.concatenate([np.arange(stores), self._stocks + inner.range_rows])
+        self._of_models = np.setdiff1d(np.arange(self._stocks, len(self.names)), self._uniform)
         self._spreads = tuple(network.uncertain.values())
         self._low = np.concatenate([network.initial[0], inner.low])
         self._width = np.concatenate([network.initial[1], inner.high]) - self._low
 
     def begin(self, seed: int | Sequence[int] | None, options: Mapping[str, Any] | None) -> Floats:
         """Return the state in which every copy starts, shape (rows, B); see ``MultiAgentVectorEnv.reset``."""
-        streams = self.streams if seed is None else self._seeded(seed)
-        given = self._given({} if options is None else options)
+        streams = self.streams if seed is None else self._new_streams(seed)
+        initial_state = self._initial_state({} if options is None else options)
         self.streams = streams  # not before, so that what is refused changes nothing
-        drawn = self.draw(range(len(streams)))
+        start = self.draw(range(len(streams)))
         for rows in self._stages.values():
-            if any(self.names[row] in given for row in rows):
-                drawn[rows] = 0.0  # stages that are not given are empty
-        for name, values in given.items():
+            if any(self.names[row] in initial_state for row in rows):
+                start[rows] = 0.0  # stages that are not given are empty
+        for name, values in initial_state.items():
             spread_ = self._spread.get(name)
-            drawn[self._rows[name]] = values if spread_ is None else spread_[:, None] * values
-        return drawn
+            start[self._rows[name]] = values if spread_ is None else spread_[:, None] * values
+        return start
 
-    def draw(self, which: Sequence[int] | range | Integers) -> Floats:
-        """Draw initial stocks and inner states of some copies, each from its own stream, shape (rows, len(which)).
+    def draw(self, copies: Sequence[int] | range | Integers) -> Floats:
+        """Draw initial stocks and inner states of some copies, each from its own stream, shape (rows, len(copies)).
 
         Models that draw their own start come first, so that a lone robot starts as it does in its own library.
         """
-        by_copy = np.empty((len(which), len(self._low)))
-        own = np.empty((len(self._own), len(which)))
-        for column, (row, i) in enumerate(zip(by_copy, which, strict=True)):
-            if len(own):
-                own[:, column] = self._inner.start(self.streams[i])
+        by_copy = np.empty((len(copies), len(self._low)))
+        of_models = np.empty((len(self._of_models), len(copies)))
+        for column, (row, i) in enumerate(zip(by_copy, copies, strict=True)):
+            if len(of_models):
+                of_models[:, column] = self._inner.start(self.streams[i])
             self.streams[i].random(out=row)
         uniform = np.ascontiguousarray(by_copy.T)
         uniform *= self._width[:, None]
         uniform += self._low[:, None]
         if len(uniform) == len(self.names):
             return uniform
-        drawn = np.empty((len(self.names), len(which)))
-        drawn[self._drawn], drawn[self._own] = uniform, own
+        start = np.empty((len(self.names), len(copies)))
+        start[self._uniform], start[self._of_models] = uniform, of_models
         for id_, rows in self._stages.items():
-            drawn[rows] = self._spread[id_][:, None] * uniform[self._network.node_index[id_]]
-        return drawn
+            start[rows] = self._spread[id_][:, None] * uniform[self._network.node_index[id_]]
+        return start
 
-    def factors(self, which: Sequence[int] | range | Integers) -> Floats:
-        """Draw factors on the uncertain numbers in some copies, each from its own stream, (numbers, len(which))."""
-        shares = np.array([self.streams[i].random(len(self._spreads)) for i in which])
-        shares = np.ascontiguousarray(shares.reshape(len(which), len(self._spreads)).T)
-        drawn = [age_shares.at(share) for age_shares, share in zip(self._spreads, shares, strict=True)]
-        return np.array(drawn).reshape(shares.shape)
+    def factors(self, copies: Sequence[int] | range | Integers) -> Floats:
+        """Draw factors on the uncertain numbers in some copies, each from its own stream, (numbers, len(copies))."""
+        shares = np.array([self.streams[i].random(len(self._spreads)) for i in copies])
+        shares = np.ascontiguousarray(shares.reshape(len(copies), len(self._spreads)).T)
+        factors = [spread.at(share) for spread, share in zip(self._spreads, shares, strict=True)]
+        return np.array(factors).reshape(shares.shape)
 
     def saved_streams(self) -> tuple[Mapping[str, Any], ...]:
         """Return a copy of the state of every stream."""
         return tuple(copy.deepcopy(dict(stream.bit_generator.state)) for stream in self.streams)
 
-    def restore_streams(self, saved: Sequence[Mapping[str, Any]]) -> None:
+    def restore_streams(self, states: Sequence[Mapping[str, Any]]) -> None:
         """Put every stream back."""
-        for stream, state in zip(self.streams, saved, strict=True):
+        for stream, state in zip(self.streams, states, strict=True):
             stream.bit_generator.state = copy.deepcopy(dict(state))
 
-    def _seeded(self, seed: int | Sequence[int]) -> list[np.random.Generator]:
+    def _new_streams(self, seed: int | Sequence[int]) -> list[np.random.Generator]:
         copies = len(self.streams)
         if isinstance(seed, int | np.integer):
             seeds = [int(seed) + i for i in range(copies)]
@@ -111,52 +111,52 @@ class Starts:
             raise ControlError(f"seed {seed!r} must be a non-negative integer, or {copies} of them")
         return [np.random.default_rng(s) for s in seeds]
 
-    def _given(self, options: Mapping[str, Any]) -> dict[str, Floats]:
+    def _initial_state(self, options: Mapping[str, Any]) -> dict[str, Floats]:
         """Return the given initial stocks and inner states by name."""
         if not isinstance(options, Mapping):
             raise ControlError(f"reset options must be a mapping, not {options!r}")
         for key in options:
             if key not in ("initial_state", "options"):  # PettingZoo's own test passes the key "options"
                 raise ControlError(f"reset options: {unknown('option', key, ['initial_state'])}")
-        given = options.get("initial_state", {})
-        if not isinstance(given, Mapping):
+        state = options.get("initial_state", {})
+        if not isinstance(state, Mapping):
             names = self._array_order
-            values = _numbers("initial_state", given)
+            values = _numbers("initial_state", state)
             if not names or values.shape != (len(names),):
                 raise ControlError(
                     f"initial_state has shape {values.shape}: give a mapping node → stock"
                     + (f", or the values of {', '.join(names)} in this order" if names else "")
                 )
-            given = dict(zip(names, values, strict=True))
-        for id_ in given:
+            state = dict(zip(names, values, strict=True))
+        for id_ in state:
             if id_ not in self._rows:
                 raise ControlError(f"initial_state: {unknown('node or inner state', id_, self._rows)}")
         for id_, rows in self._stages.items():
-            named = [self.names[row] for row in rows if self.names[row] in given]
-            if named and id_ in given:
-                raise ControlError(f"initial_state: '{id_}' and '{named[0]}': give the stock, or its stages, not both")
-        checked = {id_: self._initial(id_, values) for id_, values in given.items()}
+            stages = [self.names[row] for row in rows if self.names[row] in state]
+            if stages and id_ in state:
+                raise ControlError(f"initial_state: '{id_}' and '{stages[0]}': give the stock, or its stages, not both")
+        arrays = {id_: self._initial(id_, values) for id_, values in state.items()}
         for owner, whole in self._wholes.items():
-            named = [name for name in whole if name in given]
-            if named and len(named) < len(whole):
+            part = [name for name in whole if name in state]
+            if part and len(part) < len(whole):
                 raise ControlError(
-                    f"initial_state of '{named[0]}': a start of '{owner}' is the state of its simulator, all "
+                    f"initial_state of '{part[0]}': a start of '{owner}' is the state of its simulator, all "
                     f"{len(whole)} entries together; snapshot() and restore() go back to one"
                 )
-        if self._physical and checked:
-            self._check_mass(checked)
-        return checked
+        if self._physical and arrays:
+            self._check_mass(arrays)
+        return arrays
 
-    def _check_mass(self, given: Mapping[str, Floats]) -> None:
+    def _check_mass(self, initial_state: Mapping[str, Floats]) -> None:
         """Refuse more mass than the observation space covers; stages of which some are not given count as none."""
         network = self._network
         most = dict(zip((node.id for node in network.stores), network.initial[1], strict=True))
-        held = {id_: given.get(id_, stock) for id_, stock in most.items()}
+        stocks = {id_: initial_state.get(id_, stock) for id_, stock in most.items()}
         for id_, rows in self._stages.items():
-            if parts := [given[self.names[row]] for row in rows if self.names[row] in given]:
-                held[id_] = np.sum([np.broadcast_to(part, len(self.streams)) for part in parts], axis=0)
+            if parts := [initial_state[self.names[row]] for row in rows if self.names[row] in initial_state]:
+                stocks[id_] = np.sum([np.broadcast_to(part, len(self.streams)) for part in parts], axis=0)
         limit = float(sum(most.values()))
-        total = float(np.sum([np.broadcast_to(each, len(self.streams)) for each in held.values()], axis=0).max())
+        total = float(np.sum([np.broadcast_to(stock, len(self.streams)) for stock in stocks.values()], axis=0).max())
         if total > limit * (1 + 1e-9):
             raise ControlError(
                 f"initial_state: {total:.6g} {network.mass_unit} in all, but the observation space of '{network.name}' "
@@ -188,17 +188,17 @@ def _bounds(network: Network) -> dict[str, tuple[float, float]]:
 
 def _wholes(network: Network) -> dict[str, tuple[str, ...]]:
     """Return the states that only make sense together: those of models that draw their start, but for their goals."""
-    found = {}
+    wholes = {}
     for owner, compartment in network.compartments.items():
         model = compartment.model
         if isinstance(model, DiscreteTimeModel):
             goals = model.desired_names if isinstance(model, GoalTask) else ()
-            found[owner] = tuple(f"{owner}.{name}" for name in model.state_names if name not in goals)
-    return found
+            wholes[owner] = tuple(f"{owner}.{name}" for name in model.state_names if name not in goals)
+    return wholes
 
 
-def _numbers(what: str, values: ArrayLike) -> Floats:
+def _numbers(label: str, values: ArrayLike) -> Floats:
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
-        raise ControlError(f"{what} is {values!r}; it must hold numbers") from None
+        raise ControlError(f"{label} is {values!r}; it must hold numbers") from None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
 import numpy as np
@@ -30,17 +30,17 @@ class State:
     service: Annotated[Floats, "sum over the episode of the level of each service, shape (services, B)"]
 
     @property
-    def drawn(self) -> Floats | None:
+    def factors_if_any(self) -> Floats | None:
         """The factors, None if none are drawn."""
         return self.factors if len(self.factors) else None
 
-    def copied(self) -> State:
+    def copy(self) -> State:
         """Return the state with arrays of its own."""
-        return replace(self, **{each.name: getattr(self, each.name).copy() for each in fields(self)})
+        return State(*(getattr(self, part.name).copy() for part in fields(self)))
 
-    def renewed(self, ended: NDArray[np.bool_], fresh: State) -> State:
-        """Return the state in which the copies that ``ended``, shape (B,), are those of ``fresh``."""
-        return State(*(np.where(ended, getattr(fresh, each.name), getattr(self, each.name)) for each in fields(self)))
+    def replace(self, copies: NDArray[np.bool_], state: State) -> State:
+        """Return the state in which some ``copies``, shape (B,), are those of another ``state``."""
+        return State(*(np.where(copies, getattr(state, part.name), getattr(self, part.name)) for part in fields(self)))
 
 
 @with_field_docs
@@ -52,17 +52,17 @@ class Snapshot:
     streams: Annotated[tuple[Mapping[str, Any], ...], "state of the random stream of each copy"]
     agents: Annotated[tuple[str, ...], "who acts"]
     network: Annotated[Network, "what it is a snapshot of, under its scenario and horizon"]
-    elapsed: Annotated[int, "the published step counter of a one-agent environment with ``legacy_episode``"] = 0
+    legacy_steps: Annotated[int, "the published step counter of a one-agent environment with ``legacy_episode``"] = 0
 
     def check(self, network: Network, copies: int, agents: tuple[str, ...], *, uncertain: bool) -> None:
         """Raise a ``ControlError`` unless ``copies`` of ``network``, in which ``agents`` act, can go back to this."""
-        drawn = self.state.drawn is not None
-        theirs = _described(self.network, len(self.streams), self.agents, drawn)
-        ours = _described(network, copies, agents, uncertain)
-        if theirs != ours:
-            raise ControlError(f"the snapshot does not fit: it is of {theirs}; this is {ours}")
+        has_factors = self.state.factors_if_any is not None
+        source = _description(self.network, len(self.streams), self.agents, has_factors)
+        target = _description(network, copies, agents, uncertain)
+        if source != target:
+            raise ControlError(f"the snapshot does not fit: it is of {source}; this is {target}")
         if self.network != network:
-            raise ControlError(f"the snapshot does not fit: it is of another definition of {ours}")
+            raise ControlError(f"the snapshot does not fit: it is of another definition of {target}")
 
 
 @with_field_docs
@@ -81,17 +81,8 @@ class Outcome:
     truncated: Annotated[NDArray[np.bool_], "time limit reached, shape (B,)"]
     success: Annotated[Mapping[str, NDArray[np.bool_]], "whether the task of a compartment's model is done, shape (B,)"]
 
-    def infos(self, agents: Sequence[str]) -> dict[str, dict[str, Any]]:
-        """Return λ, local reward, flows (B, arcs) and service level for each agent; success where it is defined."""
-        self.circularity.flags.writeable = self.service_level.flags.writeable = False  # the same for all agents
-        team = {"circularity": self.circularity, "flows": self.flow.T, "service_level": self.service_level}
-        infos = {agent: {**team, "local_reward": local} for agent, local in zip(agents, self.local, strict=True)}
-        for agent in self.success.keys() & infos.keys():
-            infos[agent]["success"] = self.success[agent]
-        return infos
 
-
-def _described(network: Network, copies: int, agents: tuple[str, ...], uncertain: bool) -> str:
+def _description(network: Network, copies: int, agents: tuple[str, ...], uncertain: bool) -> str:
     return (
         f"network '{network.name}', scenario '{network.scenario_name}', {network.episode.horizon} steps, "
         f"{copies} copies, agents {', '.join(agents)}{', uncertain' if uncertain else ''}"

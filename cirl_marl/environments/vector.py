@@ -1,6 +1,6 @@
 """The multi-agent environment of a material network, batched: arrays in and out.
 
-Every other view (PettingZoo, Gymnasium, the seats of the learners) stands on this one.
+Every other view (PettingZoo, Gymnasium, the environments of the learners) stands on this one.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cirl_marl.definitions.catalogue import load_network
+from cirl_marl.definitions.ids import environment_name
 from cirl_marl.dynamics.integrator import Dynamics, Transition
 from cirl_marl.dynamics.supply import Supply
 from cirl_marl.environments.actuators import Actuators
@@ -27,16 +28,30 @@ from cirl_marl.network.calendar import years
 from cirl_marl.network.elements import MOMENTS, REWARDS
 
 Infos = dict[str, dict[str, Any]]
-_Seen = dict[str, NDArray[np.float32]]
-_Flags = dict[str, NDArray[np.bool_]]
+Observations = dict[str, NDArray[np.float32]]
+Flags = dict[str, NDArray[np.bool_]]
 
 
 class MultiAgentVectorEnv:
-    """``num_envs`` independent copies of a material network, stepped together.
+    """``num_envs`` independent copies of a material network, stepped together: a dict of agents, of arrays.
 
-    Observations, rewards and so on are dicts agent → array with leading axis ``num_envs``. A copy whose episode ended
-    starts the next one within the same step; its last observation and state are then in
-    ``infos[agent]["final_observation"]`` and ``["final_state"]``, valid where ``["_final_observation"]`` is true.
+    Observations, rewards and so on are dicts agent → array with leading axis ``num_envs``. ``infos[agent]`` holds what
+    ``team_info`` gives, which is the same for all agents, and
+
+    =============================  ====================================================================================
+    ``local_reward``               the agent's local reward
+    ``success``                    whether the task of its model is done, if the model has a criterion
+    =============================  ====================================================================================
+
+    A copy whose episode ended starts the next one within the same step (Gymnasium's ``AutoresetMode.SAME_STEP``). In
+    such a step ``infos[agent]`` also has these, which are valid where ``_final_obs`` and ``_final_info`` are true:
+
+    =============================  ====================================================================================
+    ``final_obs``                  the last observation of the episode
+    ``final_info``                 the info of its last step, and as ``state`` what ``state()`` was at its end
+    ``episode_circularity``        mean of λ over the episode, mass
+    ``episode_service_level``      mean of the service level over the episode
+    =============================  ====================================================================================
 
     Attributes:
         network: the network under the chosen scenario.
@@ -48,8 +63,7 @@ class MultiAgentVectorEnv:
         action_spaces: by agent; Box(−1, 1), mapped linearly to the bounds of the control.
         rows: which row of the physical state is what.
         supply: the arcs that make up for services.
-        controls: controls that were held in the last interval, in the rows of ``network.control_rows``, shape
-            (controls, num_envs).
+        controls: their values in the last interval, in the rows of ``network.control_rows``, (controls, num_envs).
         state_names: nodes, ``compartment.state`` of the inner states, ``arc.row`` of the masses of batch arcs, in the
             order of ``state()``.
         episodes: episodes begun in each copy, those gone back to included, shape (num_envs,).
@@ -88,43 +102,50 @@ class MultiAgentVectorEnv:
         Raises:
             CirlError: for an unknown network, scenario, agent or option.
         """
-        found = load_network(network) if isinstance(network, str | Path) else network
-        if not isinstance(found, Network):
-            raise CirlError(f"network must be a name of the catalogue, a file or a Network, got {found!r}")
-        found = found.scenario(scenario)
-        for name, value in (("num_envs", num_envs), ("horizon", found.episode.horizon if horizon is None else horizon)):
+        definition = load_network(network) if isinstance(network, str | Path) else network
+        if not isinstance(definition, Network):
+            raise CirlError(f"network must be a name of the catalogue, a file or a Network, got {definition!r}")
+        variant = definition.scenario(scenario)
+        default = variant.episode.horizon
+        for name, value in (("num_envs", num_envs), ("horizon", default if horizon is None else horizon)):
             if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
                 raise CirlError(f"{name} must be a whole number of at least 1, got {value!r}")
         if horizon is not None:
-            found = found.with_options(episode={"horizon": horizon})
+            variant = variant.with_options(episode={"horizon": horizon})
         if circularity_weight is not None:
-            found = found.with_options(objective={"circularity_weight": _share(circularity_weight)})
-        self.network = found
+            variant = variant.with_options(objective={"circularity_weight": _share(circularity_weight)})
+        self.network = variant
         self.num_envs = num_envs
-        self.reward_mode = _choice("reward", found.objective.reward if reward is None else reward, REWARDS)
-        measure = _choice("circularity", circularity, MOMENTS)
-        if uncertain and not found.uncertain:
+        self.reward_mode = _choice("reward", variant.objective.reward if reward is None else reward, REWARDS)
+        moment = _choice("circularity", circularity, MOMENTS)
+        if uncertain and not variant.uncertain:
             remedy = "give a number a deviation or a range, or leave out uncertain"
-            raise CirlError(f"network '{found.name}': nothing is uncertain; {remedy}")
+            raise CirlError(f"network '{variant.name}': nothing is uncertain; {remedy}")
         self.uncertain = uncertain
-        self.dynamics = Dynamics(found, uncertain=uncertain)
+        self.dynamics = Dynamics(variant, uncertain=uncertain)
         self.supply = Supply(self.dynamics)
         self._actuators = Actuators(found, agents, num_envs)
         self.agents = self._actuators.agents
         self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
-        self.scoring = Scoring(found, self.layout, self.agents, num_envs)
+        self.scoring = Scoring(variant, self.layout, self.agents, num_envs)
         self._idle = self.supply.idle(self.agents)
-        self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, measure)
+        self._credit = Credit(self.dynamics, self.supply, self.scoring, self.agents, self.reward_mode, moment)
         self.observation_spaces = self.layout.spaces
         self.observation_names = self.layout.names
-        self._starts = Starts(found, self.dynamics, num_envs, self.layout.array_order)
+        self._starts = Starts(variant, self.dynamics, num_envs, self.layout.array_order)
         self.rows = self.dynamics.rows
         self.state_names = (*self.rows.start_names, *self.rows.batch_names)
         self.episodes: Integers = np.zeros(num_envs, dtype=np.intp)
         self.controls: Floats = np.empty((len(self.dynamics.neutral), num_envs))
         self._state: State | None = None
+        self._services = [service.id for service in variant.services]
+        self._costs = [f"cost_{service}" for service in self._services]
         _keep_freed_memory()
+
+    def __str__(self) -> str:
+        """Return the name of the network and its scenario, as in ids of environments."""
+        return environment_name(self.network)
 
     @property
     def circularity_weight(self) -> float:
@@ -149,24 +170,23 @@ class MultiAgentVectorEnv:
         What an agent supplies to make up for a service depends on what others do in the interval, so that it can be
         told only beside their actions.
         """
-        step, given = self._coming(), {agent: np.asarray(action) for agent, action in actions.items()}
-        every: dict[str, Floats] = self._actuators.neutral_action(step) | given
-        waiting = [arc for arc in self.supply.arcs if arc in self.agents and arc not in given]
-        if waiting and self._state is not None and (self._state.step < self.network.episode.horizon).all():
-            controls = self._actuators.controls(self.stack(every), step)
-            idle = self.supply.idle([agent for agent in self.agents if agent not in waiting])
-            state = self._state
-            found = self.supply(state.stock, state.inner, controls, step, idle, state.drawn)
-            for arc in waiting:
-                every[arc] = self.normalise(arc, found[self.network.control_rows[arc]])
-        return every
+        step, state = self._next_interval(), self._state
+        joint: dict[str, Floats] = self._actuators.neutral_action(step) | {a: np.asarray(x) for a, x in actions.items()}
+        suppliers = [arc for arc in self.supply.arcs if arc in self.agents and arc not in actions]
+        if suppliers and state is not None and (state.step < self.network.episode.horizon).all():
+            controls = self._actuators.controls(self.stack(joint), step)
+            idle = self.supply.idle([agent for agent in self.agents if agent not in suppliers])
+            controls = self.supply(state.stock, state.inner, controls, step, idle, state.factors_if_any)
+            for arc in suppliers:
+                joint[arc] = self.normalise(arc, controls[self.network.control_rows[arc]])
+        return joint
 
     def normalise(self, agent: str, values: Floats) -> Floats:
         """Return the action that comes closest to physical values of an agent's control in the coming interval.
 
         Values have shape (entries of its action, num_envs), actions (num_envs, entries).
         """
-        return self._actuators.normalise(agent, values, self._coming()).T
+        return self._actuators.normalise(agent, values, self._next_interval()).T
 
     @property
     def physical(self) -> State:
@@ -181,7 +201,7 @@ class MultiAgentVectorEnv:
         episode = self.network.episode
         return None if episode.start is None else years(self.network, self.physical.step * episode.control_interval)
 
-    def reset(self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None) -> _Seen:
+    def reset(self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None) -> Observations:
         """Start an episode in every copy and return the observations.
 
         Args:
@@ -199,7 +219,7 @@ class MultiAgentVectorEnv:
         self.episodes = self.episodes + 1
         return self.by_agent(self._observe(self._state))
 
-    def step(self, actions: Mapping[str, ArrayLike]) -> tuple[_Seen, dict[str, Floats], _Flags, _Flags, Infos]:
+    def step(self, actions: Mapping[str, ArrayLike]) -> tuple[Observations, dict[str, Floats], Flags, Flags, Infos]:
         """Hold the actions, agent → array (num_envs, entries of its action) in [−1, 1], for one control interval.
 
         Returned are observations, rewards, terminations, truncations and infos, each by agent.
@@ -208,13 +228,10 @@ class MultiAgentVectorEnv:
             ControlError: for missing or unknown agents, wrong shapes, NaN or values out of bounds.
         """
         outcome = self.advance(self.stack(actions))
-        infos: Infos = outcome.infos(self.agents)
-        if (drawn := self.physical.drawn) is not None:
-            infos = {agent: {**info, "drawn": drawn.T} for agent, info in infos.items()}
-        if (year := self.year) is not None:
-            year.flags.writeable = False  # the same for all agents
-            for info in infos.values():
-                info["year"] = year
+        team = self.team_info(outcome)
+        infos: Infos = {a: {**team, "local_reward": local} for a, local in zip(self.agents, outcome.local, strict=True)}
+        for agent in outcome.success.keys() & infos.keys():
+            infos[agent]["success"] = outcome.success[agent]
         observation = outcome.observation
         if outcome.truncated.any():
             self._report_ends(infos, outcome)
@@ -228,6 +245,40 @@ class MultiAgentVectorEnv:
             dict.fromkeys(self.agents, outcome.truncated),
             infos,
         )
+
+    def team_info(self, outcome: Outcome) -> dict[str, Any]:
+        """Return what infos say to all agents of the interval of ``outcome``, the last one; arrays are read-only.
+
+        =====================  ==================================================================================
+        ``circularity``        λ at the end of the interval, shape (B,), mass
+        ``flows``              mean flows in the order of ``network.arcs``, shape (B, arcs), mass/time
+        ``service_level``      mean level of the services, shape (B,); 1 without services
+        ``service_levels``     level of each service, a dict service → shape (B,)
+        ``cost_SERVICE``       shortfall 1 − level of each service, shape (B,)
+        ``cost``               sum of the shortfalls, shape (B,): what safe reinforcement learning keeps below a budget
+        ``drawn``              with ``uncertain``: factors in the order of ``network.uncertain``, shape (B, numbers)
+        ``year``               calendar year at the end, shape (B,), if the network begins in one
+        =====================  ==================================================================================
+        """
+        levels, shortfalls = outcome.levels, 1.0 - outcome.levels
+        # unlike a sum it adds one service after the other, whatever the number of copies
+        cost = np.add.accumulate(shortfalls)[-1] if len(levels) else np.zeros(self.num_envs)
+        for array in (outcome.circularity, outcome.service_level, levels, shortfalls, cost):
+            array.flags.writeable = False  # the same for all agents
+        info: dict[str, Any] = {
+            "circularity": outcome.circularity,
+            "flows": outcome.flow.T,
+            "service_level": outcome.service_level,
+            "service_levels": dict(zip(self._services, levels, strict=True)),
+            "cost": cost,
+            **dict(zip(self._costs, shortfalls, strict=True)),
+        }
+        if (factors := self.physical.factors_if_any) is not None:
+            info["drawn"] = factors.T
+        if (year := self.year) is not None:
+            year.flags.writeable = False
+            info["year"] = year
+        return info
 
     def stack(self, actions: Mapping[str, ArrayLike]) -> Floats:
         """Stack the actions of all agents, shape (entries, B); the checks of ``step`` apply."""
@@ -249,19 +300,21 @@ class MultiAgentVectorEnv:
         if (state.step >= horizon).any():
             raise ControlError(f"the episode is over after {horizon} steps: call reset()")
         controls = self._actuators.controls(actions, state.step)
-        drawn = state.drawn
-        controls = self.controls = self.supply(state.stock, state.inner, controls, state.step, self._idle, drawn)
-        transition = dynamics.advance(state.stock, state.inner, controls, state.step, drawn)
-        quantities, flow = self._measured(transition, controls)
-        levels = self.scoring.levels(quantities, state.step, drawn)
+        factors = state.factors_if_any
+        controls = self.controls = self.supply(state.stock, state.inner, controls, state.step, self._idle, factors)
+        transition = dynamics.advance(state.stock, state.inner, controls, state.step, factors)
+        quantities, flow = self._measure(transition, controls)
+        levels = self.scoring.levels(quantities, state.step, factors)
         service = self.scoring.service_level(levels)
         terms = self.scoring.terms(quantities, levels, dynamics.inner.rewards(state.inner, transition.inner, controls))
         local = self.scoring.local(terms)
-        circularity, mean, batched = self._credit.circularity(state, transition, flow)
+        circularity, mean, batch_mass = self._credit.circularity(state, transition, flow)
         reward = self._credit.pay(circularity, mean, local, terms, levels, state, controls)
         step = state.step + 1
         measures, totals = quantities[self.layout.signals.measures], (state.circularity + mean, state.service + levels)
-        self._state = State(transition.stock, transition.inner, flow, measures, step, state.factors, batched, *totals)
+        self._state = State(
+            transition.stock, transition.inner, flow, measures, step, state.factors, batch_mass, *totals
+        )
         observation = self.layout.observe(quantities, step / horizon, levels)
         success = dynamics.inner.successes(transition.inner, controls)
         return Outcome(observation, reward, local, circularity, mean, levels, service, flow, step >= horizon, success)
@@ -272,7 +325,7 @@ class MultiAgentVectorEnv:
         done = np.maximum(state.step - 1, 0)  # the interval that the state is scored in
         quantities = self._quantities(state)
         inner = self.dynamics.inner.rewards(state.inner, state.inner, self.dynamics.neutral_in(done))
-        levels = self.scoring.levels(quantities, done, state.drawn)
+        levels = self.scoring.levels(quantities, done, state.factors_if_any)
         rewards = self.scoring.local_of_all(self.scoring.terms(quantities, levels, inner))
         return dict(zip(self.network.compartments, rewards, strict=True))
 
@@ -282,83 +335,88 @@ class MultiAgentVectorEnv:
         time = state.step / self.network.episode.horizon
         return np.concatenate([state.stock[self.rows.nodes], state.inner, state.stock[self.rows.batches], time[None]]).T
 
-    def observations(self) -> _Seen:
+    def observations(self) -> Observations:
         """Return the observations that the agents act on next, equal to what the last reset, step or restore gave."""
         return self.by_agent(self._observe(self.physical))
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the state and the random streams; environments are not changed."""
-        return Snapshot(self.physical.copied(), self._starts.saved_streams(), self.agents, self.network)
+        return Snapshot(self.physical.copy(), self._starts.saved_streams(), self.agents, self.network)
 
-    def restore(self, snapshot: Snapshot) -> _Seen:
+    def restore(self, snapshot: Snapshot) -> Observations:
         """Go back to a snapshot, which must be of the same network, horizon, batch size and agents, and observe."""
         if not isinstance(snapshot, Snapshot):
             raise ControlError(f"a snapshot is needed, as ``snapshot()`` returns it, got {type(snapshot).__name__}")
         snapshot.check(self.network, self.num_envs, self.agents, uncertain=self.uncertain)
         self._starts.restore_streams(snapshot.streams)
-        self._state = snapshot.state.copied()
+        self._state = snapshot.state.copy()
         self.episodes = self.episodes + 1
         return self.by_agent(self._observe(self._state))
 
     def close(self) -> None:
         """Do nothing; the environment holds no resources."""
 
-    def by_agent(self, stacked: NDArray[np.float32]) -> _Seen:
+    def by_agent(self, observation: NDArray[np.float32]) -> Observations:
         """Split a stacked observation, shape (entries of all agents, B), into agent → (B, entries)."""
-        return {agent: stacked[rows].T for agent, rows in self.layout.slices.items()}
+        return {agent: observation[rows].T for agent, rows in self.layout.slices.items()}
 
     def _report_ends(self, infos: Infos, outcome: Outcome) -> None:
-        """Add the final observations and the episode's λ̄ and service level of the copies that ended."""
-        state, ended = self.physical, outcome.truncated
-        steps = np.maximum(state.step, 1)
-        final, whole = self.by_agent(outcome.observation), self.state()
-        service = self.scoring.service_level(state.service / steps)
+        """Add what infos say of the copies whose episode ended."""
+        final, over = self.by_agent(outcome.observation), outcome.truncated
+        figures, state = self.episode_figures(), self.state()
         for agent, info in infos.items():
-            info |= {"final_observation": final[agent], "final_state": whole, "_final_observation": ended}
-            info |= {"episode_circularity": state.circularity / steps, "episode_service_level": service}
+            info |= figures
+            info |= {"final_obs": final[agent], "final_info": {**info, "state": state}}
+            info |= {"_final_obs": over, "_final_info": over}
 
-    def _restart(self, ended: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Start the next episode in the copies that ended and return the observation of all."""
-        self.episodes = self.episodes + ended
-        which = np.flatnonzero(ended)
-        old = self.physical
-        drawn = self.rows.start_of(old.stock, old.inner)
-        drawn[:, which] = self._starts.draw(which)
-        factors = old.factors.copy()
-        factors[:, which] = self._factors(which)
-        self._state = old.renewed(ended, self._fresh(drawn, factors))
+    def episode_figures(self) -> dict[str, Floats]:
+        """Return λ̄ and the mean service level of the episode up to now, shape (B,) each, as infos name them."""
+        state = self.physical
+        steps = np.maximum(state.step, 1)
+        service = self.scoring.service_level(state.service / steps)
+        return {"episode_circularity": state.circularity / steps, "episode_service_level": service}
+
+    def _restart(self, over: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Start the next episode in copies whose last is ``over``, shape (B,), and return the observation of all."""
+        self.episodes = self.episodes + over
+        copies, last = np.flatnonzero(over), self.physical
+        start = self.rows.start_of(last.stock, last.inner)
+        start[:, copies] = self._starts.draw(copies)
+        factors = last.factors.copy()
+        factors[:, copies] = self._factors(copies)
+        self._state = last.replace(over, self._fresh(start, factors))
         return self._observe(self._state)
 
-    def _coming(self) -> Integers:
-        """Return the index of the coming interval in each copy, shape (num_envs,); at the end that of the last."""
+    def _next_interval(self) -> Integers:
+        """Return the index of the next interval in each copy, shape (num_envs,); at the end that of the last."""
         step = np.zeros(self.num_envs, dtype=np.intp) if self._state is None else self._state.step
         return np.minimum(step, self.network.episode.horizon - 1)
 
-    def _factors(self, which: range | Integers) -> Floats:
+    def _factors(self, copies: range | Integers) -> Floats:
         """Draw factors on the uncertain numbers in some copies; no rows if none are to be drawn."""
-        return self._starts.factors(which) if self.uncertain else np.empty((0, len(which)))
+        return self._starts.factors(copies) if self.uncertain else np.empty((0, len(copies)))
 
     def _fresh(self, start: Floats, factors: Floats) -> State:
         """State at the start of an episode; flows and measures are those that neutral control would give."""
         dynamics, batch = self.dynamics, start.shape[1]
         stocks, inner = self.rows.split(start)
-        drawn = factors if self.uncertain else None
+        scales = factors if self.uncertain else None
         stock, step = dynamics.extend(stocks), np.zeros(batch, dtype=np.intp)
-        every = np.ones((len(self.supply.arcs), 1), dtype=bool)
-        neutral = self.supply(stock, inner, dynamics.neutral_in(step), step, every, drawn)
-        flow, measures = dynamics.start_flow(stock, inner, neutral, drawn), dynamics.inner.measures(inner, neutral)
+        idle = np.ones((len(self.supply.arcs), 1), dtype=bool)
+        neutral = self.supply(stock, inner, dynamics.neutral_in(step), step, idle, scales)
+        flow, measures = dynamics.start_flow(stock, inner, neutral, scales), dynamics.inner.measures(inner, neutral)
         sums = (np.zeros(shape) for shape in ((2, batch), (batch,), (len(self.network.services), batch)))
         return State(stock, inner, flow, measures, step, factors, *sums)
 
-    def _measured(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
+    def _measure(self, transition: Transition, controls: Floats) -> tuple[Floats, Floats]:
         """Return all quantities in one array, and the mean flows, which are read-only."""
         signals, dynamics = self.layout.signals, self.dynamics
         quantities = np.empty((signals.quantities, self.num_envs))
         flow = quantities[signals.flows]
         np.divide(transition.moved_mass, self.network.episode.control_interval, out=flow)
         quantities[signals.stocks] = self.rows.stocks(transition.stock)
-        if signals.passing.start < signals.passing.stop:
-            quantities[signals.passing] = self.network.throughput(flow)
+        if signals.throughputs.start < signals.throughputs.stop:
+            quantities[signals.throughputs] = self.network.throughput(flow)
         if signals.inside:
             quantities[signals.states] = transition.inner
             quantities[signals.measures] = dynamics.inner.measures(transition.inner, controls)
@@ -374,7 +432,7 @@ class MultiAgentVectorEnv:
     def _observe(self, state: State) -> NDArray[np.float32]:
         quantities = self._quantities(state)
         time = state.step / self.network.episode.horizon
-        levels = self.scoring.levels(quantities, np.maximum(state.step - 1, 0), state.drawn)
+        levels = self.scoring.levels(quantities, np.maximum(state.step - 1, 0), state.factors_if_any)
         return self.layout.observe(quantities, time, levels)
 
 
@@ -384,9 +442,9 @@ def _share(weight: float) -> float:
     return float(weight)
 
 
-def _choice(what: str, value: str, known: Sequence[str]) -> str:
-    if value not in known:
-        raise CirlError(unknown(what, value, known))
+def _choice(option: str, value: str, choices: Sequence[str]) -> str:
+    if value not in choices:
+        raise CirlError(unknown(option, value, choices))
     return value
 
 

@@ -181,7 +181,7 @@ def compare(
         first_env, done = entered[0].env(episodes), len(entered) * share
         starts, names = starting_stocks(first_env, first), [each.name for each in entered]
         told = part_of(progress, "bounds", done, 1 - done)
-        if (factors := first_env.physical.drawn) is None:
+        if (factors := first_env.physical.factors_if_any) is None:
             measure, proved = _measured(env, starts, names, rollouts, told)
         else:
             measure, proved = _measured_draws(env, starts, factors.T, rollouts, told)

@@ -22,7 +22,7 @@ class JointEnv(Protocol):
     """Several copies of an environment of many agents, all stepped at once; ``MultiAgentVectorEnv`` is one.
 
     What it takes and gives is by agent, with a leading axis of ``num_envs`` entries. An episode that has ended is
-    followed by the next at once; what was seen last is ``final_observation`` in the infos.
+    followed by the next at once; what was seen last is ``final_obs`` in the infos.
     """
 
     num_envs: int
@@ -187,8 +187,8 @@ class AgentVecEnv(VecEnv):
         if not dones.any():
             self.last_step = StepResult(observation, rewards, dones)
             return
-        final_by_agent = {agent: step.infos[agent]["final_observation"] for agent in agents}
-        final = _rows_in_order(self.view.observe(final_by_agent, lambda: step.infos[agents[0]]["final_state"]))
+        final_by_agent = {agent: step.infos[agent]["final_obs"] for agent in agents}
+        final = _rows_in_order(self.view.observe(final_by_agent, lambda: step.infos[agents[0]]["final_info"]["state"]))
         returns, lengths = self.view.score(step.returns), np.concatenate([step.lengths[agent] for agent in rows])
         truncated = np.concatenate([step.truncated[agent] for agent in rows])
         self.last_step = StepResult(observation, rewards, dones, final, returns, lengths, truncated)

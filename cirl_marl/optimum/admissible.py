@@ -352,7 +352,7 @@ def normalised_actions(admissible: Admissible, layout: Layout, plan: Floats, int
     driver = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
     setting = np.clip(_ratio(flow, base * driver * valve[:, network.donors], neutral), *admissible.setting[:, when])
     actuators, steps = admissible.actuators, np.arange(when.start, when.stop)
-    actions = np.zeros((len(steps), len(actuators.acting)))
+    actions = np.zeros((len(steps), len(actuators.control_rows)))
     for agent, entries in actuators.entries.items():
         control = network.compartments[agent].control
         assert control is not None

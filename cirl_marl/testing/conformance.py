@@ -98,9 +98,9 @@ def check_vector_env(make: Callable[[], MultiAgentVectorEnv], *, steps: int = 20
                 require(ends.dtype == np.bool_, f"{where}: {name} have dtype {ends.dtype}, not bool")
             ended = terminations[agent] | truncations[agent]
             if ended.any():
-                final = infos[agent].get("final_observation")
-                require(final is not None, f"{where}: an episode ended without 'final_observation' in infos")
-                _check_rows(first, agent, final, f"{where}, final_observation")
+                final = infos[agent].get("final_obs")
+                require(final is not None, f"{where}: an episode ended without 'final_obs' in infos")
+                _check_rows(first, agent, final, f"{where}, final_obs")
 
 
 class _Actions:

@@ -116,7 +116,7 @@ class Copies:
             self._arrive(i, observations, infos, {name for name in actors if dones[self._place[name], i]})
             if not env.agents:
                 self._begin(i, None)
-        joint_infos = {name: {"final_observation": last[name], "copies": copy_infos[name]} for name in self.agents}
+        joint_infos = {name: {"final_obs": last[name], "copies": copy_infos[name]} for name in self.agents}
         by_agent = [dict(zip(self.agents, each, strict=True)) for each in (rewards, dones & ~truncated, truncated)]
         return dict(self._observations), *by_agent, joint_infos
 
