@@ -124,7 +124,7 @@ class MultiAgentVectorEnv:
         self.uncertain = uncertain
         self.dynamics = Dynamics(variant, uncertain=uncertain)
         self.supply = Supply(self.dynamics)
-        self._actuators = Actuators(found, agents, num_envs)
+        self._actuators = Actuators(variant, agents, num_envs)
         self.agents = self._actuators.agents
         self.action_spaces = self._actuators.spaces
         self.layout = ObservationLayout(self.dynamics, self.agents, observe, num_envs)
