@@ -10,6 +10,7 @@ import typer.main
 from benchmarks.document import write_sections
 from cirl_marl import cli, load_network, recipes
 from cirl_marl.definitions.catalogue import families
+from cirl_marl.definitions.ids import ids
 from cirl_marl.environments.registration import PAPER_ENVIRONMENTS
 from cirl_marl.learners import load_recipe
 from docs.site.markdown import ROOT, table
@@ -41,8 +42,8 @@ def _networks() -> str:
 
 def _environments() -> str:
     rows = (
-        (f"`{id_}`", f"`{agent}`", f"`{network}`", f"`{scenario}`")
-        for id_, (network, agent, scenario) in PAPER_ENVIRONMENTS.items()
+        (f"`{ids()[name]}`", f"`{agent}`", f"`{network}`", f"`{scenario}`")
+        for name, (network, agent, scenario) in PAPER_ENVIRONMENTS.items()
     )
     return table(("Gymnasium id", "agent", "network", "scenario"), rows)
 
