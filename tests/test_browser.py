@@ -218,10 +218,10 @@ def test_groups_points_and_plans(tmp_path: Path, opened: Any) -> None:
     """A world opens on its countries and one unfolds and folds again; a plan is what λ is held against; points."""
     story = page_of_alternatives(simulate_alternatives(world(), controls=["neutral", "random"]))
     points = (PlanePoint("plans", 0.9, -2.0, "first"), PlanePoint("plans", 0.95, -3.0))
-    usual, plan = story.scenes
+    usual, plan = story.episodes
     front = np.array([[0.9, -1.0], [1.0, -1.5]])
     scenes = (replace(usual, figures={"bound": Aggregate(-0.5, -0.6, -0.4)}), replace(plan, name=PLAN))
-    path = write_page(tmp_path / "w.html", replace(story, scenes=scenes, points=points, front=front))
+    path = write_page(tmp_path / "w.html", replace(story, episodes=scenes, points=points, front=front))
     tab = opened(path)
     page = tab.page
     assert page.locator(".box").count() == 6

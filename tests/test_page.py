@@ -162,8 +162,8 @@ def test_the_page_of_a_comparison(tmp_path: Path) -> None:
     """Business as usual comes first; bands are intervals over episodes, flows those of the first; the plan is best."""
     found = compare([], ["random", "neutral"], network=bottles_at(tmp_path, days=4), episodes=3)
     story = page_of_comparison(found)
-    assert [scene.name for scene in story.scenes] == [USUAL, "random"]
-    usual, random = story.scenes
+    assert [scene.name for scene in story.episodes] == [USUAL, "random"]
+    usual, random = story.episodes
     entry = next(each for each in found.entries if each.name == "random")
     assert random.circularity.low is not None and (random.circularity.low < random.circularity.value).any()
     np.testing.assert_allclose(random.circularity.value, entry.rollout.circularity_mean.mean(axis=0))
@@ -174,9 +174,9 @@ def test_the_page_of_a_comparison(tmp_path: Path) -> None:
     assert random.figures["gap"] == found.rows[0].figure("gap") and len(story.front)
     env = next(each.env for each in simulate_alternatives(found.network))
     best = add_plan(page_of_comparison(found, without=["random"]), found, env)
-    assert [scene.name for scene in best.scenes] == [USUAL, PLAN]
+    assert [scene.name for scene in best.episodes] == [USUAL, PLAN]
     assert found.entries[0].bound is not None
-    planned, bound = float(best.scenes[-1].circularity.value.mean()), float(found.entries[0].bound[0])
+    planned, bound = float(best.episodes[-1].circularity.value.mean()), float(found.entries[0].bound[0])
     assert float(entry.circularity[0]) < planned <= bound + 1e-9
     told = page_data(best)
     assert [scene["plan"] for scene in told["scenes"]] == [False, True]
@@ -240,9 +240,9 @@ def test_a_page_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monkey
     before = path.read_text(encoding="utf-8")
     with pytest.raises(CirlError, match="network 'bottles': there is nothing to show, neither episodes nor points"):
         write_page(path, ReportPage("nothing", network))
-    (other,) = page_of_alternatives(simulate_alternatives(network, steps=3)).scenes
+    (other,) = page_of_alternatives(simulate_alternatives(network, steps=3)).episodes
     with pytest.raises(CirlError, match=r"2 intervals of 1 day, '.*' 3 of 1: a page shows them by one clock"):
-        write_page(path, replace(story, scenes=(*story.scenes, other)))
+        write_page(path, replace(story, episodes=(*story.episodes, other)))
 
     def full(self: Path, *_: object) -> None:
         with self.open("w") as file:

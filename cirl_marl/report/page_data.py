@@ -1,4 +1,4 @@
-"""A story as plain values, ready for JSON, which is all that the page in the browser knows."""
+"""A report page as plain values, ready for JSON, which is all that the page in the browser knows."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from cirl_marl.definitions.sources import StatedNumber, stated_numbers
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.drawing.flow_diagram import FlowDiagram, lines
 from cirl_marl.drawing.grouping import flow_diagrams
+from cirl_marl.drawing.layered import RibbonRoute
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.statistics import Aggregate
 from cirl_marl.network import Floats, Network
@@ -27,77 +28,73 @@ from cirl_marl.report.terminal import law_text
 DIGITS = 6
 """Significant digits of every number on the page."""
 SHOWN_VERSIONS = ("cirl-marl", "python", "numpy", "torch")
+Values = dict[str, Any]
 
 
-def page_data(story: ReportPage) -> dict[str, Any]:
-    """Return everything that the page of ``story`` shows.
+def page_data(page: ReportPage) -> Values:
+    """Return everything that ``page`` shows.
 
     Raises:
-        CirlError: if there is nothing to show, or scenes differ in their units or times.
+        CirlError: if there is nothing to show, or episodes differ in their units or times.
         DefinitionError: if the file of a network has changed since it was read.
     """
-    if not story.scenes and not story.points:
-        raise CirlError(f"network '{story.network.name}': there is nothing to show, neither episodes nor points")
+    network = page.network
+    if not page.episodes and not page.points:
+        raise CirlError(f"network '{network.name}': there is nothing to show, neither episodes nor points")
     networks: list[Network] = []
-    for scene in story.scenes:
-        if scene.network not in networks:
-            networks.append(scene.network)
-    found = versions()
+    for episode in page.episodes:
+        if episode.network not in networks:
+            networks.append(episode.network)
+    installed = versions()
     return {
-        "title": story.title,
-        "name": story.network.name,
-        "scenario": story.network.scenario_name,
-        "material": story.network.material,
-        "references": list(story.network.references),
-        "mass": story.network.mass_unit,
-        "time": story.network.time_unit,
-        "interval": story.network.episode.control_interval,
-        "clock": _clock(story.scenes),
-        "networks": [_network(each, story) for each in networks],
-        "scenes": [_scene(each, networks.index(each.network)) for each in story.scenes],
+        "title": page.title,
+        "name": network.name,
+        "scenario": network.scenario_name,
+        "material": network.material,
+        "references": list(network.references),
+        "mass": network.mass_unit,
+        "time": network.time_unit,
+        "interval": network.episode.control_interval,
+        "clock": _clock(page.episodes),
+        "networks": [_network(one, [e for e in page.episodes if e.network == one]) for one in networks],
+        "scenes": [_episode(episode, networks.index(episode.network)) for episode in page.episodes],
         "points": [
-            {
-                "name": each.name,
-                "service": _number(each.service),
-                "lambda": _number(each.circularity),
-                "about": each.about,
-            }
-            for each in story.points
+            {"name": p.name, "service": _number(p.service), "lambda": _number(p.circularity), "about": p.about}
+            for p in page.points
         ],
-        "front": _rows(story.front),
-        "notes": list(story.notes),
-        "reasons": [{"title": heading, "said": list(said)} for heading, said in story.reasons],
+        "front": [_list(row) for row in page.front],
+        "notes": list(page.notes),
+        "reasons": [{"title": heading, "said": list(sentences)} for heading, sentences in page.reasons],
         "made": {
-            "versions": [f"{name} {found[name]}" for name in SHOWN_VERSIONS],
-            "definition": fingerprint(story.network),
+            "versions": [f"{name} {installed[name]}" for name in SHOWN_VERSIONS],
+            "definition": fingerprint(network),
         },
     }
 
 
-def _clock(scenes: Sequence[PageEpisode]) -> dict[str, Any]:
-    """Return when each interval begins and ends, and what it is called; the same for all scenes."""
-    if not scenes:
+def _clock(episodes: Sequence[PageEpisode]) -> Values:
+    """Return when each interval begins and ends, and what it is called; the same for all episodes."""
+    if not episodes:
         return {"from": [], "to": [], "labels": [], "calendar": ""}
-    for scene in scenes[1:]:
-        ours, theirs = scenes[0].network, scene.network
-        if len(scene.flow) != len(scenes[0].flow) or ours.episode.control_interval != theirs.episode.control_interval:
+    first, network = episodes[0], episodes[0].network
+    interval = network.episode.control_interval
+    for episode in episodes[1:]:
+        other = episode.network.episode.control_interval
+        if (len(episode.flow), other) != (len(first.flow), interval):
             raise CirlError(
-                f"'{scenes[0].name}' has {len(scenes[0].flow)} intervals of {ours.episode.control_interval:g} "
-                f"{ours.time_unit}, '{scene.name}' {len(scene.flow)} of {theirs.episode.control_interval:g}: a page "
-                "shows them by one clock; give a number of steps for both, or write two pages"
+                f"'{first.name}' has {len(first.flow)} intervals of {interval:g} {network.time_unit}, '{episode.name}'"
+                f" {len(episode.flow)} of {other:g}: a page shows them by one clock; give a number of steps for both,"
+                " or write two pages"
             )
-    network = scenes[0].network
     ends = interval_ends(network)
-    begins = ends - network.episode.control_interval
-    calendar, dates = labels(network, begins)
-    named = dates[0] if dates else [f"{network.time_unit} {each:.6g}" for each in ends.tolist()]
-    return {"from": _list(begins), "to": _list(ends), "labels": named, "calendar": calendar[0] if calendar else ""}
+    calendar, dates = labels(network, ends - interval)
+    names = dates[0] if dates else [f"{network.time_unit} {time:.6g}" for time in ends.tolist()]
+    return {"from": _list(ends - interval), "to": _list(ends), "labels": names, "calendar": "".join(calendar[:1])}
 
 
-def _network(network: Network, story: ReportPage) -> dict[str, Any]:
-    scenes = [each for each in story.scenes if each.network == network]
-    peaks = np.max([np.abs(np.nan_to_num(each.flow)).max(axis=0) for each in scenes], axis=0)
-    told = stated_numbers(network)
+def _network(network: Network, episodes: Sequence[PageEpisode]) -> Values:
+    peaks = np.max([np.abs(np.nan_to_num(episode.flow)).max(axis=0) for episode in episodes], axis=0)
+    sources = stated_numbers(network)
     nodes = [
         {
             "id": node.id,
@@ -105,7 +102,7 @@ def _network(network: Network, story: ReportPage) -> dict[str, Any]:
             "role": node.role.value,
             "stores": node.stores,
             "scale": _number(node.scale),
-            "told": _told(told["nodes"].get(node.id, ())),
+            "told": _sources(sources["nodes"].get(node.id, ())),
         }
         for node in network.nodes
     ]
@@ -117,128 +114,123 @@ def _network(network: Network, story: ReportPage) -> dict[str, Any]:
             "recipient": int(network.recipients[k]),
             "sign": -int(network.sustainability[k]),
             "law": _law(network, arc),
-            "told": _told(told["arcs"].get(arc.id, ())),
+            "told": _sources(sources["arcs"].get(arc.id, ())),
         }
         for k, arc in enumerate(network.arcs)
     ]
-    services = [_service(network, each, told["services"].get(each.id, ())) for each in network.services]
-    agents = scenes[0].agents
-    low, neutral, high = network.control_bounds
+    ends = dict(zip(("low", "neutral", "high"), network.control_bounds, strict=True))
     controls = [
-        {
-            "agent": each.agent,
-            "name": each.name,
-            "kind": each.kind.value,
-            "of": each.of,
-            "unit": each.unit,
-            "row": each.row,
-            "low": _short(low[each.row]),
-            "neutral": _short(neutral[each.row]),
-            "high": _short(high[each.row]),
-        }
-        for each in settings(network, agents)
+        {"agent": s.agent, "name": s.name, "kind": s.kind.value, "of": s.of, "unit": s.unit, "row": s.row}
+        | {name: _series(values[s.row]) for name, values in ends.items()}
+        for s in settings(network, episodes[0].agents)
     ]
-    drawn = [_sketch(each) for each in flow_diagrams(network, peaks)]
-    return {"nodes": nodes, "arcs": arcs, "services": services, "settings": controls, "sketches": drawn}
+    return {
+        "nodes": nodes,
+        "arcs": arcs,
+        "services": [_service(network, s, sources["services"].get(s.id, ())) for s in network.services],
+        "settings": controls,
+        "sketches": [_diagram(diagram) for diagram in flow_diagrams(network, peaks)],
+    }
 
 
 def _law(network: Network, arc: Arc) -> str:
     return f"Law {arc.law.value}" + ("" if arc.id in network.time_dependent else f": {law_text(network, arc)}")
 
 
-def _service(network: Network, service: Service, told: Iterable[StatedNumber]) -> dict[str, Any]:
-    label = service.title or service.id.replace("_", " ")
-    providers = ", ".join(network.compartments[each].label for each in service.providers)
-    measured = f"{service.measure or service.quantity} of {providers}"
+def _service(network: Network, service: Service, sources: Iterable[StatedNumber]) -> Values:
+    providers = ", ".join(network.compartments[provider].label for provider in service.providers)
     low, high = extremes(service.low)
     return {
-        "id": service.id, "label": label, "measured": measured, "low": _number(low), "high": _number(high),
-        "told": _told(told),
-    }  # fmt: skip
-
-
-def _told(found: Iterable[StatedNumber]) -> list[list[str]]:
-    return [[each.key, each.value, each.source] for each in found]
-
-
-def _scene(scene: PageEpisode, network: int) -> dict[str, Any]:
-    found = scene.network
-    start = np.full(len(found.stores), np.nan) if scene.start is None else scene.start
-    stock = np.concatenate([start[None], scene.stock])
-    levels = [*stock.T, *found.throughput(scene.flow.T)]
-    return {
-        "name": scene.name,
-        "plan": scene.name in (PLAN, "optimum"),
-        "network": network,
-        "scenario": found.scenario_name,
-        "levels": [_list(each) for each in levels],
-        "flows": [_list(each) for each in scene.flow.T],
-        "controls": None if scene.controls is None else [_list(each) for each in scene.controls.T],
-        "lambda": _band(scene.circularity),
-        "services": [_band(each) for each in scene.levels],
-        "about": scene.about,
-        "figures": {name: _aggregate(each) for name, each in scene.figures.items() if each is not None},
+        "id": service.id,
+        "label": service.title or service.id.replace("_", " "),
+        "measured": f"{service.measure or service.quantity} of {providers}",
+        "low": _number(low),
+        "high": _number(high),
+        "told": _sources(sources),
     }
 
 
-def _sketch(drawn: FlowDiagram) -> dict[str, Any]:
-    ways = {
-        way: {
-            "scale": drawn.scales[way],
-            "breadth": _pixels(weave.breadth),
+def _sources(numbers: Iterable[StatedNumber]) -> list[list[str]]:
+    return [[number.key, number.value, number.source] for number in numbers]
+
+
+def _episode(episode: PageEpisode, network: int) -> Values:
+    start = np.full(len(episode.network.stores), np.nan) if episode.start is None else episode.start
+    stocks, throughput = np.concatenate([start[None], episode.stock]).T, episode.network.throughput(episode.flow.T)
+    return {
+        "name": episode.name,
+        "plan": episode.name in (PLAN, "optimum"),
+        "network": network,
+        "scenario": episode.network.scenario_name,
+        "levels": [_list(row) for row in (*stocks, *throughput)],
+        "flows": [_list(row) for row in episode.flow.T],
+        "controls": None if episode.controls is None else [_list(row) for row in episode.controls.T],
+        "lambda": _band(episode.circularity),
+        "services": [_band(level) for level in episode.levels],
+        "about": episode.about,
+        "figures": {name: _aggregate(figure) for name, figure in episode.figures.items() if figure is not None},
+    }
+
+
+def _diagram(diagram: FlowDiagram) -> Values:
+    layouts = {
+        name: {
+            "scale": diagram.scales[name],
+            "breadth": _pixels(layout.breadth),
             "boxes": [
                 [int(layer), _pixels(middle), _pixels(breadth)]
-                for layer, middle, breadth in zip(weave.layers, weave.middles, drawn.breadths[way], strict=True)
+                for layer, middle, breadth in zip(layout.layers, layout.middles, diagram.breadths[name], strict=True)
             ],
-            "labels": [list(lines(box.label, way)) for box in drawn.boxes],
-            "courses": [
-                {"lane": _pixels(each.lane), "side": each.side}
-                if each.side
-                else {"via": [_pixels(at) for at in each.via]} | ({"back": True} if each.back else {})
-                for each in weave.routes
-            ],
+            "labels": [list(lines(box.label, name)) for box in diagram.boxes],
+            "courses": [_route(route) for route in layout.routes],
         }
-        for way, weave in drawn.layouts.items()
+        for name, layout in diagram.layouts.items()
     }
     boxes = [
-        {"label": box.label, "members": list(box.members), "role": box.role.value, "stores": box.stores,
-         "opens": box.opens}
-        for box in drawn.boxes
-    ]  # fmt: skip
-    ribbons = [
-        {"members": list(each.members), "donor": each.donor, "recipient": each.recipient} for each in drawn.ribbons
+        {
+            "label": box.label,
+            "members": list(box.members),
+            "role": box.role.value,
+            "stores": box.stores,
+            "opens": box.opens,
+        }
+        for box in diagram.boxes
     ]
-    return {"group": drawn.group, "caption": drawn.caption, "boxes": boxes, "ribbons": ribbons, "ways": ways}
+    ribbons = [{"members": list(r.members), "donor": r.donor, "recipient": r.recipient} for r in diagram.ribbons]
+    return {"group": diagram.group, "caption": diagram.caption, "boxes": boxes, "ribbons": ribbons, "ways": layouts}
 
 
-def _band(band: Band) -> dict[str, Any]:
-    ends = {name: values for name, values in (("low", band.low), ("high", band.high)) if values is not None}
-    return {"value": _list(band.value), **{name: _list(values) for name, values in ends.items()}}
+def _route(route: RibbonRoute) -> Values:
+    if route.side:
+        return {"lane": _pixels(route.lane), "side": route.side}
+    via: Values = {"via": [_pixels(place) for place in route.via]}
+    return via | ({"back": True} if route.back else {})
 
 
-def _aggregate(found: Aggregate) -> list[float | None]:
-    return [_number(each) for each in (found.value, found.low, found.high)]
+def _band(band: Band) -> Values:
+    curves = {"value": band.value, "low": band.low, "high": band.high}
+    return {name: _list(values) for name, values in curves.items() if values is not None}
 
 
-def _short(values: Floats) -> float | list[float | None] | None:
+def _aggregate(aggregate: Aggregate) -> list[float | None]:
+    return [_number(figure) for figure in (aggregate.value, aggregate.low, aggregate.high)]
+
+
+def _series(values: Floats) -> float | list[float | None] | None:
     """Return a series, or its only value if it never changes."""
     return _number(values[0]) if np.ptp(values) == 0 else _list(values)
 
 
-def _rows(values: Floats) -> list[list[float | None]]:
-    return [_list(row) for row in values]
-
-
 def _list(values: Floats) -> list[float | None]:
-    return [_number(each) for each in values.tolist()]
+    return [_number(value) for value in values.tolist()]
 
 
 def _number(value: float) -> float | None:
     """Round to what is shown; whole numbers are short; None stands for what is no number."""
     if not math.isfinite(value):
         return None
-    rounded = float(f"{value:.{DIGITS}g}")
-    return int(rounded) if rounded.is_integer() and abs(rounded) < 2**53 else rounded
+    short = float(f"{value:.{DIGITS}g}")
+    return int(short) if short.is_integer() and abs(short) < 2**53 else short
 
 
 def _pixels(value: float) -> float:

@@ -26,43 +26,40 @@ SCRIPTS = (
 """Modules of the page, each behind those from which it imports."""
 
 
-def write_page(path: Path, story: ReportPage) -> Path:
-    """Write the page of ``story``, whole or not at all, and return its path; missing folders are made.
+def write_page(path: Path, page: ReportPage) -> Path:
+    """Write the page of ``page``, whole or not at all, and return its path; missing folders are made.
 
     Raises:
         CirlError: for what ``document`` refuses.
         OSError: if the file cannot be written.
     """
-    text = page_html(story)
+    text = page_html(page)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda partial: partial.write_text(text, "utf-8", "xmlcharrefreplace"))
+    write_atomically(path, lambda draft: draft.write_text(text, "utf-8", "xmlcharrefreplace"))
     return path
 
 
-def page_html(story: ReportPage) -> str:
+def page_html(page: ReportPage) -> str:
     """Return the text of the page."""
-    script, style = _script(), _read("page.css")
+    script = "\n" + "\n".join(_script(name, _read(f"{name}.js")) for name in SCRIPTS)
+    style = _read("page.css")
     parts = {
-        "title": html.escape(story.title),
+        "title": html.escape(page.title),
         "script_hash": _hash(script),
         "style_hash": _hash(style),
         "style": style,
-        "data": _harmless(page_data(story)),
+        "data": _json_text(page_data(page)),
         "script": script,
     }
-    return re.sub(r"{{(\w+)}}", lambda found: parts[found[1]], _read("page.html"))
+    return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], _read("page.html"))
 
 
-def _script() -> str:
-    """Return the modules as one, each a function that returns what it exports to those below it."""
-    return "\n" + "\n".join(_enclosed(name, _read(f"{name}.js")) for name in SCRIPTS)
-
-
-def _enclosed(name: str, module: str) -> str:
-    exported = ", ".join(re.findall(r"^export (?:function|const) (\w+)", module, flags=re.M))
+def _script(name: str, module: str) -> str:
+    """Return a module as a function that returns what it exports to those below it."""
+    exports = ", ".join(re.findall(r"^export (?:function|const) (\w+)", module, flags=re.M))
     body = re.sub(r"^import ({.*}) from \"\./(\w+)\.js\";$", r"const \1 = of_\2;", module, flags=re.M)
     body = re.sub(r"^export ", "", body, flags=re.M)
-    return f"const of_{name} = (() => {{\n{body}return {{ {exported} }};\n}})();"
+    return f"const of_{name} = (() => {{\n{body}return {{ {exports} }};\n}})();"
 
 
 def _read(name: str) -> str:
@@ -73,7 +70,7 @@ def _hash(text: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-def _harmless(value: object) -> str:
+def _json_text(value: object) -> str:
     """Return JSON that ends no element and no line, whatever it holds."""
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return re.sub("[<>&]", lambda found: f"\\u{ord(found[0]):04x}", text)
+    return re.sub("[<>&]", lambda match: f"\\u{ord(match[0]):04x}", text)

@@ -1,4 +1,4 @@
-"""What a report in the browser shows: scenes of one network, each what became of it under somebody's control."""
+"""What a report in the browser shows: episodes of one network, each what became of it under somebody's control."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Band:
 @with_field_docs
 @dataclass(frozen=True, slots=True)
 class PageEpisode:
-    """One course of a network: who acts, and what became of it."""
+    """One trajectory of a network: who acts, and what became of it."""
 
     name: Annotated[str, "who acts, or under which scenario"]
     network: Annotated[Network, "the network under its scenario"]
@@ -78,9 +78,7 @@ class ReportPage:
 
     title: Annotated[str, "heading"]
     network: Annotated[Network, "the network that it is about"]
-    scenes: Annotated[
-        tuple[PageEpisode, ...], "the first is what the others are compared with; none for points alone"
-    ] = ()
+    episodes: Annotated[tuple[PageEpisode, ...], "the first is what the others are compared with"] = ()
     points: Annotated[tuple[PlanePoint, ...], "what is drawn in the plane of service and circularity"] = ()
     front: Annotated[Floats, "levels of every service and the bound on λ̄ there, shape (levels, 2)"] = field(
         default_factory=lambda: np.empty((0, 2))
@@ -89,73 +87,72 @@ class ReportPage:
     reasons: Annotated[tuple[tuple[str, tuple[str, ...]], ...], "headings with sentences that say why"] = ()
 
 
-def page_of_alternatives(found: Sequence[Simulation]) -> ReportPage:
+def page_of_alternatives(simulations: Sequence[Simulation]) -> ReportPage:
     """Return the page of ``cirl simulate``."""
-    scenes = [
-        _scene(each.name or readable(each.control), each.network, each.env.agents, each.start, each.rollout)
-        for each in found
-    ]
-    network = found[0].network
-    return ReportPage(_title(network), network, tuple(scenes), notes=(f"Start: {found[0].episode_start.description}.",))
+    network, note = simulations[0].network, f"Start: {simulations[0].episode_start.description}."
+    episodes = tuple(
+        _episode(case.name or readable(case.control), case.network, case.env.agents, case.start, case.rollout)
+        for case in simulations
+    )
+    return ReportPage(_title(network), network, episodes, notes=(note,))
 
 
-def page_of_samples(found: SampledEpisodes, control: str) -> ReportPage:
+def page_of_samples(samples: SampledEpisodes, control: str) -> ReportPage:
     """Return the page of ``cirl simulate --samples``: flows and stocks are means, which balance as medians do not."""
-    network, count = found.network, len(found.circularity)
-    scene = PageEpisode(
-        readable(control),
-        network,
-        network.agents,
-        None,
-        found.stock.mean(axis=0),
-        found.flow.mean(axis=0),
-        None,
-        _quantiles(found.circularity),
-        tuple(_quantiles(found.levels[:, s]) for s in range(len(network.services))),
-        SAMPLES.format(count),
+    network, count = samples.network, len(samples.circularity)
+    episode = PageEpisode(
+        name=readable(control),
+        network=network,
+        agents=network.agents,
+        start=None,
+        stock=samples.stock.mean(axis=0),
+        flow=samples.flow.mean(axis=0),
+        controls=None,
+        circularity=_quantiles(samples.circularity),
+        levels=tuple(_quantiles(samples.levels[:, s]) for s in range(len(network.services))),
+        about=SAMPLES.format(count),
     )
     note = f"Flows and stocks are means of {count} samples of the uncertain numbers."
-    return ReportPage(_title(network), network, (scene,), notes=(note,))
+    return ReportPage(_title(network), network, (episode,), notes=(note,))
 
 
-def page_of_schedule(found: Schedule) -> ReportPage:
+def page_of_schedule(schedule: Schedule) -> ReportPage:
     """Return the page of ``cirl plan``: business as usual, and what is planned."""
-    network, start, note = found.network, found.start, found.note
-    name = PLAN if found.control == "optimum" and not note else found.control or "trained"
-    scenes = (
-        _scene(USUAL, network, found.agents, start, found.usual),
-        _scene(name, network, found.agents, start, found.rollout),
+    network, note = schedule.network, schedule.note
+    name = PLAN if schedule.control == "optimum" and not note else schedule.control or "trained"
+    episodes = tuple(
+        _episode(title, network, schedule.agents, schedule.start, outcome)
+        for title, outcome in ((USUAL, schedule.usual), (name, schedule.rollout))
     )
-    notes = [f"Start: {found.episode_start.description}.", *([note] if note else [])]
-    return ReportPage(_title(network), network, scenes, notes=tuple(notes))
+    notes = (f"Start: {schedule.episode_start.description}.", *([note] if note else []))
+    return ReportPage(_title(network), network, episodes, notes=notes)
 
 
-def page_of_comparison(found: Comparison, *, without: Sequence[str] = ()) -> ReportPage:
+def page_of_comparison(comparison: Comparison, *, without: Sequence[str] = ()) -> ReportPage:
     """Return the page of ``cirl compare``, neutral control first, but for the rows ``without`` whom it shall be."""
-    start = _first_start(found)
-    scenes, points = [], []
-    for row in sorted(found.rows, key=lambda row: row.name != "neutral"):
+    network, start = comparison.network, _first_start(comparison)
+    episodes, points = [], []
+    for row in sorted(comparison.rows, key=lambda row: row.name != "neutral"):
         if row.name in without:
             continue
-        figures = {which: row.figure(which) for which in FIGURES}
-        shown = (
-            USUAL if row.name == "neutral" else f"trained, {readable(row.name)}" if row.seeds else readable(row.name)
-        )
+        figures = {name: row.figure(name) for name in FIGURES}
+        title = f"trained, {readable(row.name)}" if row.seeds else readable(row.name)
+        title = USUAL if row.name == "neutral" else title
         for entry in row.entries:
-            name = shown if len(row.entries) == 1 else f"{shown}, seed {entry.seed}"
-            scenes.append(_scene(name, found.network, found.agents, start, entry.rollout, figures))
+            seed = "" if entry.seed is None else f"seed {entry.seed}"
+            name = title if len(row.entries) == 1 else f"{title}, seed {entry.seed}"
+            episodes.append(_episode(name, network, comparison.agents, start, entry.rollout, figures))
             service, circularity = float(entry.rollout.least_service.mean()), float(entry.circularity.mean())
-            points.append(PlanePoint(shown, service, circularity, "" if entry.seed is None else f"seed {entry.seed}"))
-    notes = [f"Flows, stocks and actions are those of the first of {found.episodes} episodes."]
-    notes += [f"No bound: {found.baseline.reason}."] if found.baseline.reason else []
-    return ReportPage(
-        _title(found.network), found.network, tuple(scenes), tuple(points), found.baseline.front, tuple(notes)
-    )
+            points.append(PlanePoint(title, service, circularity, seed))
+    baseline = comparison.baseline
+    notes = [f"Flows, stocks and actions are those of the first of {comparison.episodes} episodes."]
+    notes += [f"No bound: {baseline.reason}."] if baseline.reason else []
+    return ReportPage(_title(network), network, tuple(episodes), tuple(points), baseline.front, tuple(notes))
 
 
 def add_plan(
-    story: ReportPage,
-    found: Comparison,
+    page: ReportPage,
+    comparison: Comparison,
     env: MultiAgentVectorEnv,
     progress: Callable[[float], None] = lambda share: None,
 ) -> ReportPage:
@@ -167,67 +164,64 @@ def add_plan(
     Raises:
         CirlError: if a solver fails, or nobody acts.
     """
-    level = None if env.uncertain else levels_to_demand(found.entries[0].rollout.episode_levels[0])
-    controller = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
-    watched = ProgressController(controller, progress)
-    run = rollout(env, watched, seed=found.first_seed, progress=watched.acted)
-    scene = _scene(PLAN, found.network, found.agents, _first_start(found), run)
-    point = PlanePoint(PLAN, float(run.least_service[0]), float(run.episode_circularity[0]), "of the first episode")
-    serving = "serving as well as can be" if level is None else "with no less service than the policies gave there"
-    notes = [*story.notes, f"{PLAN.capitalize()}: for the first episode, {serving}."]
-    notes += [f"{controller.note}."] if controller.note else []
-    return replace(story, scenes=(*story.scenes, scene), points=(*story.points, point), notes=tuple(notes))
+    level = None if env.uncertain else levels_to_demand(comparison.entries[0].rollout.episode_levels[0])
+    optimum = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
+    controller = ProgressController(optimum, progress)
+    outcome = rollout(env, controller, seed=comparison.first_seed, progress=controller.acted)
+    episode = _episode(PLAN, comparison.network, comparison.agents, _first_start(comparison), outcome)
+    service, circularity = float(outcome.least_service[0]), float(outcome.episode_circularity[0])
+    point = PlanePoint(PLAN, service, circularity, "of the first episode")
+    condition = "serving as well as can be" if level is None else "with no less service than the policies gave there"
+    notes = [*page.notes, f"{PLAN.capitalize()}: for the first episode, {condition}."]
+    notes += [f"{optimum.note}."] if optimum.note else []
+    return replace(page, episodes=(*page.episodes, episode), points=(*page.points, point), notes=tuple(notes))
 
 
-def page_of_front(found: ParetoFront) -> ReportPage:
+def page_of_front(front: ParetoFront) -> ReportPage:
     """Return the page of ``cirl pareto``: points alone, as nothing else of its episodes is kept."""
     names = {"plan": "plans", "trained": "trained", "neutral": USUAL}
-    points = [
-        PlanePoint(names[each.kind], each.service, each.circularity, _weighed(each.weight, each.seed))
-        for each in found.points
-        if each.kind in names
-    ]
-    notes = [f"No bound: {found.reason}."] if found.reason else []
-    return ReportPage(_title(found.network), found.network, points=tuple(points), front=found.front, notes=tuple(notes))
+    points = []
+    for point in front.points:
+        if point.kind in names:
+            about = "" if point.weight is None else f"weight {point.weight:.3g}, seed {point.seed}"
+            points.append(PlanePoint(names[point.kind], point.service, point.circularity, about))
+    notes = (f"No bound: {front.reason}.",) if front.reason else ()
+    return ReportPage(_title(front.network), front.network, points=tuple(points), front=front.front, notes=notes)
 
 
-def _weighed(weight: float | None, seed: int | None) -> str:
-    return "" if weight is None else f"weight {weight:.3g}, seed {seed}"
-
-
-def _first_start(found: Comparison) -> Floats:
+def _first_start(comparison: Comparison) -> Floats:
     """Return the stocks with which the first episode begins, shape (stores,), mass."""
-    env = MultiAgentVectorEnv(found.network, num_envs=1, agents=found.agents)
-    env.reset(seed=found.first_seed)
+    env = MultiAgentVectorEnv(comparison.network, num_envs=1, agents=comparison.agents)
+    env.reset(seed=comparison.first_seed)
     start: Floats = env.rows.stocks(env.physical.stock)[:, 0].copy()
     return start
 
 
-def _scene(
+def _episode(
     name: str,
     network: Network,
     agents: tuple[str, ...],
     start: Floats,
-    run: Rollout,
+    outcome: Rollout,
     figures: Mapping[str, Aggregate | None] | None = None,
 ) -> PageEpisode:
-    episodes = len(run.circularity_mean)
+    count = len(outcome.circularity_mean)
     figures = figures or {
-        "circularity": over_episodes(run.episode_circularity),
-        "service": over_episodes(run.episode_service, SHARE),
+        "circularity": over_episodes(outcome.episode_circularity),
+        "service": over_episodes(outcome.episode_service, SHARE),
     }
     return PageEpisode(
-        name,
-        network,
-        agents,
-        start,
-        run.stock,
-        run.flow,
-        run.controls,
-        _mean(run.circularity_mean, np.inf),
-        tuple(_mean(run.levels[:, s], 1.0) for s in range(len(network.services))),
-        CONFIDENCE.format(episodes) if episodes > 1 else "",
-        figures,
+        name=name,
+        network=network,
+        agents=agents,
+        start=start,
+        stock=outcome.stock,
+        flow=outcome.flow,
+        controls=outcome.controls,
+        circularity=_mean(outcome.circularity_mean, np.inf),
+        levels=tuple(_mean(outcome.levels[:, s], 1.0) for s in range(len(network.services))),
+        about=CONFIDENCE.format(count) if count > 1 else "",
+        figures=figures,
     )
 
 
@@ -241,8 +235,8 @@ def _mean(values: Floats, top: float) -> Band:
 
 
 def _quantiles(values: Floats) -> Band:
-    low, middle, high = np.quantile(values, QUANTILES, axis=0)
-    return Band(middle, low, high)
+    low, median, high = np.quantile(values, QUANTILES, axis=0)
+    return Band(median, low, high)
 
 
 def _title(network: Network) -> str:

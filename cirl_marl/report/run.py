@@ -23,10 +23,10 @@ def page_of_evaluation(evaluation: Evaluation, progress: Callable[[float], None]
     called with the share of the plan that is done.
     """
     run, comparison = evaluation.run, evaluation.comparison
-    story = page_of_comparison(comparison, without=CONTROLLERS[1:])
+    page = page_of_comparison(comparison, without=CONTROLLERS[1:])
     reasons, missing = read_reasons(run, comparison.entries[0].checkpoint)
-    notes = (*story.notes, f"{missing}.") if missing else story.notes
-    return add_plan(replace(story, reasons=reasons, notes=notes), comparison, run.make_env(1), progress)
+    notes = (*page.notes, f"{missing}.") if missing else page.notes
+    return add_plan(replace(page, reasons=reasons, notes=notes), comparison, run.make_env(1), progress)
 
 
 def draw_run(evaluation: Evaluation) -> list[Path]:
