@@ -79,15 +79,15 @@ def test_a_linear_policy_is_attributed_exactly() -> None:
     policies, watching = Known(env, known), None
     watching = Recorder(policies)
     usual = play_episodes(env, watching, FIRST)
-    found, other = attribute_inputs(env, policies, policies, watching.seen, usual, FIRST, top=3)
-    seen = watching.seen.observations["use_to_collection"].reshape(-1, size)
+    found, other = attribute_inputs(env, policies, policies, watching.episodes, usual, FIRST, top=3)
+    seen = watching.episodes.observations["use_to_collection"].reshape(-1, size)
     sizes = np.abs(weights * (seen - seen.mean(axis=0))).mean(axis=0)
     order = np.argsort(-sizes)
     names = env.observation_names["use_to_collection"]
     assert [each.name for each in found.signals[:3]] == [names[i] for i in order[:3]]
     np.testing.assert_allclose(found.share, sizes[order] / sizes.sum(), atol=1e-5)
     np.testing.assert_allclose(found.slope[0, :3], weights[order[:3]], rtol=1e-4)
-    assert found.missed < 1e-4
+    assert found.residual < 1e-4
     assert found.least_held is not None and found.least_held.circularity.value == 0.0
     assert abs(found.top_held.circularity.value) > 1e-6
     assert "looks at" in input_sentence(env.network, found) and "acts more as it rises" in input_sentence(
@@ -183,7 +183,7 @@ def test_every_kind_of_policy_is_differentiated(tmp_path: Path, kind: str) -> No
     env = policies.run.make_env(3)
     watching = Recorder(policies)
     usual = play_episodes(env, watching, FIRST)
-    seen = watching.seen
+    seen = watching.episodes
     for agent in env.agents:
         name, policy = next(each for each in policies.policies.items() if agent in each[1].view.agents)
         acting, where, view = DifferentiablePolicy(policy), policy_columns(env, policy.view, agent), policy.view
@@ -196,7 +196,7 @@ def test_every_kind_of_policy_is_differentiated(tmp_path: Path, kind: str) -> No
             acted = acting(rows, *memory).numpy()[:, where.entries]
         np.testing.assert_allclose(np.clip(acted, -1, 1), seen.actions[agent].reshape(18, -1), atol=1e-5)
         for names, places in zip(where.names, where.places, strict=True):
-            whose, entry = where.seen[where.names.index(names)]
+            whose, entry = where.sources[where.names.index(names)]
             assert env.observation_names[whose][entry] == names
             for column in places:
                 np.testing.assert_array_equal(
@@ -205,7 +205,7 @@ def test_every_kind_of_policy_is_differentiated(tmp_path: Path, kind: str) -> No
         if kind == "joint":
             assert set(where.names) == {name for each in AGENTS for name in env.observation_names[each]}
     for each in attribute_inputs(env, policies, Trained(tmp_path / "run"), seen, usual, FIRST):
-        assert each.missed < 0.02 and each.share.sum() == pytest.approx(1.0)
+        assert each.residual < 0.02 and each.share.sum() == pytest.approx(1.0)
 
 
 @pytest.mark.medium

@@ -9,7 +9,7 @@ References: Sundararajan, Taly and Yan 2017, Axiomatic attribution for deep netw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ import numpy as np
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
-from cirl_marl.network import Floats, Integers
+from cirl_marl.network import Floats
 from cirl_marl.reasons.extras import captum
 from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution, play_episodes
 from cirl_marl.reasons.observations import Signal, observation_entries, policy_columns, signal_of
@@ -57,7 +57,7 @@ class AgentInputs:
         share: mean size of each input's attribution, as part of all, shape (signals,).
         slope: change of the action, [−1, 1], with the input, per unit of the input in its observation, by least
             squares of attributions on distances from the mean, shape (entries, signals).
-        missed: mean distance of Σ IG from F(x) − F(x'), as part of the mean size of the latter.
+        residual: mean distance of Σ IG from F(x) − F(x'), as part of the mean size of the latter.
         top: how many of the first inputs were held.
         top_held: what changed when those were held at their means.
         least_held: what changed when as many of the last inputs were; None where there are no others.
@@ -67,17 +67,17 @@ class AgentInputs:
     signals: tuple[Signal, ...]
     share: Floats
     slope: Floats
-    missed: float
+    residual: float
     top: int
     top_held: PairedDifference
     least_held: PairedDifference | None
 
 
-def paired_difference(run: Rollout, usual: Rollout) -> PairedDifference:
+def paired_difference(episodes: Rollout, usual: Rollout) -> PairedDifference:
     """Return how episodes differ from those to which they are compared, start by start."""
     return PairedDifference(
-        circularity=over_episodes(run.episode_circularity - usual.episode_circularity),
-        service=over_episodes(run.episode_service - usual.episode_service),
+        circularity=over_episodes(episodes.episode_circularity - usual.episode_circularity),
+        service=over_episodes(episodes.episode_service - usual.episode_service),
         usual=float(usual.episode_circularity.mean()),
     )
 
@@ -85,8 +85,8 @@ def paired_difference(run: Rollout, usual: Rollout) -> PairedDifference:
 def attribute_inputs(
     env: MultiAgentVectorEnv,
     policies: Policies,
-    again: Policies,
-    seen: RecordedEpisodes,
+    twins: Policies,
+    record: RecordedEpisodes,
     usual: Rollout,
     seed: int,
     *,
@@ -98,8 +98,8 @@ def attribute_inputs(
     Args:
         env: as many copies as episodes.
         policies: who acts.
-        again: the same policies once more, to act on what is held.
-        seen: what they saw and did in those episodes.
+        twins: the same policies once more, to act on inputs that are held.
+        record: what they saw and did in those episodes.
         usual: the episodes.
         seed: of their starts.
         top: how many inputs are held together.
@@ -108,68 +108,67 @@ def attribute_inputs(
     Raises:
         CirlError: if captum is not installed.
     """
-    found = []
+
+    def difference_if_held(policy: Policy, agent: str, names: Sequence[str]) -> PairedDifference:
+        fixed = {}
+        for member in policy.view.agents:
+            entries = observation_entries(env, member, names)
+            fixed[member] = entries, record.observations[member].mean(axis=(0, 1))[entries]
+        controller = Substitution(policies, FixedInputs(twins, fixed), [agent])
+        return paired_difference(play_episodes(env, controller, seed), usual)
+
+    attributions = []
     for place, agent in enumerate(env.agents):
-        name, policy = next(each for each in policies.policies.items() if agent in each[1].view.agents)
-        where = policy_columns(env, policy.view, agent)
-        share, slope, missed = _attributed(env, name, policy, agent, seen)
+        name, policy = next(pair for pair in policies.policies.items() if agent in pair[1].view.agents)
+        share, slope, residual = _integrated_gradients(env, name, policy, agent, record)
         order = np.argsort(-share, kind="stable")
-        count = min(top, len(order))
-        outcomes = []
-        for which in (order[:count], order[count:][-count:]):
-            names = [where.names[i] for i in which]
-            held = {each: _means(env, each, names, seen) for each in policy.view.agents}
-            other = FixedInputs(again, held)
-            run = play_episodes(env, Substitution(policies, {agent: other}), seed) if names else usual
-            outcomes.append(paired_difference(run, usual) if names else None)
-        assert outcomes[0] is not None
-        found.append(
+        names = [policy_columns(env, policy.view, agent).names[i] for i in order]
+        least = names[top:][-top:]
+        attributions.append(
             AgentInputs(
                 agent=agent,
-                signals=tuple(signal_of(env.network, where.names[i]) for i in order),
+                signals=tuple(signal_of(env.network, name) for name in names),
                 share=share[order],
                 slope=slope[:, order],
-                missed=missed,
-                top=count,
-                top_held=outcomes[0],
-                least_held=outcomes[1],
+                residual=residual,
+                top=min(top, len(names)),
+                top_held=difference_if_held(policy, agent, names[:top]),
+                least_held=difference_if_held(policy, agent, least) if least else None,
             )
         )
         progress((place + 1) / len(env.agents))
-    return tuple(found)
+    return tuple(attributions)
 
 
-def _means(env: MultiAgentVectorEnv, agent: str, names: list[str], seen: RecordedEpisodes) -> tuple[Integers, Floats]:
-    entries = observation_entries(env, agent, names)
-    return entries, seen.observations[agent].mean(axis=(0, 1))[entries]
-
-
-def _attributed(
-    env: MultiAgentVectorEnv, name: str, policy: Policy, agent: str, seen: RecordedEpisodes
+def _integrated_gradients(
+    env: MultiAgentVectorEnv, name: str, policy: Policy, agent: str, record: RecordedEpisodes
 ) -> tuple[Floats, Floats, float]:
-    """Return shares, slopes and what is missed, for the signals of ``columns``."""
+    """Return shares, slopes and the residual, for the signals of ``policy_columns``."""
     import torch
 
     from cirl_marl.learners.policies import DifferentiablePolicy
 
-    acting, view, where = DifferentiablePolicy(policy), policy.view, policy_columns(env, policy.view, agent)
-    flat: Mapping[str, Floats] = {
-        each: seen.observations[each].reshape(-1, seen.observations[each].shape[2]) for each in view.agents
+    function, view, columns = DifferentiablePolicy(policy), policy.view, policy_columns(env, policy.view, agent)
+    flat: dict[str, Floats] = {
+        member: record.observations[member].reshape(-1, record.observations[member].shape[2]) for member in view.agents
     }
     count = len(flat[agent])
     place = view.row_agents.index(agent) if view.row_agents else 0
     rows = np.asarray(view.rows(flat), dtype=np.float32)[place * count : (place + 1) * count]
-    chosen = np.unique(np.linspace(0, count - 1, min(count, SAMPLES)).round().astype(int))
+    sample = np.unique(np.linspace(0, count - 1, min(count, SAMPLES)).round().astype(int))
     memory: tuple[torch.Tensor, ...] = ()
-    if acting.remembers:
-        memory = tuple(torch.as_tensor(each[chosen]) for each in _memories(seen.memories[name], env.num_envs, place))
+    if function.remembers:
+        states = _memories(record.memories[name], env.num_envs, place)
+        memory = tuple(torch.as_tensor(state[sample]) for state in states)
     mean = rows.mean(axis=0, keepdims=True)
-    taken, baseline = torch.as_tensor(rows[chosen]), torch.as_tensor(np.repeat(mean, len(chosen), axis=0))
-    method = captum().IntegratedGradients(acting)
-    sizes, slopes, missed = np.zeros(len(where.names)), [], []
-    for entry in where.entries.tolist():
-        given, delta = method.attribute(
-            taken,
+    inputs, baseline = torch.as_tensor(rows[sample]), torch.as_tensor(np.repeat(mean, len(sample), axis=0))
+    method = captum().IntegratedGradients(function)
+    distance = (rows[sample] - mean)[:, [places[0] for places in columns.places]].astype(float)
+    squares = (distance**2).sum(axis=0)
+    sizes, slopes, residuals = np.zeros(len(columns.names)), [], []
+    for entry in columns.entries.tolist():
+        gradients, delta = method.attribute(
+            inputs,
             baseline,
             target=entry,
             additional_forward_args=memory or None,
@@ -179,27 +178,25 @@ def _attributed(
             return_convergence_delta=True,
         )
         with torch.no_grad():
-            change = (acting(taken, *memory) - acting(baseline, *memory))[:, entry]
-        parts = given.detach().numpy().astype(float)
-        by_signal = np.stack([parts[:, each].sum(axis=1) for each in where.places], axis=1)
+            change = (function(inputs, *memory) - function(baseline, *memory))[:, entry]
+        parts = gradients.detach().numpy().astype(float)
+        # a signal may stand in several columns of the row
+        by_signal = np.stack([parts[:, places].sum(axis=1) for places in columns.places], axis=1)
         sizes += np.abs(by_signal).mean(axis=0)
-        distance = (rows[chosen] - mean)[:, [each[0] for each in where.places]].astype(float)
-        squares = (distance**2).sum(axis=0)
-        slopes.append(
-            np.divide((by_signal * distance).sum(axis=0), squares, out=np.zeros(len(squares)), where=squares > 0)
-        )
+        products = (by_signal * distance).sum(axis=0)
+        slopes.append(np.divide(products, squares, out=np.zeros(len(squares)), where=squares > 0))
         size = float(change.abs().mean())
-        missed.append(float(delta.abs().mean()) / size if size > 0 else 0.0)
+        residuals.append(float(delta.abs().mean()) / size if size > 0 else 0.0)
     total = sizes.sum()
-    return sizes / total if total > 0 else sizes, np.array(slopes), float(np.mean(missed))
+    return sizes / total if total > 0 else sizes, np.array(slopes), float(np.mean(residuals))
 
 
-def _memories(kept: list[object], copies: int, place: int) -> tuple[Floats, Floats]:
+def _memories(states: Sequence[object], copies: int, place: int) -> tuple[Floats, Floats]:
     """Return hidden and cell states before each decision of an agent, shape (steps · copies, layers, units) each."""
-    known = next(each for each in kept if each is not None)
-    found = []
+    first = next(state for state in states if state is not None)
+    rows = slice(place * copies, (place + 1) * copies)
+    parts = []
     for part in range(2):
-        states = [np.zeros_like(known[part]) if each is None else each[part] for each in kept]  # type: ignore[index]
-        mine = [np.asarray(each)[:, place * copies : (place + 1) * copies].transpose(1, 0, 2) for each in states]
-        found.append(np.concatenate(mine))
-    return found[0], found[1]
+        arrays = [np.zeros_like(first[part]) if state is None else state[part] for state in states]  # type: ignore[index]
+        parts.append(np.concatenate([np.asarray(array)[:, rows].transpose(1, 0, 2) for array in arrays]))
+    return parts[0], parts[1]

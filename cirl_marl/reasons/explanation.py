@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,11 @@ import numpy as np
 
 from cirl_marl.controllers.rollout import first_seed
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import part_of, starting_stocks
 from cirl_marl.learners.run_directory import RunDirectory
-from cirl_marl.network import Floats, Network
+from cirl_marl.network import Network
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.reasons import extras
 from cirl_marl.reasons.attribution import AgentInputs, attribute_inputs
@@ -88,30 +88,34 @@ def explain(
     run = source if isinstance(source, RunDirectory) else None
     if isinstance(source, str | Path) and (Path(source) / "config.json").is_file():
         run = RunDirectory(source)
-    known = PARTS if run is not None else PARTS[:1]
+    possible = PARTS if run is not None else PARTS[:1]
     for part in parts or ():
-        if part in PARTS and part not in known:
+        if part in PARTS and part not in possible:
             raise CirlError(f"explain {source}: {part} are those of policies, and a network has none; give a run")
-        if part not in known:
-            raise CirlError(f"explain: {unknown('part', part, known)}")
-    asked = known if parts is None else tuple(parts)
+        if part not in possible:
+            raise CirlError(f"explain: {unknown('part', part, possible)}")
     if run is None:
         assert not isinstance(source, RunDirectory)
         network = (load_network(source) if isinstance(source, str | Path) else source).scenario(scenario)
-        told = part_of(progress, "shadow prices", 0.0, 1.0)
-        return Explanation(
-            network=network,
-            about=network.name,
-            prices=shadow_prices(network, min_service=min_service, progress=told),
-        )
+        report = part_of(progress, "shadow prices", 0.0, 1.0)
+        prices = shadow_prices(network, min_service=min_service, progress=report)
+        return Explanation(network=network, about=network.name, prices=prices)
     if scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; a run has its own")
-    return _of_run(run, asked, min_service, episodes, seed, top, leaves, progress)
+    if episodes < 2:
+        raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
+    if top < 1 or leaves < 2:
+        raise CirlError(f"top must be at least 1 and leaves at least 2, got {top} and {leaves}")
+    parts = possible if parts is None else tuple(parts)
+    for part, extra in (("inputs", extras.captum), ("rules", extras.trees)):
+        if part in parts:
+            extra()
+    return _explain_run(run, parts, min_service, episodes, first_seed(seed), top, leaves, progress)
 
 
-def _of_run(
+def _explain_run(
     run: RunDirectory,
-    asked: Sequence[str],
+    parts: Sequence[str],
     min_service: float | None,
     episodes: int,
     seed: int,
@@ -119,38 +123,36 @@ def _of_run(
     leaves: int,
     progress: Callable[[str, float], None],
 ) -> Explanation:
-    if episodes < 2:
-        raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
-    if top < 1 or leaves < 2:
-        raise CirlError(f"top must be at least 1 and leaves at least 2, got {top} and {leaves}")
-    for part, extra in (("inputs", extras.captum), ("rules", extras.trees)):
-        if part in asked:
-            extra()
     from cirl_marl.learners.interface import Trained  # it needs torch
 
-    policies, env, first = Trained(run), run.make_env(episodes, uncertain=False), first_seed(seed)
-    starts = starting_stocks(env, first)
-    watching = Recorder(policies)
-    share = 1.0 / (1 + len(asked))
-    usual = play_episodes(env, watching, first, part_of(progress, "episodes", 0.0, share))
+    policies, env = Trained(run), run.make_env(episodes, uncertain=False)
+    start = np.asarray(starting_stocks(env, seed).mean(axis=0))
+    share, steps = 1.0 / (1 + len(parts)), itertools.count()
+
+    def report(name: str) -> Callable[[float], None]:
+        return part_of(progress, name, next(steps) * share, share)
+
+    recorder = Recorder(policies)
+    usual = play_episodes(env, recorder, seed, report("episodes"))
     prices: ShadowPrices | None = None
-    looked: tuple[AgentInputs, ...] = ()
-    ruled: TeamRules | None = None
-    no_prices, done = "", share
-    if "prices" in asked:
+    inputs: tuple[AgentInputs, ...] = ()
+    rules: TeamRules | None = None
+    no_prices = ""
+    if "prices" in parts:
         level = levels_to_demand(usual.episode_levels.mean(axis=0)) if min_service is None else min_service
+        progress_of_prices = report("shadow prices")
         try:
-            prices = _prices(env, starts, level, part_of(progress, "shadow prices", done, share))
+            prices = shadow_prices(
+                env.network, start, min_service=level, agents=env.agents, progress=progress_of_prices
+            )
         except NoCertificate as missing:
             no_prices = str(missing)
-        done += share
-    if "inputs" in asked:
-        told = part_of(progress, "what agents look at", done, share)
-        looked = attribute_inputs(env, policies, Trained(run), watching.seen, usual, first, top=top, progress=told)
-        done += share
-    if "rules" in asked:
-        told = part_of(progress, "rules", done, share)
-        ruled = distil_rules(env, policies, usual, first, leaves=leaves, progress=told)
+    if "inputs" in parts:
+        record, twins = recorder.episodes, Trained(run)
+        report_inputs = report("what agents look at")
+        inputs = attribute_inputs(env, policies, twins, record, usual, seed, top=top, progress=report_inputs)
+    if "rules" in parts:
+        rules = distil_rules(env, policies, usual, seed, leaves=leaves, progress=report("rules"))
     return Explanation(
         network=env.network,
         about=str(run.path),
@@ -158,13 +160,6 @@ def _of_run(
         episodes=episodes,
         prices=prices,
         no_prices=no_prices,
-        inputs=looked,
-        rules=ruled,
+        inputs=inputs,
+        rules=rules,
     )
-
-
-def _prices(
-    env: MultiAgentVectorEnv, starts: Floats, level: float | Floats, progress: Callable[[float], None]
-) -> ShadowPrices:
-    mean = np.asarray(starts.mean(axis=0))
-    return shadow_prices(env.network, mean, min_service=level, agents=env.agents, progress=progress)

@@ -1,8 +1,8 @@
-"""Episodes of policies that are watched, and episodes in which others act for some of the agents."""
+"""Episodes of policies: recorded ones, and such with some inputs held fixed or some agents replaced."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RecordedEpisodes:
-    """What agents saw, and what a teacher did there.
+    """What agents saw, and what the expert did there.
 
     Attributes:
         observations: by agent, shape (steps, B, k).
-        actions: of the teacher, by agent, shape (steps, B, entries).
+        actions: of the expert, by agent, shape (steps, B, entries).
         memories: what each policy remembered before it acted, by name, as its algorithm has it, one a step; zeros at
             first.
     """
@@ -36,16 +36,14 @@ class RecordedEpisodes:
 
 @dataclass
 class Recorder(Controller):
-    """Lets a pupil act, or the teacher itself, and keeps what the teacher would have done."""
+    """Lets the imitator act, or the expert itself, and records what the expert would have done (as DAgger does)."""
 
-    teacher: Policies
-    pupil: Controller | None = None
-    _seen: list[Arrays] = field(default_factory=list)
-    _done: list[Arrays] = field(default_factory=list)
-    _memories: list[Mapping[str, Any]] = field(default_factory=list)
+    expert: Policies
+    imitator: Controller | None = None
+    _steps: list[tuple[Arrays, Arrays, Mapping[str, Any]]] = field(default_factory=list)
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        """Forget what was seen.
+        """Forget earlier episodes.
 
         Raises:
             RunError: if an agent sees anything but a row of numbers.
@@ -53,36 +51,39 @@ class Recorder(Controller):
         for agent, space in env.observation_spaces.items():
             if len(getattr(space, "shape", None) or ()) != 1:
                 raise RunError(f"agent '{agent}' sees {space}, not a row of named numbers; there is nothing to explain")
-        self.teacher.start(env, seed)
-        if self.pupil is not None:
-            self.pupil.start(env, seed)
-        self._seen, self._done, self._memories = [], [], []
+        self.expert.start(env, seed)
+        if self.imitator is not None:
+            self.imitator.start(env, seed)
+        self._steps = []
 
     def act(self, observations: Arrays) -> Arrays:
-        """Return what the pupil does."""
-        self._seen.append({agent: np.array(each, dtype=np.float64) for agent, each in observations.items()})
-        self._memories.append(dict(self.teacher.memory))
-        actions = self.teacher.act(observations)
-        self._done.append({agent: np.array(each, dtype=np.float64) for agent, each in actions.items()})
-        return actions if self.pupil is None else self.pupil.act(observations)
+        """Return what the imitator does."""
+        inputs, memory = _copies(observations), dict(self.expert.memory)
+        actions = self.expert.act(observations)
+        self._steps.append((inputs, _copies(actions), memory))
+        return actions if self.imitator is None else self.imitator.act(observations)
 
     @property
-    def seen(self) -> RecordedEpisodes:
+    def episodes(self) -> RecordedEpisodes:
         """What was seen and done in the last episodes."""
-        agents = self._seen[0]
+        observations, actions, memories = zip(*self._steps, strict=True)
         return RecordedEpisodes(
-            {agent: np.stack([each[agent] for each in self._seen]) for agent in agents},
-            {agent: np.stack([each[agent] for each in self._done]) for agent in self._done[0]},
-            {name: [each[name] for each in self._memories] for name in self.teacher.policies},
+            {agent: np.stack([step[agent] for step in observations]) for agent in observations[0]},
+            {agent: np.stack([step[agent] for step in actions]) for agent in actions[0]},
+            {name: [memory[name] for memory in memories] for name in self.expert.policies},
         )
+
+
+def _copies(arrays: Arrays) -> Arrays:
+    return {agent: np.array(values, dtype=np.float64) for agent, values in arrays.items()}
 
 
 @dataclass
 class FixedInputs(Controller):
-    """A controller to whom some entries of what agents see are shown at fixed values."""
+    """A controller to whom some entries of what agents see are shown at fixed values, by agent: entries and values."""
 
     controller: Controller
-    held: Mapping[str, tuple[Integers, Floats]]
+    fixed: Mapping[str, tuple[Integers, Floats]]
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Start the controller."""
@@ -90,36 +91,38 @@ class FixedInputs(Controller):
 
     def act(self, observations: Arrays) -> Arrays:
         """Return what it does when it sees that."""
-        shown = dict(observations)
-        for agent, (entries, values) in self.held.items():
-            shown[agent] = np.array(observations[agent])
-            shown[agent][:, entries] = values
-        return self.controller.act(shown)
+        inputs = dict(observations)
+        for agent, (entries, values) in self.fixed.items():
+            inputs[agent] = np.array(observations[agent])
+            inputs[agent][:, entries] = values
+        return self.controller.act(inputs)
 
 
 @dataclass
 class Substitution(Controller):
-    """A controller in whose place others act for some agents."""
+    """A controller in whose place a substitute acts for some agents."""
 
-    everyone: Controller
-    others: Mapping[str, Controller]
+    controller: Controller
+    substitute: Controller
+    agents: Collection[str]
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        """Start all of them."""
-        self.everyone.start(env, seed)
-        for other in {id(each): each for each in self.others.values()}.values():
-            other.start(env, seed)
+        """Start both."""
+        self.controller.start(env, seed)
+        self.substitute.start(env, seed)
 
     def act(self, observations: Arrays) -> Arrays:
         """Return each agent's action by whoever acts for it."""
-        actions = dict(self.everyone.act(observations))
-        acted = {id(other): other.act(observations) for other in {id(o): o for o in self.others.values()}.values()}
-        return actions | {agent: acted[id(other)][agent] for agent, other in self.others.items()}
+        actions, substitutes = self.controller.act(observations), self.substitute.act(observations)
+        return {**actions, **{agent: substitutes[agent] for agent in self.agents}}
 
 
 def play_episodes(
-    env: MultiAgentVectorEnv, controller: Controller, seed: int, progress: Callable[[float], None] = lambda share: None
+    env: MultiAgentVectorEnv,
+    controller: Controller,
+    seed: int,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Rollout:
     """Return the episodes of a controller from the starts of a seed."""
     steps = env.network.episode.horizon
-    return rollout(env, controller, seed=seed, progress=lambda done: progress(done / steps))
+    return rollout(env, controller, seed=seed, progress=lambda step: progress(step / steps))

@@ -58,13 +58,13 @@ class PolicyColumns:
     Attributes:
         names: of the signals that stand in it, each once.
         places: for each of them the columns of the row.
-        seen: for each of them an agent, and an entry of its observation, where it is found first.
+        sources: for each of them an agent, and an entry of its observation, where it is found first.
         entries: columns of the policy's output that are the agent's action.
     """
 
     names: tuple[str, ...]
     places: tuple[Integers, ...]
-    seen: tuple[tuple[str, int], ...]
+    sources: tuple[tuple[str, int], ...]
     entries: Integers
 
 
@@ -73,29 +73,28 @@ def policy_columns(env: MultiAgentVectorEnv, view: View, agent: str) -> PolicyCo
 
     Views are asked: they are shown numbers that no indicator and no padding has.
     """
-    first, codes, known = 2, {}, list[tuple[str, int]]()
-    for each in view.agents:
-        count = len(env.observation_names[each])
-        codes[each] = np.arange(first, first + count, dtype=np.float64)[None]
-        known += [(each, entry) for entry in range(count)]
+    first, codes, sources = 2, {}, list[tuple[str, int]]()
+    for member in view.agents:
+        count = len(env.observation_names[member])
+        codes[member] = np.arange(first, first + count, dtype=np.float64)[None]
+        sources += [(member, entry) for entry in range(count)]
         first += count
     rows = np.asarray(view.rows(codes), dtype=np.float64)
     row = rows[view.row_agents.index(agent)] if view.row_agents else rows[0]
-    found: dict[str, list[int]] = {}
-    seen: dict[str, tuple[str, int]] = {}
+    places: dict[str, list[int]] = {}
+    entries: dict[str, tuple[str, int]] = {}
     for column, code in enumerate(row.astype(int).tolist()):
         if code >= 2:
-            whose, entry = known[code - 2]
-            name = env.observation_names[whose][entry]
-            found.setdefault(name, []).append(column)
-            seen.setdefault(name, (whose, entry))
+            member, entry = sources[code - 2]
+            name = env.observation_names[member][entry]
+            places.setdefault(name, []).append(column)
+            entries.setdefault(name, (member, entry))
     outputs = int(view.action_space.shape[0])  # type: ignore[index]
-    acted = view.act(np.tile(np.arange(outputs, dtype=np.float64), (max(1, len(view.row_agents)), 1)))
-    places = tuple(np.array(each, dtype=np.intp) for each in found.values())
-    return PolicyColumns(tuple(found), places, tuple(seen.values()), np.asarray(acted[agent][0], dtype=np.intp))
+    actions = view.act(np.tile(np.arange(outputs, dtype=np.float64), (max(1, len(view.row_agents)), 1)))
+    columns = tuple(np.array(place, dtype=np.intp) for place in places.values())
+    return PolicyColumns(tuple(places), columns, tuple(entries.values()), np.asarray(actions[agent][0], dtype=np.intp))
 
 
 def observation_entries(env: MultiAgentVectorEnv, agent: str, names: Sequence[str]) -> Integers:
     """Return which entries of an agent's observation have these names."""
-    shown = env.observation_names[agent]
-    return np.array([i for i, name in enumerate(shown) if name in names], dtype=np.intp)
+    return np.flatnonzero([name in names for name in env.observation_names[agent]])

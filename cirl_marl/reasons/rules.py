@@ -18,11 +18,11 @@ import numpy as np
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
-from cirl_marl.network import Floats
+from cirl_marl.network import Floats, Integers
 from cirl_marl.reasons.attribution import PairedDifference, paired_difference
 from cirl_marl.reasons.extras import trees
 from cirl_marl.reasons.interventions import RecordedEpisodes, Recorder, Substitution, play_episodes
-from cirl_marl.reasons.observations import Signal, policy_columns, signal_of
+from cirl_marl.reasons.observations import PolicyColumns, Signal, policy_columns, signal_of
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 LEAVES = 4
 ROUNDS = 2
 """Times that trees act and are fitted anew to what the policies would have done."""
-WORTH, NOTICED = 2e-3, 5e-4
+RELATIVE_GAIN, ABSOLUTE_GAIN = 2e-3, 5e-4
 """What a branch must explain at least: as part of the variance of an action, and in squares of actions in [−1, 1]."""
-FEWEST = 0.01
+LEAF_SHARE = 0.01
 """Least part of all decisions that a leaf stands for."""
 
 
@@ -95,21 +95,42 @@ class TeamRules:
 class TreeController(Controller):
     """Acts for some agents by their trees; where it has none it does nothing."""
 
-    def __init__(self, grown: Mapping[str, Any], seen: Mapping[str, Sequence[tuple[str, int]]]) -> None:
+    def __init__(self, trees_: Mapping[str, Any], columns: Mapping[str, PolicyColumns]) -> None:
         """Take a fitted tree for each agent, and where in the observations its features are."""
-        self._grown, self._seen = grown, seen
+        self._trees, self._columns = trees_, columns
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Get ready: there is nothing to remember."""
 
     def act(self, observations: Arrays) -> Arrays:
         """Return what the trees say, shape (B, entries) each."""
-        found = {}
-        for agent, tree in self._grown.items():
-            features = np.stack([observations[whose][:, entry] for whose, entry in self._seen[agent]], axis=1)
-            acted = tree.predict(features.astype(np.float32))
-            found[agent] = np.clip(acted.reshape(len(features), -1), -1.0, 1.0)
-        return found
+        actions = {}
+        for agent, tree in self._trees.items():
+            sources = self._columns[agent].sources
+            features = np.stack([observations[member][:, entry] for member, entry in sources], axis=1)
+            output = tree.predict(features.astype(np.float32))
+            actions[agent] = np.clip(output.reshape(len(features), -1), -1.0, 1.0)
+        return actions
+
+
+@dataclass(frozen=True, slots=True)
+class _Lessons:
+    """What one agent saw in all recorded episodes, as trees keep it, what its policy did there, and in which step."""
+
+    features: Floats
+    actions: Floats
+    steps: Integers
+
+
+def _lessons(agent: str, columns: PolicyColumns, records: Sequence[RecordedEpisodes]) -> _Lessons:
+    features, actions, steps = [], [], []
+    for record in records:
+        count, copies, entries = record.actions[agent].shape
+        values = [record.observations[member][:, :, entry].ravel() for member, entry in columns.sources]
+        features.append(np.stack(values, axis=1))
+        actions.append(record.actions[agent].reshape(-1, entries))
+        steps.append(np.repeat(np.arange(count), copies))
+    return _Lessons(np.concatenate(features).astype(np.float32), np.concatenate(actions), np.concatenate(steps))
 
 
 def distil_rules(
@@ -134,108 +155,85 @@ def distil_rules(
     Raises:
         CirlError: if scikit-learn is not installed.
     """
-    where = {}
+    columns = {}
     for agent in env.agents:
-        policy = next(each for each in policies.policies.values() if agent in each.view.agents)
-        where[agent] = policy_columns(env, policy.view, agent)
-    places = {agent: each.seen for agent, each in where.items()}
-    watched: list[RecordedEpisodes] = []
-    grown: dict[str, Any] = {}
+        policy = next(policy for policy in policies.policies.values() if agent in policy.view.agents)
+        columns[agent] = policy_columns(env, policy.view, agent)
+    records: list[RecordedEpisodes] = []
+    controller = TreeController({}, columns)
     work = ROUNDS + 1 + len(env.agents) + 1
     for round_ in range(ROUNDS + 1):
-        watching = Recorder(policies, TreeController(grown, places) if round_ else None)
+        recorder = Recorder(policies, controller if round_ else None)
         # starts between those of one evaluation and the next are nobody's
-        play_episodes(env, watching, seed + (round_ + 1) * 100_000)
-        watched.append(watching.seen)
-        grown = {agent: _grown(agent, watched, places[agent], leaves) for agent in env.agents}
+        play_episodes(env, recorder, seed + (round_ + 1) * 100_000)
+        records.append(recorder.episodes)
+        lessons = {agent: _lessons(agent, columns[agent], records) for agent in env.agents}
+        fitted_trees = {agent: _fit(lessons[agent], leaves) for agent in env.agents}
+        controller = TreeController(fitted_trees, columns)
         progress((round_ + 1) / work)
-    tree, found = TreeController(grown, places), []
+    rules = []
     for a, agent in enumerate(env.agents):
-        cost = paired_difference(play_episodes(env, Substitution(policies, {agent: tree}), seed), usual)
-        names = where[agent].names
-        found.append(
+        episodes = play_episodes(env, Substitution(policies, controller, [agent]), seed)
+        tree, lesson = fitted_trees[agent], lessons[agent]
+        rules.append(
             Rule(
                 agent=agent,
-                leaves=_leaves(env, agent, grown[agent], names, places[agent], watched),
-                explained_variance=_explained_variance(grown[agent], agent, places[agent], watched),
-                cost=cost,
+                leaves=_leaves(env, agent, tree, columns[agent].names, lesson),
+                explained_variance=_explained_variance(tree, lesson),
+                cost=paired_difference(episodes, usual),
             )
         )
         progress((ROUNDS + 2 + a) / work)
-    together = paired_difference(play_episodes(env, tree, seed), usual)
+    together = paired_difference(play_episodes(env, controller, seed), usual)
     progress(1.0)
-    return TeamRules(rules=tuple(found), together=together)
+    return TeamRules(rules=tuple(rules), together=together)
 
 
-def _table(agent: str, watched: Sequence[RecordedEpisodes], places: Sequence[tuple[str, int]]) -> tuple[Floats, Floats]:
-    """Return all features that an agent saw, as trees keep them, and what its policy did."""
-    features = [
-        np.stack([each.observations[whose][:, :, entry].ravel() for whose, entry in places], axis=1) for each in watched
-    ]
-    actions = [each.actions[agent].reshape(-1, each.actions[agent].shape[2]) for each in watched]
-    return np.concatenate(features).astype(np.float32), np.concatenate(actions)
-
-
-def _grown(agent: str, watched: Sequence[RecordedEpisodes], places: Sequence[tuple[str, int]], leaves: int) -> Any:
-    features, actions = _table(agent, watched, places)
-    variance = float(actions.var(axis=0).mean())
+def _fit(lesson: _Lessons, leaves: int) -> Any:
+    variance, actions = float(lesson.actions.var(axis=0).mean()), lesson.actions
     tree = trees().DecisionTreeRegressor(
         max_leaf_nodes=max(2, leaves),
-        min_samples_leaf=max(1, int(FEWEST * len(features))),
-        min_impurity_decrease=max(WORTH * variance, NOTICED),
+        min_samples_leaf=max(1, int(LEAF_SHARE * len(lesson.features))),
+        min_impurity_decrease=max(RELATIVE_GAIN * variance, ABSOLUTE_GAIN),
         random_state=0,
     )
-    return tree.fit(features, actions if actions.shape[1] > 1 else actions.ravel())
+    return tree.fit(lesson.features, actions if actions.shape[1] > 1 else actions.ravel())
 
 
-def _explained_variance(
-    tree: Any, agent: str, places: Sequence[tuple[str, int]], watched: Sequence[RecordedEpisodes]
-) -> float:
-    features, actions = _table(agent, watched, places)
-    left = actions - tree.predict(features).reshape(actions.shape)
-    variance = float(actions.var(axis=0).sum())
-    return 1.0 - float((left**2).mean(axis=0).sum()) / variance if variance > 1e-12 else 1.0
+def _explained_variance(tree: Any, lesson: _Lessons) -> float:
+    error = lesson.actions - tree.predict(lesson.features).reshape(lesson.actions.shape)
+    variance = float(lesson.actions.var(axis=0).sum())
+    return 1.0 - float((error**2).mean(axis=0).sum()) / variance if variance > 1e-12 else 1.0
 
 
 def _leaves(
-    env: MultiAgentVectorEnv,
-    agent: str,
-    tree: Any,
-    names: Sequence[str],
-    places: Sequence[tuple[str, int]],
-    watched: Sequence[RecordedEpisodes],
+    env: MultiAgentVectorEnv, agent: str, tree: Any, names: Sequence[str], lesson: _Lessons
 ) -> tuple[Leaf, ...]:
-    features, _ = _table(agent, watched, places)
-    steps = np.concatenate([np.repeat(np.arange(len(each.actions[agent])), env.num_envs) for each in watched])
-    reached, grown = tree.apply(features), tree.tree_
-    network = env.network
-    rows = network.control_rows[agent]
-    low, _, high = network.control_bounds[:, rows]
-    found = []
-    for leaf, ways in _ways(grown):
-        at = reached == leaf
-        action = np.clip(grown.value[leaf].reshape(-1), -1.0, 1.0)
-        held = low[:, steps[at]] + (action[:, None] + 1) / 2 * (high - low)[:, steps[at]]
-        conditions = tuple(
-            Condition(signal_of(network, names[feature]), *ends) for feature, ends in sorted(ways.items())
-        )
-        found.append(Leaf(conditions, action, held.mean(axis=1), float(at.mean())))
-    return tuple(found)
+    leaf_of, network = tree.apply(lesson.features), env.network
+    low, _, high = network.control_bounds[:, network.control_rows[agent]]
+    leaves = []
+    for node, ranges in _paths(tree.tree_):
+        decisions = leaf_of == node
+        action = np.clip(tree.tree_.value[node].reshape(-1), -1.0, 1.0)
+        steps = lesson.steps[decisions]
+        control = low[:, steps] + (action[:, None] + 1) / 2 * (high - low)[:, steps]
+        conditions = (Condition(signal_of(network, names[feature]), *ends) for feature, ends in sorted(ranges.items()))
+        leaves.append(Leaf(tuple(conditions), action, control.mean(axis=1), float(decisions.mean())))
+    return tuple(leaves)
 
 
-def _ways(grown: Any) -> list[tuple[int, dict[int, tuple[float, float]]]]:
-    """Return each leaf with the range of every feature that leads to it."""
-    found: list[tuple[int, dict[int, tuple[float, float]]]] = []
-
-    def go(node: int, ranges: dict[int, tuple[float, float]]) -> None:
-        left, right = int(grown.children_left[node]), int(grown.children_right[node])
+def _paths(tree: Any) -> list[tuple[int, dict[int, tuple[float, float]]]]:
+    """Return each leaf with the range of every feature that leads to it, from left to right."""
+    leaves = []
+    stack: list[tuple[int, dict[int, tuple[float, float]]]] = [(0, {})]
+    while stack:
+        node, ranges = stack.pop()
+        left, right = int(tree.children_left[node]), int(tree.children_right[node])
         if left < 0:
-            found.append((node, ranges))
-            return
-        feature, threshold = int(grown.feature[node]), float(grown.threshold[node])
+            leaves.append((node, ranges))
+            continue
+        feature, threshold = int(tree.feature[node]), float(tree.threshold[node])
         low, high = ranges.get(feature, (-np.inf, np.inf))
-        go(left, {**ranges, feature: (low, min(high, threshold))})
-        go(right, {**ranges, feature: (max(low, threshold), high)})
-
-    go(0, {})
-    return found
+        stack.append((right, {**ranges, feature: (max(low, threshold), high)}))
+        stack.append((left, {**ranges, feature: (low, min(high, threshold))}))
+    return leaves
