@@ -39,7 +39,7 @@ CLOSE = 1e-6
 """Share of what there is to be had by which a weight may be wrong about an inequality."""
 NARROW = 0.1
 """Width of a weight's range, relative to its middle, up to which it counts as found."""
-NOTHING = 1e-9
+TINY = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,7 @@ class ObjectiveWeights:
         distance: by how much they fall short of it under these, as share of what there is to be had; proved.
         within: distance up to which weights fit.
         cuts: the inequalities that were found, Σ u_j cut_j ≤ distance, shape (cuts, terms).
-        solved: programs that were solved.
+        programs: how many programs were solved.
     """
 
     network: Network
@@ -75,23 +75,22 @@ class ObjectiveWeights:
     distance: float
     within: float
     cuts: Floats
-    solved: int
+    programs: int
 
     def fits(self, weights: ArrayLike) -> bool:
         """Whether weights w_j ≥ 0 of the terms, in their own units, break none of the inequalities."""
-        given = np.asarray(weights, dtype=float)
-        shares = given * self.spread if given.shape == self.spread.shape else np.zeros(0)
+        per_unit = np.asarray(weights, dtype=float)
+        shares = per_unit * self.spread if per_unit.shape == self.spread.shape else np.zeros(0)
         if not shares.sum() > 0 or (shares < 0).any():
             raise CirlError(f"weights {weights!r}: needs one for each of {len(self.terms)} terms, none negative")
         return bool((self.cuts @ (shares / shares.sum())).max(initial=0.0) <= self.within + CLOSE)
 
     def weights(self, shares: Floats) -> Floats:
         """Return weights per unit of each term, the largest share of a part of λ having 1; NaN for idle terms."""
-        natural = np.divide(shares, self.spread, out=np.full(len(shares), np.nan), where=self.spread > 0)
-        parts = [j for j, each in enumerate(self.terms) if each.kind == "circularity" and self.spread[j] > 0]
-        first = max(parts, key=lambda j: shares[j], default=int(np.argmax(shares)))
-        found: Floats = natural / natural[first] if natural[first] > 0 else natural
-        return found
+        per_unit: Floats = np.divide(shares, self.spread, out=np.full(len(shares), np.nan), where=self.spread > 0)
+        parts = [j for j, term in enumerate(self.terms) if term.kind == "circularity" and self.spread[j] > 0]
+        reference = per_unit[max(parts, key=lambda j: shares[j], default=int(np.argmax(shares)))]
+        return per_unit / reference if reference > 0 else per_unit
 
     @property
     def identifiable(self) -> list[int]:
@@ -100,20 +99,20 @@ class ObjectiveWeights:
         return [j for j in range(len(self.terms)) if self.high[j] - self.low[j] <= NARROW * middle[j]]
 
 
-class _WeighedPlan:
+class _PlanProgram:
     """One plan, with the program of what could have been done from its start."""
 
-    def __init__(self, programs: Programs, weighed: Sequence[ObjectiveTerm], course: PlannedEpisode) -> None:
-        admissible = programs.admissible
-        network, lifetimes = admissible.lifetimes.network, admissible.lifetimes
+    def __init__(self, programs: Programs, terms: Sequence[ObjectiveTerm], plan: PlannedEpisode) -> None:
+        lifetimes = programs.admissible.lifetimes
+        network = lifetimes.network
+        tangents = [term.tangent(network, plan) for term in terms]
+        self._problem = replace(programs.program(plan.initial), constant=0.0)
         steps = network.episode.horizon
-        tangents = [term.tangent(network, course) for term in weighed]
-        self._problem = replace(programs.program(course.initial), constant=0.0)
-        self._columns = np.array([each.columns(programs.layout, lifetimes, steps) for each in tangents])
-        self.value = np.array([each.of(network, course) for each in tangents])
+        self._columns = np.array([tangent.columns(programs.layout, lifetimes, steps) for tangent in tangents])
+        self.value = np.array([tangent.of(network, plan) for tangent in tangents])
         self._basis: Basis | None = None
 
-    def against(self, weights: Floats) -> tuple[Floats, float]:
+    def maximise(self, weights: Floats) -> tuple[Floats, float]:
         """Return the terms of an episode that is best for weights, and what no episode exceeds."""
         problem = replace(self._problem, cost=-(weights @ self._columns))
         solution = solve(problem, self._basis, label="the program of the best for some weights", same_rows=True)
@@ -155,131 +154,129 @@ def infer(
         raise CirlError(f"within {within!r} must be at least 0 and less than 1")
     if episodes < 1:
         raise CirlError(f"episodes must be at least 1, got {episodes}")
-    known = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
-    given = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
-    if not given:
+    network = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    sources = [plans] if isinstance(plans, str | Path | PlannedEpisode) else list(plans)
+    if not sources:
         raise CirlError("infer: no plans were given")
-    known, agents = episode_setting(known, given)
-    weighed = tuple(objective_terms(known, kinds))
-    programs = Programs(Admissible.of(known, agents), DEGREE, None)
-    every: list[PlannedEpisode] = []
-    for each in given:
-        every += (
-            [each] if isinstance(each, PlannedEpisode) else episodes_of_plan(known, each, seed=seed, episodes=episodes)
-        )
-    for course in every:
-        _check_shape(known, course)
-    cone = _Cone([_WeighedPlan(programs, weighed, course) for course in every], len(weighed), progress)
-    spread = cone.spread
+    network, agents = episode_setting(network, sources)
+    terms = tuple(objective_terms(network, kinds))
+    programs = Programs(Admissible.of(network, agents), DEGREE, None)
+    planned_episodes: list[PlannedEpisode] = []
+    for source in sources:
+        if isinstance(source, PlannedEpisode):
+            planned_episodes.append(source)
+        else:
+            planned_episodes += episodes_of_plan(network, source, seed=seed, episodes=episodes)
+    steps = network.episode.horizon
+    shapes = (steps, len(network.stores)), (steps, len(network.arcs))
+    for plan in planned_episodes:
+        if (plan.stock.shape, plan.flow.shape) != shapes:
+            raise CirlError(
+                f"{plan.name}: has stocks {plan.stock.shape} and flows {plan.flow.shape}, but an episode of"
+                f" '{network.name}' has {shapes[0]} and {shapes[1]}"
+            )
+    cone = _Cone([_PlanProgram(programs, terms, plan) for plan in planned_episodes], len(terms), progress)
     best, distance = cone.closest()
-    allowed = distance + within
-    low, high, corners = cone.ends(allowed)
+    low, high, corners = cone.ends(distance + within)
     progress(1.0)
     return ObjectiveWeights(
-        network=known,
-        plans=tuple(course.name for course in every),
-        terms=weighed,
-        spread=spread,
+        network=network,
+        plans=tuple(plan.name for plan in planned_episodes),
+        terms=terms,
+        spread=cone.spread,
         low=low,
         high=high,
         centre=np.mean(corners, axis=0),
         best=best,
         distance=distance,
-        within=allowed,
+        within=distance + within,
         cuts=cone.cuts,
-        solved=cone.solved,
+        programs=cone.programs,
     )
-
-
-def _check_shape(network: Network, course: PlannedEpisode) -> None:
-    steps = network.episode.horizon
-    shapes = (steps, len(network.stores)), (steps, len(network.arcs))
-    if (course.stock.shape, course.flow.shape) != shapes:
-        raise CirlError(
-            f"{course.name}: has stocks {course.stock.shape} and flows {course.flow.shape}, but an episode of"
-            f" '{network.name}' has {shapes[0]} and {shapes[1]}"
-        )
 
 
 class _Cone:
     """The inequalities that are known, and those that are yet to be found."""
 
-    def __init__(self, plans: Sequence[_WeighedPlan], count: int, progress: Callable[[float], None]) -> None:
+    def __init__(self, plans: Sequence[_PlanProgram], count: int, progress: Callable[[float], None]) -> None:
         self._plans, self._count, self._progress = plans, count, progress
-        self.solved = 0
-        reached: list[tuple[int, Floats]] = []
+        self.programs = 0
+        extremes: list[tuple[int, Floats]] = []
         for p, plan in enumerate(plans):
-            for j in range(count):
-                reached.append((p, plan.against(np.eye(count)[j])[0]))
-                self.solved += 1
-                progress(0.3 * self.solved / (len(plans) * count))
-        points = np.array([*(each for _, each in reached), *(plan.value for plan in plans)])
+            for unit in np.eye(count):
+                extremes.append((p, plan.maximise(unit)[0]))
+                self.programs += 1
+                progress(0.3 * self.programs / (len(plans) * count))
+        points = np.array([*(point for _, point in extremes), *(plan.value for plan in plans)])
         spread = points.max(axis=0) - points.min(axis=0)
         size = np.abs(points).max(axis=0)
-        self.spread = np.where(spread > 1e-7 * size + NOTHING, spread, 0.0)
+        self.spread = np.where(spread > 1e-7 * size + TINY, spread, 0.0)
         self._moves = self.spread > 0
         if not self._moves.any():
             raise CirlError("infer: nothing that can be done changes any of the terms")
-        self._rows = [self._row(p, each) for p, each in reached]
+        self._rows = [self._row(p, point) for p, point in extremes]
 
     @property
     def cuts(self) -> Floats:
         """All inequalities, shape (cuts, terms)."""
         return np.array(self._rows)
 
-    def _row(self, plan: int, terms_: Floats) -> Floats:
-        gain = terms_ - self._plans[plan].value
-        row: Floats = np.divide(gain, self.spread, out=np.zeros_like(gain), where=self._moves)
-        return row
+    def _per_spread(self, values: Floats) -> Floats:
+        """Divide by how much of each term there is to be had; 0 for what nothing changes."""
+        quotient: Floats = np.divide(values, self.spread, out=np.zeros_like(values), where=self._moves)
+        return quotient
+
+    def _row(self, plan: int, point: Floats) -> Floats:
+        return self._per_spread(point - self._plans[plan].value)
 
     def _worst(self, shares: Floats) -> float:
         """Look for what breaks inequalities most for some shares; return by how much the plans are off, proved."""
-        weights = np.divide(shares, self.spread, out=np.zeros_like(shares), where=self._moves)
+        weights = self._per_spread(shares)
         worst = 0.0  # a plan that is outside of what the rows allow may be better than all of it
         for p, plan in enumerate(self._plans):
-            reached, most = plan.against(weights)
-            self.solved += 1
-            self._rows.append(self._row(p, reached))
-            worst = max(worst, most - float(weights @ plan.value))
+            point, bound = plan.maximise(weights)
+            self.programs += 1
+            self._rows.append(self._row(p, point))
+            worst = max(worst, bound - float(weights @ plan.value))
         return worst
 
     def closest(self) -> tuple[Floats, float]:
         """Return the shares under which plans are closest to the best, and how far they are then."""
         best, least = np.zeros(self._count), np.inf
         for _ in range(ROUNDS):
-            shares, promised = self._solved(np.append(np.zeros(self._count), 1.0), None)
-            found = self._worst(shares)
-            if found < least:
-                best, least = shares, found
-            if least <= promised + CLOSE:
+            shares, outside = self._minimise(np.append(np.zeros(self._count), 1.0), None)
+            distance = self._worst(shares)
+            if distance < least:
+                best, least = shares, distance
+            if least <= outside + CLOSE:
                 break
         self._progress(0.4)
         return best, least
 
-    def ends(self, allowed: float) -> tuple[Floats, Floats, list[Floats]]:
-        """Return the least and the greatest share of each term, and the shares at which they are reached."""
-        low, high, corners = np.zeros(self._count), np.zeros(self._count), list[Floats]()
-        low[~self._moves], high[~self._moves] = 0.0, 1.0
-        moving = np.flatnonzero(self._moves)
-        for place, j in enumerate(moving.tolist()):
-            for way, ends in ((1.0, low), (-1.0, high)):
+    def ends(self, distance: float) -> tuple[Floats, Floats, list[Floats]]:
+        """Return the least and the greatest share of each term within a distance, and the shares where they are."""
+        low, high, corners = np.zeros(self._count), np.where(self._moves, 0.0, 1.0), list[Floats]()
+        movable = np.flatnonzero(self._moves).tolist()
+        for place, j in enumerate(movable):
+            for sign, ends in ((1.0, low), (-1.0, high)):
+                cost = np.append(sign * np.eye(self._count)[j], 0.0)
                 for _ in range(ROUNDS):
-                    shares, _ = self._solved(np.append(way * np.eye(self._count)[j], 0.0), allowed)
-                    if self._worst(shares) <= allowed + CLOSE:
+                    shares, _ = self._minimise(cost, distance)
+                    if self._worst(shares) <= distance + CLOSE:
                         break
                 ends[j] = shares[j]
                 corners.append(shares)
-            self._progress(0.4 + 0.6 * (place + 1) / len(moving))
+            self._progress(0.4 + 0.6 * (place + 1) / len(movable))
         return low, high, corners
 
-    def _solved(self, cost: Floats, allowed: float | None) -> tuple[Floats, float]:
+    def _minimise(self, cost: Floats, most: float | None) -> tuple[Floats, float]:
         """Return shares, and the distance, that minimise a cost under the inequalities that are known."""
         rows = np.concatenate([self.cuts, np.full((len(self._rows), 1), -1.0)], axis=1)
         limits = [(0.0, 1.0 if moves else 0.0) for moves in self._moves]
-        last = (0.0, None) if allowed is None else (0.0, allowed)
         total = np.append(self._moves.astype(float), 0.0)[None]
-        found = linprog(cost, A_ub=rows, b_ub=np.zeros(len(rows)), A_eq=total, b_eq=[1.0], bounds=[*limits, last])
-        if not found.success:
-            raise CirlError(f"infer: no weights satisfy what was found: {found.message}")
-        shares = np.maximum(found.x[:-1], 0.0)
-        return shares / shares.sum(), float(found.x[-1])
+        bounds = [*limits, (0.0, most)]
+        solution = linprog(cost, A_ub=rows, b_ub=np.zeros(len(rows)), A_eq=total, b_eq=[1.0], bounds=bounds)
+        if not solution.success:
+            raise CirlError(f"infer: no weights satisfy what was found: {solution.message}")
+        shares = np.maximum(solution.x[:-1], 0.0)
+        return shares / shares.sum(), float(solution.x[-1])

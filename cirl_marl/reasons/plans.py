@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ def episodes_of_plan(
     """Return the episodes of a plan.
 
     A table with stocks and flows, as ``cirl simulate`` writes it, is taken as it is. One with controls alone, as
-    ``cirl plan`` writes it, is carried out again from ``beginning``. The policies of a run play fresh episodes.
+    ``cirl plan`` writes it, is carried out again from ``episode_start``. The policies of a run play fresh episodes.
 
     Args:
         network: of which the plan is.
@@ -44,11 +44,11 @@ def episodes_of_plan(
     """
     path = Path(plan)
     if path.is_dir():
-        return _of_run(RunDirectory(path), 0 if seed is None else seed, episodes)
-    header, rows = _table(path)
-    if any(each.startswith("stock of ") for each in header):
-        return [_of_trajectory(network, path, header, rows)]
-    return [_of_controls(network, path, header, rows, seed)]
+        return _episodes_of_run(RunDirectory(path), first_seed(0 if seed is None else seed), episodes)
+    table = _Table(path)
+    if any(name.startswith("stock of ") for name in table.header):
+        return [_simulated_episode(network, table)]
+    return [_carry_out(network, table, seed)]
 
 
 def episode_setting(network: Network, plans: Sequence[object]) -> tuple[Network, tuple[str, ...] | None]:
@@ -57,132 +57,128 @@ def episode_setting(network: Network, plans: Sequence[object]) -> tuple[Network,
     Raises:
         RunError: for a run of another network, or of another horizon or other agents than the first.
     """
-    found, agents = network, None
+    setting, agents = network, None
     for plan in plans:
         if not isinstance(plan, str | Path) or not Path(plan).is_dir():
             continue
         run = RunDirectory(plan)
         env = run.make_env(1, uncertain=False)
-        theirs = env.network
-        if _parts(theirs) != _parts(network):
+        if _parts(env.network) != _parts(network):
             raise RunError(
-                f"{run.path}: was trained on '{theirs.name}', scenario '{theirs.scenario_name}', not on this"
+                f"{run.path}: was trained on '{env.network.name}', scenario '{env.network.scenario_name}', not on this"
                 f" '{network.name}', scenario '{network.scenario_name}'; what it was trained on is {run.definition}"
             )
-        if agents is not None and (theirs.episode, env.agents) != (found.episode, agents):
-            steps = f"{theirs.episode.horizon} steps of {len(env.agents)} agents"
+        if agents is not None and (env.network.episode, env.agents) != (setting.episode, agents):
+            steps = f"{env.network.episode.horizon} steps of {len(env.agents)} agents"
             raise RunError(f"{run.path}: its episodes are {steps}, those of another run are not")
-        found, agents = theirs, env.agents
-    return found, agents
+        setting, agents = env.network, env.agents
+    return setting, agents
 
 
 def _parts(network: Network) -> tuple[object, ...]:
     return network.nodes, network.arcs, network.services, network.objective, network.episode.control_interval
 
 
-def _table(path: Path) -> tuple[list[str], list[list[str]]]:
-    if not path.is_file():
-        raise CirlError(f"{path}: no such file; a plan is a CSV file of cirl plan or cirl simulate, or a run")
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            header, *rows = list(csv.reader(file))
-    except (ValueError, UnicodeDecodeError, csv.Error) as error:
-        raise CirlError(f"{path}: is no CSV file with a header: {error}") from error
-    for line, row in enumerate(rows, 2):
-        if len(row) != len(header):
-            raise CirlError(f"{path}, line {line}: has {len(row)} cells, the header has {len(header)}")
-    return header, rows
+class _Table:
+    """A CSV file with a header, whose errors name the file, the line and the column."""
+
+    def __init__(self, path: Path) -> None:
+        """Read it; a ``CirlError`` if it cannot be."""
+        if not path.is_file():
+            raise CirlError(f"{path}: no such file; a plan is a CSV file of cirl plan or cirl simulate, or a run")
+        self.path = path
+        try:
+            with path.open(newline="", encoding="utf-8") as file:
+                self.header, *self.rows = list(csv.reader(file))
+        except (ValueError, UnicodeDecodeError, csv.Error) as error:
+            raise CirlError(f"{path}: is no CSV file with a header: {error}") from error
+        for line, row in enumerate(self.rows, 2):
+            if len(row) != len(self.header):
+                raise CirlError(f"{path}, line {line}: has {len(row)} cells, the header has {len(self.header)}")
+
+    def check_steps(self, network: Network, intervals: int) -> None:
+        """Check how many intervals it has, which are those of an episode."""
+        steps = network.episode.horizon
+        if intervals != steps:
+            raise CirlError(f"{self.path}: has {intervals} intervals, an episode of '{network.name}' has {steps}")
+
+    def column(self, name: str, first: int = 0) -> Floats:
+        """Return the numbers of a column from a row on."""
+        if name not in self.header:
+            raise CirlError(f"{self.path}: {unknown('column', name, self.header)} It is no plan of this network")
+        place, numbers = self.header.index(name), []
+        for line, row in enumerate(self.rows[first:], first + 2):
+            try:
+                numbers.append(float(row[place]))
+            except ValueError:
+                numbers.append(math.nan)
+            if not math.isfinite(numbers[-1]):
+                raise CirlError(f"{self.path}, line {line}: '{name}' is {row[place]!r}, not a number")
+        return np.array(numbers)
 
 
-def _number(path: Path, line: int, column: str, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise CirlError(f"{path}, line {line}: '{column}' is {cell!r}, not a number")
-    return value
+def _simulated_episode(network: Network, table: _Table) -> PlannedEpisode:
+    mass = network.mass_unit
+    table.check_steps(network, len(table.rows) - 1)
+    stocks = [f"stock of {node.id} ({mass})" for node in network.stores]
+    flows = [f"flow of {arc.id} ({mass}/{network.time_unit})" for arc in network.arcs]
+    for name in table.header:
+        if name.startswith(("stock of ", "flow of ")) and name not in {*stocks, *flows}:
+            columns = sorted({*stocks, *flows})
+            raise CirlError(f"{table.path}: {unknown('column', name, columns)} It is a plan of another network")
+    stock = np.array([table.column(name) for name in stocks]).T
+    flow = np.array([table.column(name, 1) for name in flows]).T
+    return PlannedEpisode(str(table.path), by_stage(network, stock[0]), stock[1:], flow)
 
 
-def _column(path: Path, header: list[str], rows: list[list[str]], name: str, first: int = 0) -> Floats:
-    if name not in header:
-        raise CirlError(f"{path}: {unknown('column', name, header)} It is no plan of this network")
-    place = header.index(name)
-    return np.array([_number(path, first + i + 2, name, row[place]) for i, row in enumerate(rows[first:])])
-
-
-def _of_trajectory(network: Network, path: Path, header: list[str], rows: list[list[str]]) -> PlannedEpisode:
-    mass, steps = network.mass_unit, network.episode.horizon
-    rate = f"{mass}/{network.time_unit}"
-    if len(rows) != steps + 1:
-        raise CirlError(f"{path}: has {len(rows) - 1} intervals, an episode of '{network.name}' has {steps}")
-    wanted = [f"stock of {node.id} ({mass})" for node in network.stores]
-    known = {*wanted, *(f"flow of {arc.id} ({rate})" for arc in network.arcs)}
-    for each in header:
-        if each.startswith(("stock of ", "flow of ")) and each not in known:
-            raise CirlError(f"{path}: {unknown('column', each, sorted(known))} It is a plan of another network")
-    stock = np.array([_column(path, header, rows, each) for each in wanted]).T
-    flow = np.array([_column(path, header, rows, f"flow of {arc.id} ({rate})", 1) for arc in network.arcs]).T
-    return PlannedEpisode(str(path), by_stage(network, stock[0]), stock[1:], flow)
-
-
-class _Given(Controller):
-    """Holds controls that a table has."""
+class _TableController(Controller):
+    """Acts as a table of physical controls says, shape (entries, steps)."""
 
     def __init__(self, values: Floats) -> None:
-        """Take physical values, shape (entries, steps)."""
         self._values, self._step = values, 0
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        self._env, self._step = env, 0
-        self._actuators = Actuators(env.network, env.agents, 1)
+        self._step, self._actuators = 0, Actuators(env.network, env.agents, 1)
 
     def act(self, observations: Arrays) -> Arrays:
         step = np.array([self._step])
-        found: Mapping[str, Floats] = {
-            agent: self._actuators.normalise(agent, self._values[entries, self._step][:, None], step).T
+        self._step += 1
+        return {
+            agent: self._actuators.normalise(agent, self._values[entries][:, step], step).T
             for agent, entries in self._actuators.entries.items()
         }
-        self._step += 1
-        return found
 
 
-def _of_controls(
-    network: Network, path: Path, header: list[str], rows: list[list[str]], seed: int | None
-) -> PlannedEpisode:
+def _carry_out(network: Network, table: _Table, seed: int | None) -> PlannedEpisode:
     env = MultiAgentVectorEnv(network, num_envs=1)
-    steps = network.episode.horizon
-    if len(rows) != steps:
-        raise CirlError(f"{path}: has {len(rows)} intervals, an episode of '{network.name}' has {steps}")
-    values = np.array([_column(path, header, rows, name) for name in control_names(network, env.agents)])
-    begun = episode_start(env, seed)
-    begun.reset(env)
+    table.check_steps(network, len(table.rows))
+    values = np.array([table.column(name) for name in control_names(network, env.agents)])
+    start = episode_start(env, seed)
+    start.reset(env)
     initial = _stocks(env)
-    run = rollout(env, _Given(values), seed=begun.seed, start=begun.initial_state)
-    told = _column(path, header, rows, f"mean circularity ({network.mass_unit})")
-    found = run.circularity_mean[0]
-    if not np.allclose(found, told, rtol=ALIKE, atol=ALIKE * float(np.abs(found).max(initial=0.0))):
+    episode = rollout(env, _TableController(values), seed=start.seed, start=start.initial_state)
+    mass, written = network.mass_unit, table.column(f"mean circularity ({network.mass_unit})")
+    circularity = episode.circularity_mean[0]
+    if not np.allclose(circularity, written, rtol=ALIKE, atol=ALIKE * float(np.abs(circularity).max(initial=0.0))):
         raise CirlError(
-            f"{path}: carried out from {begun.description} its mean circularity is {found.mean():.6g} "
-            f"{network.mass_unit}, but the file says {told.mean():.6g}: "
-            "it is of another start (--seed), scenario or definition"
+            f"{table.path}: carried out from {start.description} its mean circularity is {circularity.mean():.6g} "
+            f"{mass}, but the file says {written.mean():.6g}: it is of another start (--seed), scenario or definition"
         )
-    return PlannedEpisode(str(path), initial, run.stock, run.flow)
+    return PlannedEpisode(str(table.path), initial, episode.stock, episode.flow)
 
 
 def _stocks(env: MultiAgentVectorEnv) -> Floats:
     """Return the stocks of the only copy, shape (stocks,), as the simulator has them."""
-    found: Floats = env.physical.stock[env.rows.nodes][:, 0].copy()
-    return found
+    stocks: Floats = env.physical.stock[env.rows.nodes][:, 0].copy()
+    return stocks
 
 
-def _of_run(run: RunDirectory, seed: int, episodes: int) -> list[PlannedEpisode]:
+def _episodes_of_run(run: RunDirectory, seed: int, count: int) -> list[PlannedEpisode]:
     from cirl_marl.learners.interface import Trained  # it needs torch
 
-    policies, env, found = Trained(run), run.make_env(1, uncertain=False), []
-    for episode in range(episodes):
-        first = first_seed(seed) + episode
-        env.reset(seed=first)
-        initial, played = _stocks(env), rollout(env, policies, seed=first)
-        found.append(PlannedEpisode(f"{run.path}, episode {episode + 1}", initial, played.stock, played.flow))
-    return found
+    policies, env, episodes = Trained(run), run.make_env(1, uncertain=False), []
+    for episode in range(count):
+        env.reset(seed=seed + episode)
+        initial, outcome = _stocks(env), rollout(env, policies, seed=seed + episode)
+        episodes.append(PlannedEpisode(f"{run.path}, episode {episode + 1}", initial, outcome.stock, outcome.flow))
+    return episodes

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,11 +12,11 @@ from numpy.typing import ArrayLike
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
-from cirl_marl.network.elements import Arc, Compartment, Control, Node
+from cirl_marl.network.elements import Arc, Control, Node
 from cirl_marl.network.series import in_intervals
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.bounds import Bound, bound, highest_service
-from cirl_marl.optimum.program import Program, Programs
+from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.sensitivity import changes, of_stocks, resting_on_rows
 
 PERCENT = 0.01
@@ -85,30 +84,28 @@ def shadow_prices(
 
     References: Boyd and Vandenberghe 2004, Convex Optimization, section 5.6.
     """
-    found = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
-    if min_service is None and found.services:
-        min_service = WITHIN_REACH * highest_service(found)
-    best = bound(found, initial, min_service=min_service, agents=agents)
+    network = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    if min_service is None and network.services:
+        min_service = WITHIN_REACH * highest_service(network)
+    best = bound(network, initial, min_service=min_service, agents=agents)
     progress(0.3)
-    admissible = Admissible.of(found, agents)
+    admissible = Admissible.of(network, agents)
     programs = Programs(admissible, best.degree, None)
     best = resting_on_rows(best, admissible)
-    progress(0.5)
-    steps, services = found.episode.horizon, len(found.services)
+    steps, services = network.episode.horizon, len(network.services)
     demand, room = np.zeros((steps, services)), np.zeros((2, steps, len(best.agents)))
-    to_do, done = services + 2 * len(best.agents), 0
+    shares = iter(np.linspace(0.5, 1.0, services + 2 * len(best.agents) + 1).tolist())
+    progress(next(shares))
     for s in range(services):
         step = DIFFERENCE * max(float(admissible.service_low[:, s].max()), 1.0)
         served = admissible.service_low.copy()
         served[:, s] += step
         demand[:, s] = _slope(best, admissible, replace(admissible, service_low=served)) / step
-        done += 1
-        progress(0.5 + 0.5 * done / to_do)
+        progress(next(shares))
     for a, agent in enumerate(best.agents):
         for side in range(2):
             room[side, :, a] = _worth_of_room(best, admissible, agent, side)
-            done += 1
-            progress(0.5 + 0.5 * done / to_do)
+            progress(next(shares))
     # the last rows of the program hold each service to its level
     level = best.certificate.under[len(best.certificate.under) - services :]
     return ShadowPrices(
@@ -120,16 +117,13 @@ def shadow_prices(
     )
 
 
-def _program(best: Bound, admissible: Admissible) -> Program:
-    ours, theirs = best.network, admissible.lifetimes.network
-    initial = best.initial.copy()
+def _slope(best: Bound, admissible: Admissible, variant: Admissible) -> Floats:
+    """Return the rise of λ̄ by interval with the program of a variant of what is admissible."""
+    initial, network = best.initial.copy(), best.network
     # a source without a known reserve starts with all that may be asked of it
-    initial[: len(ours.stores)] += (theirs.initial - ours.initial).mean(axis=0)
-    return Programs(admissible, best.degree, None).program(initial, best.min_service)
-
-
-def _slope(best: Bound, admissible: Admissible, other: Admissible) -> Floats:
-    return changes(best, admissible, _program(best, other))
+    initial[: len(network.stores)] += (variant.lifetimes.network.initial - network.initial).mean(axis=0)
+    program = Programs(variant, best.degree, None).program(initial, best.min_service)
+    return changes(best, admissible, program)
 
 
 def _worth_of_room(best: Bound, admissible: Admissible, agent: str, side: int) -> Floats:
@@ -139,14 +133,14 @@ def _worth_of_room(best: Bound, admissible: Admissible, agent: str, side: int) -
     if not values.any():
         return np.zeros(len(values))
     outwards = (-1.0, 1.0)[side] * np.sign(values)
-    # a share of 1 cannot grow, and a faster flow may take another number of pieces: then the slope the other way
-    for way in (1.0, -1.0):
+    # a share of 1 cannot grow, and a faster flow may take another number of pieces: then the slope inwards
+    for sign in (1.0, -1.0):
         try:
-            moved = with_bound(network, agent, side, values * (1 + way * outwards * DIFFERENCE))
-            rise = _slope(best, admissible, Admissible.of(moved, best.agents))
+            variant = with_bound(network, agent, side, values * (1 + sign * outwards * DIFFERENCE))
+            rise = _slope(best, admissible, Admissible.of(variant, best.agents))
         except (CirlError, ValueError):
             continue
-        return rise * way * PERCENT / DIFFERENCE
+        return rise * sign * PERCENT / DIFFERENCE
     raise CirlError(f"network '{network.name}': no other bound of the control of '{agent}' makes a like program")
 
 
@@ -159,20 +153,14 @@ def with_bound(network: Network, agent: str, side: int, values: Floats) -> Netwo
         NetworkError: if the control cannot have them.
     """
     compartment = network.compartments[agent]
-    assert compartment.control is not None
+    assert isinstance(compartment, Arc | Node) and compartment.control is not None
     bounds = network.control_bounds[:, network.control_rows[agent].start].copy()
     bounds[2 * side] = values
     bounds[1] = np.clip(bounds[1], bounds[0], bounds[2])
     interval = network.episode.control_interval
-    low, neutral, high = (in_intervals(each, interval) for each in bounds)
+    low, neutral, high = (in_intervals(series, interval) for series in bounds)
     control = Control(kind=compartment.control.kind, low=low, neutral=neutral, high=high)
-    return _with(network, replace(compartment, control=control))
-
-
-def _with(network: Network, compartment: Compartment) -> Network:
-    changed: dict[str, Any] = {"scenarios": {}}
-    if isinstance(compartment, Arc):
-        changed["arcs"] = tuple(compartment if each.id == compartment.id else each for each in network.arcs)
-    elif isinstance(compartment, Node):
-        changed["nodes"] = tuple(compartment if each.id == compartment.id else each for each in network.nodes)
-    return replace(network, **changed)
+    variant = replace(compartment, control=control)
+    nodes = tuple(variant if node.id == agent else node for node in network.nodes)
+    arcs = tuple(variant if arc.id == agent else arc for arc in network.arcs)
+    return replace(network, nodes=nodes, arcs=arcs, scenarios={})  # type: ignore[arg-type]
