@@ -198,7 +198,7 @@ def test_copies_are_folded_in_pictures(folder: Path) -> None:
     open_, _, _ = fold_copies(found, stock, flow, ["japan"])
     shown = {arc.id for arc in open_.arcs}
     assert {"japan_sold", "japan_ore", "china_to_between"} <= shown and "china_sold" not in shown
-    save_network(folder / "seen.png", found, stock, flow, unfolded=["japan"])
+    save_network(folder / "seen.png", found, stock, flow, open_copies=["japan"])
     assert (folder / "seen.png").stat().st_size > 1000
     with pytest.raises(CirlError, match=r"unknown copy to unfold 'jpan'\. Did you mean 'japan'\?"):
         fold_copies(found, stock, flow, ["jpan"])

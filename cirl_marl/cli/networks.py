@@ -100,7 +100,7 @@ def show(
     path = picture or Path(f"{stem(found)}.png")
     if path.suffix != ".png":
         raise CirlError(f"--picture {path}: needs the name of a .png file")
-    save_network(path, found, stock, flow, title=found.title, circularity=circularity, unfolded=unfold or ())
+    save_network(path, found, stock, flow, title=found.title, circularity=circularity, open_copies=unfold or ())
     console.print(f"picture: {path}")
 
 

@@ -81,8 +81,8 @@ class Canvas:
         network, stock, flow = fold_copies(self._network, stock, flow)
         reference = max(self._reference, largest_flow(flow))
         calendar, dates = labels(network, time)
-        when = [*calendar, *dates[0]] if dates else [network.time_unit, number(time)]
-        title = f"{readable(network.name)}, {' '.join(when)}"
+        moment = [*calendar, *dates[0]] if dates else [network.time_unit, number(time)]
+        title = f"{readable(network.name)}, {' '.join(moment)}"
         draw_network(self._axes, network, stock, flow, title=title, circularity=circularity, reference_flow=reference)
         self._agg.draw()  # type: ignore[no-untyped-call]
         pixels = np.asarray(self._agg.buffer_rgba())  # type: ignore[no-untyped-call]
@@ -104,14 +104,14 @@ def save_network(
     flow: Floats,
     title: str = "",
     circularity: float | None = None,
-    unfolded: Collection[str] = (),
+    open_copies: Collection[str] = (),
 ) -> Path:
     """Save the digraph with its stocks and flows as a PNG, 1800 pixels wide, and return its path.
 
-    Its folder is made; without a title it has that of the network. Copies are folded, but for those ``unfolded``. For
-    the other arguments see ``draw_network``.
+    Its folder is made; without a title it has that of the network. Copies are folded, but for ``open_copies``. For the
+    other arguments see ``draw_network``.
     """
-    network, stock, flow = fold_copies(network, stock, flow, unfolded)
+    network, stock, flow = fold_copies(network, stock, flow, open_copies)
     figure = Figure(figsize=FRAME_INCHES)
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.87))
     draw_network(axes, network, stock, flow, title=title, circularity=circularity)
@@ -140,7 +140,7 @@ def save_before_after(
     reference = max(largest_flow(np.asarray(flow)) for _, flow in (before, after))
     for column, ((stock, flow), label, value) in enumerate(zip((before, after), labels, circularity, strict=True)):
         axes = figure.add_axes((0.005 + 0.5 * column, 0.1, 0.49, 0.78))
-        shown, stock, flow = fold_copies(network, stock, flow)
-        draw_network(axes, shown, stock, flow, title=label, circularity=value, reference_flow=reference, legend=False)
+        drawing, stock, flow = fold_copies(network, stock, flow)
+        draw_network(axes, drawing, stock, flow, title=label, circularity=value, reference_flow=reference, legend=False)
     figure.legend(**legend_of(network, reference), loc="lower center", ncols=3)
     return save(figure, path)

@@ -83,8 +83,8 @@ def _layout(structure: _Structure, aspect: float) -> DigraphLayout:
     letters = max(len(line) for name in names for line in name)
     box = np.array([max(5.5, 0.62 * letters + 1.0), 1.2 * (max(map(len, names)) + 1) + 0.6])
     positions = place_nodes(network, box + np.array([4.8, 3.7]), aspect)
-    labelled = len(network.nodes) <= LABELLED_NODES and len(network.arcs) <= LABELLED_ARCS
-    routes = route(positions, network.donors, network.recipients, box) if labelled else None
+    has_labels = len(network.nodes) <= LABELLED_NODES and len(network.arcs) <= LABELLED_ARCS
+    routes = route(positions, network.donors, network.recipients, box) if has_labels else None
     return DigraphLayout(positions, routes, box, names)
 
 
@@ -118,25 +118,25 @@ def route(positions: Floats, donors: Integers, recipients: Integers, box: Floats
         bends = np.array([bend for bend in BENDS if bend >= MUTUAL_BEND or not mutual])
         ends = np.repeat(positions[[donor, recipient]][:, None], len(bends), axis=1)
         trials = bezier(ends[0], ends[1], bends, POINTS)
-        trials = np.stack([_clipped(trial, positions[donor], positions[recipient], box) for trial in trials])
-        others = np.delete(positions, [donor, recipient], axis=0)
-        price = 2.5 * np.abs(bends) + _inside(trials, others, box + 1.2) + _crowded(trials, curves[done])
+        trials = np.stack([_outside_boxes(trial, positions[donor], positions[recipient], box) for trial in trials])
+        other_nodes = np.delete(positions, [donor, recipient], axis=0)
+        price = 2.5 * np.abs(bends) + _inside(trials, other_nodes, box + 1.2) + _closeness(trials, curves[done])
         curves[arc] = trials[int(np.argmin(price))]
         done.append(arc)
     return Routes(curves, _labels(curves, positions, box))
 
 
-def _clipped(curve: Floats, donor: Floats, recipient: Floats, box: Floats) -> Floats:
+def _outside_boxes(curve: Floats, donor: Floats, recipient: Floats, box: Floats) -> Floats:
     """Cut off what lies in the boxes of the two ends and space the rest evenly again."""
     fine = np.linspace(0, 1, 4 * POINTS)
     share = np.linspace(0, 1, len(curve))
     dense = np.stack([np.interp(fine, share, curve[:, axis]) for axis in (0, 1)], axis=1)
     reach = box / 2 + 0.15
     free = ~((np.abs(dense - donor) < reach).all(axis=1) | (np.abs(dense - recipient) < reach).all(axis=1))
-    kept = dense[free] if free.sum() > 1 else dense
-    step = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(kept, axis=0).T))])
+    outside = dense[free] if free.sum() > 1 else dense
+    step = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(outside, axis=0).T))])
     even = np.linspace(0, step[-1], POINTS)
-    return np.stack([np.interp(even, step, kept[:, axis]) for axis in (0, 1)], axis=1)
+    return np.stack([np.interp(even, step, outside[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def _inside(trials: Floats, centres: Floats, box: Floats) -> Floats:
@@ -145,26 +145,26 @@ def _inside(trials: Floats, centres: Floats, box: Floats) -> Floats:
     return np.asarray(inside.sum(axis=(1, 2)) * 0.5)
 
 
-def _crowded(trials: Floats, done: Floats) -> Floats:
+def _closeness(trials: Floats, curves: Floats) -> Floats:
     """Price of running close to earlier arcs, shape (trials,)."""
-    if not len(done):
+    if not len(curves):
         return np.zeros(len(trials))
-    others = done[:, ::3].reshape(-1, 2)
-    away = np.hypot(*np.moveaxis(trials[:, ::3, None] - others, -1, 0))
+    points = curves[:, ::3].reshape(-1, 2)
+    away = np.hypot(*np.moveaxis(trials[:, ::3, None] - points, -1, 0))
     return np.asarray(np.clip(1.3 - away, 0, None).sum(axis=(1, 2)) * 0.25)
 
 
 def _labels(curves: Floats, positions: Floats, box: Floats) -> Floats:
     """Put each label beside its arc where it hides least of boxes, arcs and earlier labels."""
-    placed = np.zeros((len(curves), 2))
+    places = np.zeros((len(curves), 2))
     for arc, curve in enumerate(curves):
         centres, price = _beside(curve)
-        price += _overlap(centres, positions, box + LABEL) * 15 + _overlap(centres, placed[:arc], 2 * LABEL) * 8
-        others = np.delete(curves, arc, axis=0)[:, ::2]
-        covered = (np.abs(centres[:, None, None] - others) < LABEL / 2 + 0.5).all(axis=-1)
-        price += covered.sum(axis=(1, 2)) * 0.6
-        placed[arc] = centres[int(np.argmin(price))]
-    return placed
+        price += _overlap(centres, positions, box + LABEL) * 15 + _overlap(centres, places[:arc], 2 * LABEL) * 8
+        other_curves = np.delete(curves, arc, axis=0)[:, ::2]
+        hidden_curves = (np.abs(centres[:, None, None] - other_curves) < LABEL / 2 + 0.5).all(axis=-1)
+        price += hidden_curves.sum(axis=(1, 2)) * 0.6
+        places[arc] = centres[int(np.argmin(price))]
+    return places
 
 
 def _beside(curve: Floats) -> tuple[Floats, Floats]:
@@ -182,7 +182,7 @@ def _beside(curve: Floats) -> tuple[Floats, Floats]:
     return np.array(centres), np.array(price)
 
 
-def _overlap(centres: Floats, others: Floats, size: Floats) -> Floats:
+def _overlap(centres: Floats, rivals: Floats, size: Floats) -> Floats:
     """Shared area, in labels, of boxes whose half sizes sum to half of ``size``, shape (centres,)."""
-    shared = np.clip(size / 2 - np.abs(centres[:, None] - others), 0, LABEL)
-    return np.asarray(shared.prod(axis=-1).sum(axis=1) / LABEL.prod())
+    overlap = np.clip(size / 2 - np.abs(centres[:, None] - rivals), 0, LABEL)
+    return np.asarray(overlap.prod(axis=-1).sum(axis=1) / LABEL.prod())

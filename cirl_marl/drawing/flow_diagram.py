@@ -85,7 +85,7 @@ def arrange_boxes(
     group: str, boxes: list[Box], ribbons: list[Ribbon], peaks: Floats, layers: Integers | None = None
 ) -> FlowDiagram:
     """Find the places of boxes and ribbons whose arcs carry at most ``peaks``; in ``layers``, if they are given."""
-    most = np.array([peaks[list(each.members)].sum() for each in ribbons])
+    most = np.array([peaks[list(ribbon.members)].sum() for ribbon in ribbons])
     donors, recipients = (np.array([getattr(r, end) for r in ribbons], dtype=np.intp) for end in ("donor", "recipient"))
     caption = LINE * (1 + max((len(lines(box.label, HORIZONTAL)) for box in boxes), default=0))
     weaves, breadths, scales = {}, {}, {}

@@ -26,7 +26,7 @@ class FoldedNetwork(Network):
 
 
 def fold_copies(
-    network: Network, stock: Floats, flow: Floats, unfolded: Collection[str] = ()
+    network: Network, stock: Floats, flow: Floats, open_copies: Collection[str] = ()
 ) -> tuple[Network, Floats, Floats]:
     """Return a network with its stocks and flows in which each copy is one box; one without copies is left as it is.
 
@@ -37,17 +37,17 @@ def fold_copies(
         network: the network.
         stock: stocks, shape (stores,), mass.
         flow: flows, shape (arcs,), mass/time.
-        unfolded: copies that are shown as they are.
+        open_copies: copies that are shown as they are.
 
     Raises:
         CirlError: if there is no copy of that name.
     """
-    for region in unfolded:
+    for region in open_copies:
         if region not in network.copies:
             raise CirlError(f"network '{network.name}': {unknown('copy to unfold', region, network.copies)}")
     if not network.copies:
         return network, stock, flow
-    regions = {node: region for region, nodes in network.copies.items() for node in nodes if region not in unfolded}
+    regions = {node: region for region, nodes in network.copies.items() for node in nodes if region not in open_copies}
     box_of = {node.id: _box(node, regions.get(node.id), network) for node in network.nodes}
     boxes = {box.id: box for box in box_of.values()}
     held, scales = dict.fromkeys(boxes, 0.0), dict.fromkeys(boxes, 0.0)
@@ -55,27 +55,27 @@ def fold_copies(
         held[box_of[node.id].id] += amount
         scales[box_of[node.id].id] += node.scale  # reference stocks add up as stocks do
     nodes = tuple(replace(box, scale=scales[box.id] or box.scale) for box in boxes.values())
-    moved: dict[tuple[str, str], float] = {}
-    kept: list[tuple[Arc, float]] = []
+    flows: dict[tuple[str, str], float] = {}
+    visible: list[tuple[Arc, float]] = []
     for arc, value in zip(network.arcs, flow.tolist(), strict=True):
         ends = box_of[arc.donor].id, box_of[arc.recipient].id
         if ends == (arc.donor, arc.recipient):
-            kept.append((arc, value))
+            visible.append((arc, value))
         elif ends[0] != ends[1] and value != 0:
-            moved[ends] = moved.get(ends, 0.0) + value
-    arcs = [Arc(id=f"{a}_to_{b}", donor=a, recipient=b, law=Law.SHARE) for a, b in moved]
+            flows[ends] = flows.get(ends, 0.0) + value
+    arcs = [Arc(id=f"{a}_to_{b}", donor=a, recipient=b, law=Law.SHARE) for a, b in flows]
     fields = {name: getattr(network, name) for name in network.__dataclass_fields__}
-    fields |= {"nodes": nodes, "arcs": (*(arc for arc, _ in kept), *arcs), "services": (), "copies": {}}
-    found = FoldedNetwork(**fields)
-    stocks = np.array([held[node.id] for node in found.stores])
-    return found, stocks, np.array([*(value for _, value in kept), *moved.values()])
+    fields |= {"nodes": nodes, "arcs": (*(arc for arc, _ in visible), *arcs), "services": (), "copies": {}}
+    folded_network = FoldedNetwork(**fields)
+    stocks = np.array([held[node.id] for node in folded_network.stores])
+    return folded_network, stocks, np.array([*(value for _, value in visible), *flows.values()])
 
 
 def _box(node: Node, region: str | None, network: Network) -> Node:
     """Return the box that stands for a node of a folded region, or of none; itself if that is shown."""
     if region is None:
-        own = any(node.id in nodes for nodes in network.copies.values())
-        return node if own or node.stores else Node(id=MARKETS, title="Markets", stores=False)
+        in_copy = any(node.id in nodes for nodes in network.copies.values())
+        return node if in_copy or node.stores else Node(id=MARKETS, title="Markets", stores=False)
     if node.role is Role.TECHNOSPHERE:
         return Node(id=region, title=readable(region).title())
     name = {Role.NONRENEWABLE_RESERVOIR: "Reservoirs", Role.LANDFILL: "Landfills"}.get(node.role, readable(node.role))

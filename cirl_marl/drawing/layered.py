@@ -1,7 +1,10 @@
-"""Places for a flow diagram whose ribbons are as wide as their flows: layers, what passes between them, and loops.
+"""Layered layout (after Sugiyama) of a flow diagram whose ribbons are as wide as their flows.
 
-Compartments stand in layers, so that most of the mass moves forward. A flow that leads back runs in a lane of its own
-around what lies between: a loop is drawn as a loop. All is deterministic: the same flows give the same places.
+Nodes stand in layers, so that most of the mass moves forward; a ribbon that passes layers has a place of its own in
+each. A flow that leads back runs in a lane around what lies between: a loop is drawn as a loop. *Across* is the
+direction along a layer. All is deterministic: the same flows give the same places.
+
+References: Sugiyama, Tagawa and Toda 1981, Methods for visual understanding of hierarchical system structures.
 """
 
 from __future__ import annotations
@@ -50,7 +53,7 @@ class LayeredLayout:
     Attributes:
         layers: layer of each node, shape (nodes,).
         middles: centre of each node, across, shape (nodes,).
-        courses: one for each flow.
+        routes: one for each flow.
         breadth: of all, across.
     """
 
@@ -76,48 +79,47 @@ def layered_layout(
     pairs = list(zip(donors.tolist(), recipients.tolist(), strict=True))
     if layers is None:
         weights = widths + 1e-6 * max(1.0, float(widths.max(initial=0.0)))
-        order = _forward(len(breadths), donors, recipients, weights)
-        place = np.empty(len(breadths), dtype=np.intp)
-        place[order] = np.arange(len(order))
+        order = _forward_order(len(breadths), donors, recipients, weights)
+        place = np.argsort(order)
         ahead = place[donors] < place[recipients]
         layers = _layers(order, donors[ahead], recipients[ahead])
         ahead = layers[donors] < layers[recipients]
-        crowded = np.count_nonzero(~ahead) > MOST_LOOPS
-        back = _beside_others(pairs, ahead) if crowded else np.zeros(len(pairs), dtype=bool)
+        too_many = np.count_nonzero(~ahead) > MOST_LOOPS
+        back = _runs_beside(pairs, ahead) if too_many else np.zeros(len(pairs), dtype=bool)
     else:
         ahead, back = layers[donors] < layers[recipients], layers[donors] > layers[recipients]
-    threads = _LayerItems(layers, breadths, clearance)
+    items = _LayerItems(layers, breadths, clearance)
     links = [
-        threads.link(*(pair if forward else pair[::-1]), float(width)) if forward or backward else ()
+        items.link(*(pair if forward else pair[::-1]), float(width)) if forward or backward else ()
         for pair, width, forward, backward in zip(pairs, widths, ahead, back, strict=True)
     ]
-    middles = threads.positions()
-    courses = [
-        RibbonRoute(via=tuple(float(middles[item]) for item in link), back=bool(backward))
+    middles = items.positions()
+    routes = [
+        RibbonRoute(via=tuple(middles[list(link)].tolist()), back=bool(backward))
         for link, backward in zip(links, back, strict=True)
     ]
-    half = np.array(threads.sizes) / 2
-    for arc, course in _lanes(
-        np.flatnonzero(~ahead & ~back), layers[donors], layers[recipients], widths, threads, middles
-    ):
-        courses[arc] = course
-    edges = [(each.lane, LANE + width / 2) for each, width in zip(courses, widths.tolist(), strict=True) if each.side]
-    low = min([*(middles - half), *(lane - beside for lane, beside in edges)], default=0.0)
-    high = max([*(middles + half), *(lane + beside for lane, beside in edges)], default=0.0)
-    shifted = [
-        replace(each, via=tuple(at - low for at in each.via), lane=each.lane - low if each.side else 0.0)
-        for each in courses
+    half = np.array(items.sizes) / 2
+    loops = np.flatnonzero(~ahead & ~back)
+    for arc, route in _lanes(loops, layers[donors], layers[recipients], widths, items, middles):
+        routes[arc] = route
+    lanes = [(route.lane, LANE + width / 2) for route, width in zip(routes, widths.tolist(), strict=True) if route.side]
+    low = min([*(middles - half), *(lane - room for lane, room in lanes)], default=0.0)
+    high = max([*(middles + half), *(lane + room for lane, room in lanes)], default=0.0)
+    routes = [
+        replace(route, via=tuple(place - low for place in route.via), lane=route.lane - low if route.side else 0.0)
+        for route in routes
     ]
-    return LayeredLayout(layers, middles[: len(breadths)] - low, tuple(shifted), float(high - low))
+    return LayeredLayout(layers, middles[: len(breadths)] - low, tuple(routes), float(high - low))
 
 
-def _beside_others(pairs: Sequence[tuple[int, int]], ahead: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _runs_beside(pairs: Sequence[tuple[int, int]], ahead: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Whether each flow leads back between two nodes of which another leads forward, shape (arcs,)."""
-    forward = {pair for pair, each in zip(pairs, ahead, strict=True) if each}
-    return np.array([not each and pair[::-1] in forward for pair, each in zip(pairs, ahead, strict=True)], dtype=bool)
+    flags = ahead.tolist()
+    forward = {pair for pair, flag in zip(pairs, flags, strict=True) if flag}
+    return np.array([not flag and pair[::-1] in forward for pair, flag in zip(pairs, flags, strict=True)], dtype=bool)
 
 
-def _forward(count: int, donors: Integers, recipients: Integers, weights: Floats) -> list[int]:
+def _forward_order(count: int, donors: Integers, recipients: Integers, weights: Floats) -> list[int]:
     """Order the nodes so that little mass leads back: what only gives first, what only takes last.
 
     References: Eades, Lin and Smyth 1993, A fast and effective heuristic for the feedback arc set problem.
@@ -127,40 +129,36 @@ def _forward(count: int, donors: Integers, recipients: Integers, weights: Floats
         if donor != recipient:
             out[donor][recipient] += weight
             into[recipient][donor] += weight
-    left, first, last = set(range(count)), list[int](), list[int]()
-    while left:
-        ends = [node for node in sorted(left) if not out[node]]
-        sources = [node for node in sorted(left) if not into[node] and out[node]]
-        chosen = (
-            ends or sources or [max(sorted(left), key=lambda node: sum(out[node].values()) - sum(into[node].values()))]
-        )
-        for node in chosen:
-            left.discard(node)
-            for other in into[node]:
-                out[other].pop(node, None)
-            for other in out[node]:
-                into[other].pop(node, None)
-        if ends:
-            last = [*chosen, *last]
-        else:
-            first += chosen
+    rest, first, last = set(range(count)), list[int](), list[int]()
+    while rest:
+        sinks = [node for node in sorted(rest) if not out[node]]
+        sources = [node for node in sorted(rest) if not into[node] and out[node]]
+        # on a cycle, the node that gives most more than it takes opens it
+        surplus = {node: sum(out[node].values()) - sum(into[node].values()) for node in sorted(rest)}
+        nodes = sinks or sources or [max(surplus, key=lambda node: surplus[node])]
+        for node in nodes:
+            rest.discard(node)
+            for donor in into[node]:
+                out[donor].pop(node, None)
+            for recipient in out[node]:
+                into[recipient].pop(node, None)
+        first, last = (first, [*nodes, *last]) if sinks else ([*first, *nodes], last)
     return first + last
 
 
 def _layers(order: Sequence[int], donors: Integers, recipients: Integers) -> Integers:
     """Return the layer of each node: one behind the last of its donors, and sources close to whom they give."""
     layers = np.zeros(len(order), dtype=np.intp)
-    out, into = defaultdict[int, list[int]](list), defaultdict[int, list[int]](list)
-    for donor, recipient in zip(donors.tolist(), recipients.tolist(), strict=True):
-        out[donor].append(recipient)
-        into[recipient].append(donor)
     for node in order:
-        layers[node] = max((int(layers[donor]) + 1 for donor in into[node]), default=0)
+        layers[node] = (layers[donors[recipients == node]] + 1).max(initial=0)
     for node in reversed(order):
-        if not into[node] and out[node]:
-            layers[node] = min(int(layers[recipient]) for recipient in out[node]) - 1
-    used = {int(layer): i for i, layer in enumerate(sorted(set(layers.tolist())))}
-    return np.array([used[int(layer)] for layer in layers], dtype=np.intp)
+        if node in donors and node not in recipients:
+            layers[node] = layers[recipients[donors == node]].min() - 1
+    return np.asarray(np.unique(layers, return_inverse=True)[1], dtype=np.intp)
+
+
+Links = dict[int, list[tuple[int, float]]]
+"""What each item is tied to, and how strongly."""
 
 
 class _LayerItems:
@@ -170,15 +168,18 @@ class _LayerItems:
         self.layers: list[int] = layers.tolist()
         self.sizes: list[float] = breadths.tolist()
         self._nodes, self._clearance = len(self.sizes), clearance
-        self._links: list[tuple[int, int, float]] = []
+        self._before: Links = defaultdict(list)
+        self._behind: Links = defaultdict(list)
 
     def link(self, donor: int, recipient: int, width: float) -> tuple[int, ...]:
-        """Connect two nodes through new items in the layers between, and return these."""
-        passed = range(self.layers[donor] + 1, self.layers[recipient])
-        items = tuple(range(len(self.sizes), len(self.sizes) + len(passed)))
-        self.layers += passed
-        self.sizes += [max(width, LEAST_BREADTH)] * len(passed)
-        self._links += [(one, two, width + 0.1) for one, two in pairwise((donor, *items, recipient))]
+        """Connect two nodes through new items (dummy nodes) in the layers between, and return these."""
+        between = range(self.layers[donor] + 1, self.layers[recipient])
+        items = tuple(range(len(self.sizes), len(self.sizes) + len(between)))
+        self.layers += between
+        self.sizes += [max(width, LEAST_BREADTH)] * len(between)
+        for start, end in pairwise((donor, *items, recipient)):
+            self._behind[start].append((end, width + 0.1))
+            self._before[end].append((start, width + 0.1))
         return items
 
     def positions(self) -> Floats:
@@ -186,39 +187,28 @@ class _LayerItems:
         members: list[list[int]] = [[] for _ in range(max(self.layers, default=-1) + 1)]
         for item, place in enumerate(self.layers):
             members[place].append(item)
-        before: dict[int, list[tuple[int, float]]] = defaultdict(list)
-        behind: dict[int, list[tuple[int, float]]] = defaultdict(list)
-        for one, two, weight in self._links:
-            behind[one].append((two, weight))
-            before[two].append((one, weight))
         room = max((sum(map(self._room, layer)) for layer in members), default=0.0)
         at = [0.0] * len(self.sizes)
+        # sweeps forward and back put the layers in order; then both sides pull at once
         for sweep in range(SWEEPS):
-            for sides, layers in (((before,), members), ((behind,), members[::-1])):
+            for links, layers in ((self._before, members), (self._behind, members[::-1])):
                 for layer in layers:
-                    self._pull(layer, at, sides, 0.99**sweep, room)
+                    self._pull(layer, at, [links], 0.99**sweep, room)
         for _ in range(SWEEPS):
             for layer in members:
-                self._pull(layer, at, (before, behind), 0.5, room)
+                self._pull(layer, at, [self._before, self._behind], 0.5, room)
         return np.array(at)
 
     def _room(self, item: int) -> float:
         """Return the breadth of an item with what is kept free around it."""
         return self.sizes[item] + (self._clearance if item < self._nodes else NARROW)
 
-    def _pull(
-        self,
-        layer: list[int],
-        at: list[float],
-        sides: Sequence[dict[int, list[tuple[int, float]]]],
-        strength: float,
-        room: float,
-    ) -> None:
+    def _pull(self, layer: list[int], at: list[float], sides: Sequence[Links], strength: float, room: float) -> None:
         """Move the items of a layer towards what they are tied to, and apart."""
         for item in layer:
-            tied = [each for side in sides for each in side.get(item, ())]
-            if tied:
-                goal = sum(at[other] * weight for other, weight in tied) / sum(weight for _, weight in tied)
+            ties = [tie for side in sides for tie in side.get(item, ())]
+            if ties:
+                goal = sum(at[end] * weight for end, weight in ties) / sum(weight for _, weight in ties)
                 at[item] += (goal - at[item]) * strength
         self._spread(layer, at, room)
 
@@ -235,11 +225,11 @@ class _LayerItems:
                 (start, length, count), (begin, size, more) = blocks[-2:]
                 middle = (count * (start + length / 2) + more * (begin + size / 2)) / (count + more)
                 blocks[-2:] = [(middle - (length + size) / 2, length + size, count + more)]
-        left, least = sum(length for _, length, _ in blocks), -room / 2
+        rest, least = sum(length for _, length, _ in blocks), -room / 2
         items = iter(layer)
         for begin, length, count in blocks:
-            begin = max(least, min(begin, room / 2 - left))
-            least, left = begin + length, left - length
+            begin = max(least, min(begin, room / 2 - rest))
+            least, rest = begin + length, rest - length
             for _ in range(count):
                 item = next(items)
                 at[item] = begin + self._room(item) / 2
@@ -247,29 +237,28 @@ class _LayerItems:
 
     def span(self, layers: range, middles: Floats) -> tuple[float, float]:
         """Return where the items of some layers begin and end."""
-        within = [i for i, layer in enumerate(self.layers) if layer in layers]
-        return (
-            min(float(middles[i]) - self.sizes[i] / 2 for i in within),
-            max(float(middles[i]) + self.sizes[i] / 2 for i in within),
-        )
+        within = np.array([layer in layers for layer in self.layers])
+        half = np.array(self.sizes)[within] / 2
+        return float((middles[within] - half).min()), float((middles[within] + half).max())
 
 
 def _lanes(
-    arcs: Integers, starts: Integers, ends: Integers, widths: Floats, threads: _LayerItems, middles: Floats
+    loops: Integers, starts: Integers, ends: Integers, widths: Floats, items: _LayerItems, middles: Floats
 ) -> list[tuple[int, RibbonRoute]]:
     """Give every loop a lane, short ones inside: on the side to which both its ends are closer."""
-    found: list[tuple[int, RibbonRoute]] = []
-    taken: dict[int, list[tuple[range, float]]] = {-1: [], 1: []}
-    for arc in sorted(arcs.tolist(), key=lambda k: (int(starts[k] - ends[k]), k)):
+    routes: list[tuple[int, RibbonRoute]] = []
+    lanes: dict[int, list[tuple[range, float]]] = {-1: [], 1: []}
+    for arc in sorted(loops.tolist(), key=lambda k: (int(starts[k] - ends[k]), k)):
         layers = range(int(ends[arc]), int(starts[arc]) + 1)
-        width, (low, high) = max(float(widths[arc]), LEAST_BREADTH), threads.span(layers, middles)
+        width, (low, high) = max(float(widths[arc]), LEAST_BREADTH), items.span(layers, middles)
         edges = {-1: low, 1: high}
-        for side, others in taken.items():
-            met = [edge for span, edge in others if span[0] <= layers[-1] and layers[0] <= span[-1]]
-            edges[side] = side * max([side * edges[side], *(side * edge for edge in met)])
-        lengths = {side: abs(edges[side] - (low + high) / 2) for side in edges}
-        side = min((1, -1), key=lambda each: lengths[each])
+        for side, neighbours in lanes.items():
+            # how far lanes that go around the same layers already reach
+            reach = [side * edge for span, edge in neighbours if span[0] <= layers[-1] and layers[0] <= span[-1]]
+            edges[side] = side * max([side * edges[side], *reach])
+        lengths = {side: abs(edge - (low + high) / 2) for side, edge in edges.items()}
+        side = min((1, -1), key=lambda side: lengths[side])
         lane = edges[side] + side * (LANE + width / 2)
-        taken[side].append((layers, lane + side * width / 2))
-        found.append((arc, RibbonRoute(lane=lane, side=side)))
-    return found
+        lanes[side].append((layers, lane + side * width / 2))
+        routes.append((arc, RibbonRoute(lane=lane, side=side)))
+    return routes

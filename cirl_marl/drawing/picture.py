@@ -66,7 +66,7 @@ def draw_network(
         CirlError: if an array has the wrong shape.
     """
     stock, flow = check_shape("stock", stock, (len(network.stores),)), check_shape("flow", flow, (len(network.arcs),))
-    held = np.concatenate([stock, network.throughput(flow)])
+    amounts = np.concatenate([stock, network.throughput(flow)])
     reference = largest_flow(flow) if reference_flow is None else reference_flow
     share = np.clip(np.nan_to_num(np.abs(flow)) / max(reference, 1e-12), 0, BROADEST)
     layout = digraph_layout(network, axes.bbox.width / axes.bbox.height)
@@ -74,10 +74,10 @@ def draw_network(
     axes.set_axis_off()
     em = _frame(axes, layout, legend)
     if layout.routes is None:
-        _draw_dots(axes, network, layout, held, share, em)
+        _draw_dots(axes, network, layout, amounts, share, em)
     else:
         _draw_arrows(axes, network, layout.routes, flow, share, em)
-        _draw_boxes(axes, network, layout, held, em)
+        _draw_boxes(axes, network, layout, amounts, em)
     if circularity is None and all(arc.law is not Law.BATCH for arc in network.arcs):
         with np.errstate(invalid="ignore"):  # flows that overflowed are shown as they are
             circularity = float(network.circularity(flow))
@@ -100,8 +100,8 @@ def legend_of(network: Network, reference: float) -> dict[str, Any]:
         patches[colour] = f"{patches[colour]}, {name}" if colour in patches else name
     sign = network.sustainability
     arrows = {WARNING: "flow that lowers λ", GOOD: "flow that raises λ", NEUTRAL: "other flow"}
-    used = {WARNING: (sign > 0).any(), GOOD: (sign < 0).any(), NEUTRAL: (sign == 0).any()}
-    patches |= {colour: label for colour, label in arrows.items() if used[colour]}
+    present = {WARNING: (sign > 0).any(), GOOD: (sign < 0).any(), NEUTRAL: (sign == 0).any()}
+    patches |= {colour: label for colour, label in arrows.items() if present[colour]}
     handles: list[Artist] = [Patch(facecolor=colour, label=label) for colour, label in patches.items()]
     width = f"widest arrow: {number(reference)} {network.mass_unit}/{network.time_unit}"
     handles.append(Line2D([], [], color=NEUTRAL, linewidth=4, label=width))
@@ -150,8 +150,8 @@ def _arrow(curve: Floats, width: float) -> Floats:
     width = max(width, 0.09)
     head, flare = 0.55 + 0.55 * width, 0.3 + 0.75 * width
     length = np.hypot(*np.diff(curve, axis=0).T)
-    left = np.concatenate([np.cumsum(length[::-1])[::-1], [0.0]])
-    shaft = curve[left >= min(head, 0.6 * left[0])]
+    remaining = np.concatenate([np.cumsum(length[::-1])[::-1], [0.0]])
+    shaft = curve[remaining >= min(head, 0.6 * remaining[0])]
     along = np.gradient(shaft, axis=0) if len(shaft) > 1 else curve[-1:] - curve[:1]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
     tip, neck, across = curve[-1], shaft[-1], normal[-1]
@@ -159,10 +159,10 @@ def _arrow(curve: Floats, width: float) -> Floats:
     return np.concatenate([sides[0], [neck + across * flare, tip, neck - across * flare], sides[1][::-1]])
 
 
-def _draw_boxes(axes: Axes, network: Network, layout: DigraphLayout, held: Floats, em: float) -> None:
+def _draw_boxes(axes: Axes, network: Network, layout: DigraphLayout, amounts: Floats, em: float) -> None:
     width, height = layout.box
     units = {True: network.mass_unit, False: f"{network.mass_unit}/{network.time_unit}"}
-    for node, (x, y), amount, name in zip(network.nodes, layout.positions, held, layout.names, strict=True):
+    for node, (x, y), amount, name in zip(network.nodes, layout.positions, amounts, layout.names, strict=True):
         corner, colour = (x - width / 2, y - height / 2), ROLE_COLOURS[node.role]
         look = "round,pad=0,rounding_size=0.5"
         axes.add_patch(FancyBboxPatch(corner, width, height, look, fc=_tint(colour, 0.25), ec="none", zorder=3))
@@ -196,7 +196,7 @@ def _darker(colour: str) -> str:
     return "#" + "".join(f"{int(colour[i : i + 2], 16) * 6 // 10:02x}" for i in (1, 3, 5))
 
 
-def _draw_dots(axes: Axes, network: Network, layout: DigraphLayout, held: Floats, share: Floats, em: float) -> None:
+def _draw_dots(axes: Axes, network: Network, layout: DigraphLayout, amounts: Floats, share: Floats, em: float) -> None:
     """Draw a large network: dots whose area shows the stock or throughput, bent lines whose width shows the flow."""
     ends = layout.positions[network.donors], layout.positions[network.recipients]
     # Arcs that count towards λ come last, on top of the others.
@@ -205,7 +205,7 @@ def _draw_dots(axes: Axes, network: Network, layout: DigraphLayout, held: Floats
     thickest = min(2.5, 40 / math.sqrt(len(network.arcs)))
     inks, widths = [colours[k] for k in order], np.clip(thickest * share[order], 0.15, None)
     axes.add_collection(LineCollection(list(lines[order]), colors=inks, linewidths=widths, alpha=0.6), autolim=False)
-    fill = np.array([_fill(amount, node.scale) for amount, node in zip(held, network.nodes, strict=True)])
+    fill = np.array([_fill(amount, node.scale) for amount, node in zip(amounts, network.nodes, strict=True)])
     area = (0.6 * em * layout.box[1]) ** 2 * (0.15 + 0.85 * fill)
     faces = [ROLE_COLOURS[node.role] for node in network.nodes]
     edges = [_darker(face) for face in faces]

@@ -38,11 +38,11 @@ def place_nodes(network: Network, pitch: Floats, aspect: float) -> Floats:
     small = 2 < len(network.nodes) <= SEARCHED_NODES and len(edges) <= SEARCHED_EDGES
     cells = _Search(network, edges, pitch, aspect).best(layers) if small else layers
     cells = _without_gaps(cells)
-    positions: Floats = cells * _stretched(cells, pitch, aspect) * np.array([1.0, -1.0])
+    positions: Floats = cells * _pitch(cells, pitch, aspect) * np.array([1.0, -1.0])
     return positions
 
 
-def _stretched(cells: Floats, pitch: Floats, aspect: float) -> Floats:
+def _pitch(cells: Floats, pitch: Floats, aspect: float) -> Floats:
     """Return the pitch widened, at most by ``STRETCH``, so that the cells fill a picture of this aspect."""
     wide, high = (np.ptp(cells, axis=0) + 1) * pitch
     stretch: Floats = np.clip(np.array([high * aspect / wide, wide / aspect / high]), 1.0, STRETCH)
@@ -55,12 +55,12 @@ def depths(network: Network) -> Integers:
     graph.add_nodes_from(range(len(network.nodes)))
     starts = [i for i, node in enumerate(network.nodes) if node.role is Role.NONRENEWABLE_RESERVOIR]
     starts += [i for i in graph if not graph.in_degree(i)]
-    known: dict[int, int] = {}
+    depth_of: dict[int, int] = {}
     # What no source reaches hangs on a cycle: its first node counts as a source.
     for sources in (starts, *([i] for i in range(len(graph)))):
-        if fresh := [i for i in sources if i not in known]:
-            known = nx.multi_source_dijkstra_path_length(graph, fresh) | known
-    depth = np.array([known[i] for i in range(len(graph))], dtype=np.intp)
+        if fresh := [i for i in sources if i not in depth_of]:
+            depth_of = nx.multi_source_dijkstra_path_length(graph, fresh) | depth_of
+    depth = np.array([depth_of[i] for i in range(len(graph))], dtype=np.intp)
     for i, node in enumerate(network.nodes):
         if node.role in SINKS and node.role is not Role.ENVIRONMENT and not graph.out_degree(i):
             depth[i] = depth.max()
@@ -95,14 +95,14 @@ def _spread(height: Floats, members: Integers) -> None:
 def _in_columns(depth: Integers, height: Floats, rows: int) -> Floats:
     """Fill columns of at most ``rows`` cells; thin layers share columns, up and down in turn."""
     order = np.lexsort((height, depth))
-    folded = int(depth.max()) + 1 > 2 * math.ceil(len(depth) / rows)
-    groups = [order] if folded else [order[depth[order] == level] for level in range(int(depth.max()) + 1)]
+    snakes = int(depth.max()) + 1 > 2 * math.ceil(len(depth) / rows)
+    groups = [order] if snakes else [order[depth[order] == level] for level in range(int(depth.max()) + 1)]
     cells = np.zeros((len(depth), 2))
     column = 0
     for group in groups:
         for part in np.array_split(group, math.ceil(len(group) / rows)) if len(group) else []:
-            row = np.arange(len(part)) + (0.0 if folded else (rows - len(part)) / 2)
-            if folded and column % 2:
+            row = np.arange(len(part)) + (0.0 if snakes else (rows - len(part)) / 2)
+            if snakes and column % 2:
                 row = len(part) - 1 - row
             cells[part, 0], cells[part, 1] = column, row
             column += 1
@@ -133,7 +133,7 @@ class _Search:
         first, second = np.triu_indices(len(edges), 1)
         apart = ~(edges[first][:, :, None] == edges[second][:, None, :]).any(axis=(1, 2))
         self._first, self._second = first[apart], second[apart]
-        self._shared = (first[~apart], second[~apart])
+        self._pairs_at_node = (first[~apart], second[~apart])
 
     def best(self, seed: Floats) -> Floats:
         """Return the cheapest cells found from ``seed`` and some shuffled starts."""
@@ -141,27 +141,27 @@ class _Search:
         starts = [np.argsort(np.lexsort((seed[:, 1], seed[:, 0])))]
         restarts = RESTARTS // max(1, self._count // 8)
         starts += [random.permutation(len(self._grid))[: self._count] for _ in range(restarts)]
-        return self._grid[min(map(self._descend, starts), key=lambda found: found[0])[1]]
+        return self._grid[min(map(self._descend, starts), key=lambda outcome: outcome[0])[1]]
 
     def _descend(self, cells: Integers) -> tuple[float, Integers]:
         cells = cells.copy()
         cost = float(self._cost(self._grid[cells][None])[0])
-        improved = True
-        while improved:
-            improved = False
+        moves = True
+        while moves:
+            moves = False
             for node in range(self._count):
                 trials = self._trials(cells, node)
                 costs = self._cost(self._grid[trials])
-                chosen = int(np.argmin(costs))
-                if costs[chosen] < cost - 1e-9:
-                    cells, cost, improved = trials[chosen], float(costs[chosen]), True
+                cheapest = int(np.argmin(costs))
+                if costs[cheapest] < cost - 1e-9:
+                    cells, cost, moves = trials[cheapest], float(costs[cheapest]), True
         return cost, cells
 
     def _trials(self, cells: Integers, node: int) -> Integers:
         """Every move of ``node`` to a cell, changing places with whoever is there, shape (cells, nodes)."""
         trials = np.repeat(cells[None], len(self._grid), axis=0)
-        for other in range(self._count):
-            trials[cells[other], other] = cells[node]
+        for neighbour in range(self._count):
+            trials[cells[neighbour], neighbour] = cells[node]
         trials[:, node] = np.arange(len(self._grid))
         return trials
 
@@ -177,15 +177,15 @@ class _Search:
         price: Floats = (
             (length + 0.5 * length**2).sum(axis=1)
             + 3.0 * crossings.sum(axis=1)
-            + 4.0 * self._blocked(points, start, end).sum(axis=(1, 2))
-            + 0.8 * self._narrow(points).sum(axis=1)
+            + 4.0 * self._obstruction(points, start, end).sum(axis=(1, 2))
+            + 0.8 * self._sharpness(points).sum(axis=1)
             + 0.35 * backwards.sum(axis=1)
             + span.sum(axis=1)
             + 0.02 * middle.sum(axis=1)
         )
         return price
 
-    def _blocked(self, points: Floats, start: Floats, end: Floats) -> Floats:
+    def _obstruction(self, points: Floats, start: Floats, end: Floats) -> Floats:
         """How far each arc runs into the boxes of other nodes, shape (trials, edges, nodes)."""
         along = end - start
         square = np.maximum((along**2).sum(axis=-1), 1e-12)
@@ -198,23 +198,23 @@ class _Search:
         near[:, rows, self._edges[:, 1]] = 0
         return near
 
-    def _narrow(self, points: Floats) -> Floats:
+    def _sharpness(self, points: Floats) -> Floats:
         """Cosine above 0.8 between two arcs of one node, shape (trials, pairs): labels would collide."""
-        a, b = (self._edges[side] for side in self._shared)
+        a, b = (self._edges[side] for side in self._pairs_at_node)
         hub = np.where((a[:, :1] == b).any(axis=1), a[:, 0], a[:, 1])
-        one, two = a.sum(axis=1) - hub, b.sum(axis=1) - hub
-        left, right = points[:, one] - points[:, hub], points[:, two] - points[:, hub]
-        norm = np.hypot(*np.moveaxis(left, -1, 0)) * np.hypot(*np.moveaxis(right, -1, 0))
-        cosine = (left * right).sum(axis=-1) / np.maximum(norm, 1e-12)
+        first, second = a.sum(axis=1) - hub, b.sum(axis=1) - hub
+        first_arm, second_arm = points[:, first] - points[:, hub], points[:, second] - points[:, hub]
+        norm = np.hypot(*np.moveaxis(first_arm, -1, 0)) * np.hypot(*np.moveaxis(second_arm, -1, 0))
+        cosine = (first_arm * second_arm).sum(axis=-1) / np.maximum(norm, 1e-12)
         narrow: Floats = np.maximum(cosine - 0.8, 0) * 5
         return narrow
 
 
 def _cross(a: Floats, b: Floats, c: Floats, d: Floats) -> NDArray[np.bool_]:
     """Whether the segments a–b and c–d cross."""
-    one = _turn(a, b, c) * _turn(a, b, d)
-    two = _turn(c, d, a) * _turn(c, d, b)
-    return (one < 0) & (two < 0)
+    of_ab = _turn(a, b, c) * _turn(a, b, d)
+    of_cd = _turn(c, d, a) * _turn(c, d, b)
+    return (of_ab < 0) & (of_cd < 0)
 
 
 def _turn(a: Floats, b: Floats, c: Floats) -> Floats:
