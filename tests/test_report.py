@@ -345,7 +345,7 @@ def test_stocks_are_drawn_from_the_start(tmp_path: Path, monkeypatch: pytest.Mon
 def test_smoothing_heeds_what_there_is() -> None:
     """A moving average is that of the finite values in its window, whatever the size of others."""
     values = np.array([1.0, 2.0, np.nan, 4.0, -1e17, 3.0, 3.0, 3.0, 3.0])
-    smoothed = curves._smoothed(values, 3)
+    smoothed = curves._moving_average(values, 3)
     np.testing.assert_allclose(smoothed[:3], [1.5, 1.5, 3.0])
     np.testing.assert_allclose(smoothed[6:], 3.0)
 

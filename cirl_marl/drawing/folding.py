@@ -50,9 +50,9 @@ def fold_copies(
     regions = {node: region for region, nodes in network.copies.items() for node in nodes if region not in open_copies}
     box_of = {node.id: _box(node, regions.get(node.id), network) for node in network.nodes}
     boxes = {box.id: box for box in box_of.values()}
-    held, scales = dict.fromkeys(boxes, 0.0), dict.fromkeys(boxes, 0.0)
+    box_stocks, scales = dict.fromkeys(boxes, 0.0), dict.fromkeys(boxes, 0.0)
     for node, amount in zip(network.stores, stock.tolist(), strict=True):
-        held[box_of[node.id].id] += amount
+        box_stocks[box_of[node.id].id] += amount
         scales[box_of[node.id].id] += node.scale  # reference stocks add up as stocks do
     nodes = tuple(replace(box, scale=scales[box.id] or box.scale) for box in boxes.values())
     flows: dict[tuple[str, str], float] = {}
@@ -67,7 +67,7 @@ def fold_copies(
     fields = {name: getattr(network, name) for name in network.__dataclass_fields__}
     fields |= {"nodes": nodes, "arcs": (*(arc for arc, _ in visible), *arcs), "services": (), "copies": {}}
     folded_network = FoldedNetwork(**fields)
-    stocks = np.array([held[node.id] for node in folded_network.stores])
+    stocks = np.array([box_stocks[node.id] for node in folded_network.stores])
     return folded_network, stocks, np.array([*(value for _, value in visible), *flows.values()])
 
 

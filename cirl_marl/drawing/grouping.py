@@ -71,7 +71,7 @@ def _diagram_of_groups(
             boxes.append(Box(label, (i,), node.role, node.stores))
         else:
             box_of |= dict.fromkeys(group_nodes[name], len(boxes))
-            stores = tuple(each for each in group_nodes[name] if network.nodes[each].stores)
+            stores = tuple(k for k in group_nodes[name] if network.nodes[k].stores)
             boxes.append(Box(name, stores, Role.TECHNOSPHERE, bool(stores), opens=name))
     between: dict[tuple[int, int], list[int]] = defaultdict(list)
     for k, (donor, recipient) in enumerate(ends):

@@ -150,8 +150,8 @@ def _arrow(curve: Floats, width: float) -> Floats:
     width = max(width, 0.09)
     head, flare = 0.55 + 0.55 * width, 0.3 + 0.75 * width
     length = np.hypot(*np.diff(curve, axis=0).T)
-    remaining = np.concatenate([np.cumsum(length[::-1])[::-1], [0.0]])
-    shaft = curve[remaining >= min(head, 0.6 * remaining[0])]
+    to_tip = np.concatenate([np.cumsum(length[::-1])[::-1], [0.0]])
+    shaft = curve[to_tip >= min(head, 0.6 * to_tip[0])]
     along = np.gradient(shaft, axis=0) if len(shaft) > 1 else curve[-1:] - curve[:1]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
     tip, neck, across = curve[-1], shaft[-1], normal[-1]
@@ -183,8 +183,8 @@ def _draw_boxes(axes: Axes, network: Network, layout: DigraphLayout, amounts: Fl
 
 def _fill(amount: float, scale: float) -> float:
     """Share of a box that a stock fills: 0 without stock or for one that is no number, half at ``scale``."""
-    held = max(amount, 0.0) if math.isfinite(amount) else 0.0
-    return held / (held + scale)
+    positive = max(amount, 0.0) if math.isfinite(amount) else 0.0
+    return positive / (positive + scale)
 
 
 def _tint(colour: str, share: float) -> str:

@@ -110,11 +110,11 @@ def attribute_inputs(
     """
 
     def difference_if_held(policy: Policy, agent: str, names: Sequence[str]) -> PairedDifference:
-        fixed = {}
+        constants = {}
         for member in policy.view.agents:
             entries = observation_entries(env, member, names)
-            fixed[member] = entries, record.observations[member].mean(axis=(0, 1))[entries]
-        controller = Substitution(policies, FixedInputs(twins, fixed), [agent])
+            constants[member] = entries, record.observations[member].mean(axis=(0, 1))[entries]
+        controller = Substitution(policies, FixedInputs(twins, constants), [agent])
         return paired_difference(play_episodes(env, controller, seed), usual)
 
     attributions = []

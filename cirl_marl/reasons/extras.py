@@ -7,7 +7,7 @@ from typing import Any
 
 from cirl_marl.errors import CirlError
 
-NEEDED = 'explanations of policies need {}: python -m pip install "cirl-marl[explain]"'
+ADVICE = 'explanations of policies need {}: python -m pip install "cirl-marl[explain]"'
 
 
 def captum() -> Any:
@@ -24,4 +24,4 @@ def _module(name: str, distribution: str) -> Any:
     try:
         return import_module(name)
     except ImportError as missing:
-        raise CirlError(NEEDED.format(distribution)) from missing
+        raise CirlError(ADVICE.format(distribution)) from missing

@@ -83,7 +83,7 @@ class FixedInputs(Controller):
     """A controller to whom some entries of what agents see are shown at fixed values, by agent: entries and values."""
 
     controller: Controller
-    fixed: Mapping[str, tuple[Integers, Floats]]
+    constants: Mapping[str, tuple[Integers, Floats]]
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Start the controller."""
@@ -92,7 +92,7 @@ class FixedInputs(Controller):
     def act(self, observations: Arrays) -> Arrays:
         """Return what it does when it sees that."""
         inputs = dict(observations)
-        for agent, (entries, values) in self.fixed.items():
+        for agent, (entries, values) in self.constants.items():
             inputs[agent] = np.array(observations[agent])
             inputs[agent][:, entries] = values
         return self.controller.act(inputs)

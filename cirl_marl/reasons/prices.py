@@ -98,9 +98,9 @@ def shadow_prices(
     progress(next(shares))
     for s in range(services):
         step = DIFFERENCE * max(float(admissible.service_low[:, s].max()), 1.0)
-        served = admissible.service_low.copy()
-        served[:, s] += step
-        demand[:, s] = _slope(best, admissible, replace(admissible, service_low=served)) / step
+        demand_rows = admissible.service_low.copy()
+        demand_rows[:, s] += step
+        demand[:, s] = _slope(best, admissible, replace(admissible, service_low=demand_rows)) / step
         progress(next(shares))
     for a, agent in enumerate(best.agents):
         for side in range(2):

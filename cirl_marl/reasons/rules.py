@@ -228,12 +228,12 @@ def _paths(tree: Any) -> list[tuple[int, dict[int, tuple[float, float]]]]:
     stack: list[tuple[int, dict[int, tuple[float, float]]]] = [(0, {})]
     while stack:
         node, ranges = stack.pop()
-        left, right = int(tree.children_left[node]), int(tree.children_right[node])
-        if left < 0:
+        lower, upper = int(tree.children_left[node]), int(tree.children_right[node])
+        if lower < 0:
             leaves.append((node, ranges))
             continue
         feature, threshold = int(tree.feature[node]), float(tree.threshold[node])
         low, high = ranges.get(feature, (-np.inf, np.inf))
-        stack.append((right, {**ranges, feature: (max(low, threshold), high)}))
-        stack.append((left, {**ranges, feature: (low, min(high, threshold))}))
+        stack.append((upper, {**ranges, feature: (max(low, threshold), high)}))
+        stack.append((lower, {**ranges, feature: (low, min(high, threshold))}))
     return leaves

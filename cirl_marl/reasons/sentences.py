@@ -23,7 +23,7 @@ MOST_PRICES = 5
 """Most stocks and agents of which prices are told in sentences."""
 SMALL = 1e-6
 """Of the largest price of a kind: below it nothing is worth telling."""
-SAME = 0.02
+TOLERANCE = 0.02
 """Part of a control's range within which two values are the same in words."""
 
 
@@ -56,8 +56,8 @@ def price_sentences(prices: ShadowPrices) -> list[str]:
             continue
         worth = prices.stock[:, i]
         step = int(np.abs(worth).argmax())
-        when = f"in {times[step]}" if times[step].isdigit() else f"at {times[step]}"
-        change = f"{abs(worth[step]):.3g} {mass} {when}"
+        moment = f"in {times[step]}" if times[step].isdigit() else f"at {times[step]}"
+        change = f"{abs(worth[step]):.3g} {mass} {moment}"
         if abs(worth[0]) < abs(worth[step]):
             change += f", by {number(float(abs(worth[0])))} {mass} at the start"
         stock, verb = compartment_label(network, network.stores[i].id), "raises" if worth[step] > 0 else "lowers"
@@ -105,10 +105,12 @@ def rule_sentences(network: Network, rule: Rule) -> list[str]:
         leaves = [Leaf((), leaves[0].action, leaves[0].control, 1.0)]
     sentences = []
     for leaf in sorted(leaves, key=lambda leaf: (_first_time(leaf), -leaf.share)):
-        when = condition_text(network, leaf.conditions)
+        condition = condition_text(network, leaf.conditions)
         action = f"*{compartment_label(network, rule.agent)}* {action_text(network, rule.agent, leaf)}"
         share = "" if len(rule.leaves) == 1 else f" ({100 * leaf.share:.0f} % of decisions)"
-        sentences.append(f"{when[:1].upper() + when[1:]} {action}{share}." if when else f"Always {action}.")
+        sentences.append(
+            f"{condition[:1].upper() + condition[1:]} {action}{share}." if condition else f"Always {action}."
+        )
     sentences.append(f"Acting by this rule, {difference_text(network, rule.cost)}.")
     return sentences
 
@@ -122,10 +124,10 @@ def condition_text(network: Network, conditions: Sequence[Condition]) -> str:
 
     A condition on time is one on the beginning of intervals.
     """
-    when, signals = "", []
+    calendar, signals = "", []
     for condition in conditions:
         if condition.signal.name == TIME:
-            when = _time_text(condition, interval_names(network))
+            calendar = _time_text(condition, interval_names(network))
             continue
         low, high = condition.low * condition.signal.scale, condition.high * condition.signal.scale
         unit = "" if condition.signal.unit == "1" else f" {condition.signal.unit}"
@@ -133,7 +135,7 @@ def condition_text(network: Network, conditions: Sequence[Condition]) -> str:
         if math.isfinite(low) and math.isfinite(high):
             span = f"between {number(low)} and {number(high)}"
         signals.append(f"{signal_text(network, condition.signal)} is {span}{unit}")
-    parts = [when] if when else []
+    parts = [calendar] if calendar else []
     parts += [f"while {joined_text(signals)}"] if signals else []
     return f"{', '.join(parts)}," if parts else ""
 
@@ -169,11 +171,11 @@ def action_text(network: Network, agent: str, leaf: Leaf) -> str:
         ControlKind.STRETCH: f"a lifetime {100 * (value - 1):+.0f} %".replace("-", "−"),
         ControlKind.RATE: f"{100 * value:.3g} % of its flow",
     }[control.kind]
-    if action > 1 - 2 * SAME:
+    if action > 1 - 2 * TOLERANCE:
         return f"opens as far as it can, to {amount}"
-    if action < -1 + 2 * SAME:
+    if action < -1 + 2 * TOLERANCE:
         return f"closes as far as it can, to {amount}"
-    if abs(value - neutral) < SAME * (high - low):
+    if abs(value - neutral) < TOLERANCE * (high - low):
         return f"stays about as usual, at {amount}"
     return f"{'opens' if value > neutral else 'closes'} to {amount}"
 

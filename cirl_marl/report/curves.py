@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 AGENT_PANELS = 20
-SHOWN = 10
+MOST_CURVES = 10
 """Largest number of compartments in one panel of a trajectory."""
 SCALE, SCALES = 10.0, 3
 """Ratio of stocks from which on they stand in panels of their own, and the most panels of stocks."""
@@ -45,12 +45,12 @@ LEAST_SERVICE, LEAST_CIRCULARITY = 0.02, 0.05
 
 @dataclass(frozen=True, slots=True)
 class PointSeries:
-    """Points of one kind in the plane of service level and λ̄, mass, shape (points,) each; ``joined`` by a line."""
+    """Points of one kind in the plane of service level and λ̄, mass, shape (points,) each; a line if ``is_line``."""
 
     name: str
     service: Floats
     circularity: Floats
-    joined: bool = False
+    is_line: bool = False
 
 
 def save_circularity(
@@ -70,7 +70,7 @@ def save_circularity(
     names = list(dict.fromkeys([*runs, *services]))
     for axes, curves, top in ((above, runs, math.inf), (below, services, 1.0)):
         for name, values in curves.items():
-            _draw_mean(axes, time, _matching(name, values, time), name, names.index(name), top=top)
+            _draw_mean(axes, time, _check_length(name, values, time), name, names.index(name), top=top)
     title = "Mean circularity of each step, averaged over episodes, with 95 % intervals"
     style_axes(above, title=title, ylabel=f"λ / {network.mass_unit}")
     style_axes(below, title="Service level", ylabel="service level")
@@ -89,23 +89,23 @@ def save_learning_curves(path: str | Path, steps: Floats, returns: Mapping[str, 
     than 20 agents the first 20 are shown. ``steps`` are environment steps at the end of each episode, and ``returns``
     those of episodes by agent, shape (episodes,) each; other shapes raise a ``CirlError``.
     """
-    shown = list(returns.items())[:AGENT_PANELS]
-    columns = max(1, min(len(shown), 3 if len(shown) <= 9 else 4))
-    rows = max(1, math.ceil(len(shown) / columns))
+    agents = list(returns.items())[:AGENT_PANELS]
+    columns = max(1, min(len(agents), 3 if len(agents) <= 9 else 4))
+    rows = max(1, math.ceil(len(agents) / columns))
     figure = Figure(figsize=(WIDTH, 0.7 + max(1.7 * rows, 2.6)), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
-    for axes, (agent, values) in zip(panels, shown, strict=False):
-        _draw_returns(axes, steps, _matching(agent, values, steps))
+    for axes, (agent, values) in zip(panels, agents, strict=False):
+        _draw_returns(axes, steps, _check_length(agent, values, steps))
         style_axes(axes, title=readable(agent), size=8.0)
         axes.locator_params(nbins=4)
-    for axes in panels[len(shown) :]:
+    for axes in panels[len(agents) :]:
         axes.set_axis_off()
-    for axes in panels[: len(shown)][-columns:]:
+    for axes in panels[: len(agents)][-columns:]:
         axes.tick_params(labelbottom=True)  # nothing may lie below the last panel of a column
     figure.supxlabel("environment steps", fontsize=9, color=FAINT)
     figure.supylabel("episode return", fontsize=9, color=FAINT)
-    if len(returns) > len(shown):
-        figure.suptitle(f"The first {len(shown)} of {len(returns)} agents", fontsize=9, color=FAINT)
+    if len(returns) > len(agents):
+        figure.suptitle(f"The first {len(agents)} of {len(returns)} agents", fontsize=9, color=FAINT)
     return save(figure, path)
 
 
@@ -146,16 +146,16 @@ def save_trajectory(
     stock = check_shape("stock", stock, (len(network.stores), *steps))
     flow = check_shape("flow", flow, (len(network.arcs), *steps))
     circularity = check_shape("circularity", circularity, steps)
-    held = [node.label for node in network.stores]
+    labels = [node.label for node in network.stores]
     if load is not None:
         on_the_way = [arc.id for arc in network.arcs if arc.law is Law.BATCH]
-        held += [f"on {network.compartments[arc].label}" for arc in on_the_way]
+        labels += [f"on {network.compartments[arc].label}" for arc in on_the_way]
         stock = np.concatenate([stock, check_shape("load", load, (len(on_the_way), *steps))])
     # what is a mean over an interval stands in its middle, a stock at its end
-    middle, held_at = (axis_time(each, network) for each in (time - network.episode.control_interval / 2, time))
+    middle, stock_times = (axis_time(times, network) for times in (time - network.episode.control_interval / 2, time))
     if start is not None:
         stock = np.column_stack([check_shape("start", start, (len(stock),)), stock])
-        held_at = np.concatenate([axis_time(np.zeros(1), network), held_at])
+        stock_times = np.concatenate([axis_time(np.zeros(1), network), stock_times])
     groups = _by_scale(np.abs(np.nan_to_num(stock)).max(axis=1, initial=0.0))
     heights = [1.25 if len(groups) == 1 else 0.9] * len(groups) + [1.25, 0.8, *([] if service is None else [0.5])]
     figure = Figure(figsize=(WIDTH, 2.5 * sum(heights)), layout="constrained")
@@ -163,7 +163,7 @@ def save_trajectory(
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     for place, (axes, rows) in enumerate(zip(panels, groups, strict=False)):
         name = "Stocks" if place == 0 else "Smaller stocks" if place == 1 else "The smallest stocks"
-        _draw_largest(axes, held_at, stock[rows], [held[row] for row in rows], name, mass)
+        _draw_largest(axes, stock_times, stock[rows], [labels[row] for row in rows], name, mass)
     flows, lambdas = panels[len(groups) : len(groups) + 2]
     _draw_largest(flows, middle, flow, [arc.label for arc in network.arcs], "Mean flows", f"{mass}/{network.time_unit}")
     _draw_mean(lambdas, middle, circularity, "", 0)
@@ -172,7 +172,7 @@ def save_trajectory(
         _draw_mean(panels[-1], middle, check_shape("service", service, steps), "", 0)
         style_axes(panels[-1], title="Service level", ylabel="service level")
         panels[-1].set_ylim(-0.03, 1.06)
-    time_axis(panels[-1], held_at, network)
+    time_axis(panels[-1], stock_times, network)
     return save(figure, path)
 
 
@@ -186,18 +186,18 @@ def save_fronts(
     """
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     axes = figure.subplots()
-    for place, each in enumerate(series):
+    for place, points in enumerate(series):
         colour = SERIES[place % len(SERIES)]
-        line = DASHES[place % len(DASHES)] if each.joined else ""
+        line = DASHES[place % len(DASHES)] if points.is_line else ""
         axes.plot(
-            each.service,
-            each.circularity,
+            points.service,
+            points.circularity,
             color=colour,
             marker=MARKERS[(place + place // len(SERIES)) % len(MARKERS)],  # colours come round before pairs do
             linestyle=line,
             linewidth=1.4,
             alpha=0.9,
-            label=readable(each.name),
+            label=readable(points.name),
         )
     _widen(axes)
     if len(bound):
@@ -212,22 +212,20 @@ def save_fronts(
 
 def _widen(axes: Axes) -> None:
     """Show at least 2 points of service and 5 % of λ̄: what lies closer together is much the same."""
-    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    for limits, least, widen in (
-        ((left, right), LEAST_SERVICE, axes.set_xlim),
-        ((low, high), LEAST_CIRCULARITY * max(abs(low), abs(high)), axes.set_ylim),
-    ):
-        missing = least - (limits[1] - limits[0])
-        if missing > 0:
-            widen(limits[0] - missing / 2, limits[1] + missing / 2)
+    widest = LEAST_CIRCULARITY * max(map(abs, axes.get_ylim()))
+    for axis, least in ((axes.xaxis, LEAST_SERVICE), (axes.yaxis, widest)):
+        low, high = axis.get_view_interval()
+        if (gap := least - (high - low)) > 0:
+            set_limits = axes.set_xlim if axis is axes.xaxis else axes.set_ylim
+            set_limits(low - gap / 2, high + gap / 2)
 
 
-def _matching(name: str, values: Floats, time: Floats) -> Floats:
+def _check_length(name: str, values: Floats, time: Floats) -> Floats:
     """Check that the last axis of ``values`` is that of ``time``."""
-    found = np.asarray(values, dtype=float)
-    if found.ndim not in (1, 2) or found.shape[-1] != len(time):
-        raise CirlError(f"'{name}' has shape {found.shape}, expected {len(time)} along the last axis")
-    return found
+    numbers = np.asarray(values, dtype=float)
+    if numbers.ndim not in (1, 2) or numbers.shape[-1] != len(time):
+        raise CirlError(f"'{name}' has shape {numbers.shape}, expected {len(time)} along the last axis")
+    return numbers
 
 
 def _dots(time: Floats) -> str:
@@ -255,14 +253,14 @@ def _draw_returns(axes: Axes, steps: Floats, values: Floats) -> None:
     marker = "o" if values.size < 5 else ""
     axes.plot(steps, values, color=SERIES[5], linewidth=0.7, alpha=0.7, marker=marker, markersize=4)
     if values.size >= 5:
-        axes.plot(steps, _smoothed(values, max(3, values.size // 15)), color=SERIES[0], linewidth=2.0)
+        axes.plot(steps, _moving_average(values, max(3, values.size // 15)), color=SERIES[0], linewidth=2.0)
 
 
-def _smoothed(values: Floats, window: int) -> Floats:
+def _moving_average(values: Floats, window: int) -> Floats:
     """Centred moving average over about ``window`` values, fewer at the ends and where some are not finite."""
     finite = np.isfinite(values)
     weights = np.ones(2 * (window // 2) + 1)
-    total, count = (np.convolve(each, weights, "same") for each in (np.where(finite, values, 0.0), finite))
+    total, count = (np.convolve(terms, weights, "same") for terms in (np.where(finite, values, 0.0), finite))
     mean: Floats = np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
     return mean
 
@@ -270,14 +268,14 @@ def _smoothed(values: Floats, window: int) -> Floats:
 def _draw_largest(axes: Axes, time: Floats, values: Floats, names: Sequence[str], title: str, unit: str) -> None:
     """Draw the rows that change most, with a legend beside the panel."""
     change = np.ptp(values, axis=1) if values.size else np.zeros(len(values))
-    kept = np.sort(np.argsort(-change, kind="stable")[:SHOWN])
-    for place, row in enumerate(kept.tolist()):
+    largest = np.sort(np.argsort(-change, kind="stable")[:MOST_CURVES])
+    for place, row in enumerate(largest.tolist()):
         axes.plot(time, values[row], color=SERIES[place % len(SERIES)], linestyle=DASHES[place // len(SERIES)],
                   linewidth=1.5, label=names[row], marker=_dots(time))  # fmt: skip
     axes.ticklabel_format(axis="y", useOffset=False)
-    more = f": {SHOWN} of {len(names)}, the largest changes" if len(names) > SHOWN else ""
+    more = f": {MOST_CURVES} of {len(names)}, the largest changes" if len(names) > MOST_CURVES else ""
     style_axes(axes, title=title + more, ylabel=unit)
-    if len(kept):
+    if len(largest):
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8, borderaxespad=0)
 
 

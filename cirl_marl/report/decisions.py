@@ -87,12 +87,12 @@ def settings(network: Network, agents: Sequence[str]) -> Iterator[Setting]:
 def levers(schedule: Schedule) -> list[Lever]:
     """Return what the agents of a plan set, first what differs most from business as usual."""
     low, _, high = schedule.network.control_bounds
-    pulled = []
+    by_agent = []
     for setting in settings(schedule.network, schedule.agents):
         row, about = setting.row, (setting.agent, setting.name, setting.kind, setting.of, setting.unit)
         plan, usual = (episode.controls[:, row] for episode in (schedule.rollout, schedule.usual))
-        pulled.append(Lever(*about, row, plan, usual, float((high[row] - low[row]).max())))
-    return sorted(pulled, key=lambda lever: -lever.change)
+        by_agent.append(Lever(*about, row, plan, usual, float((high[row] - low[row]).max())))
+    return sorted(by_agent, key=lambda lever: -lever.change)
 
 
 def _title(network: Network, compartment: Compartment) -> str:

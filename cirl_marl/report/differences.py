@@ -55,15 +55,15 @@ def write_alternatives(
         quantities: what ``rank_quantities`` found in them.
         title: heading of the picture.
     """
-    first, *others = files.values()
+    first, *alternatives = files.values()
     header = ["quantity", "unit", first.name]
-    for simulation in others:
+    for simulation in alternatives:
         header += [form.format(simulation.name) for form in ("{}", "difference of {}", "relative difference of {}")]
     with publish_folder(folder) as draft:
         for stem, simulation in files.items():
             write_table(draft / f"{stem}.csv", *simulation.table())
         write_table(draft / f"{name}.csv", header, map(_row, quantities))
-        save_alternatives(draft / f"{name}.png", [first, *others], quantities, title=title)
+        save_alternatives(draft / f"{name}.png", [first, *alternatives], quantities, title=title)
     return [folder / file for file in (*(f"{stem}.csv" for stem in files), f"{name}.csv", f"{name}.png")]
 
 

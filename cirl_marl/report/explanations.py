@@ -176,9 +176,12 @@ def _rule_rows(explanation: Explanation) -> Rows:
     for rule in explanation.rules.rules:
         for leaf in rule.leaves:
             control = "; ".join(_digits(value) for value in leaf.control.tolist())
-            when, action = condition_text(network, leaf.conditions) or "always", action_text(network, rule.agent, leaf)
+            condition, action = (
+                condition_text(network, leaf.conditions) or "always",
+                action_text(network, rule.agent, leaf),
+            )
             shares = _digits(leaf.share), _digits(rule.explained_variance)
-            yield [rule.agent, when, action, control, *shares, *_outcome(rule.cost)]
+            yield [rule.agent, condition, action, control, *shares, *_outcome(rule.cost)]
     yield ["all together", "", "", "", "", "", *_outcome(explanation.rules.together)]
 
 
@@ -238,14 +241,14 @@ def _draw_room(axes: Axes, prices: ShadowPrices) -> None:
 def _draw_inputs(axes: Axes, explanation: Explanation) -> None:
     network = explanation.network
     for row, inputs in enumerate(explanation.inputs):
-        left = 0.0
+        start = 0.0
         for i, share in enumerate(inputs.share[: inputs.top].tolist()):
-            axes.barh(row, share, left=left, color=SERIES[i % len(SERIES)], height=0.7, alpha=0.85)
+            axes.barh(row, share, left=start, color=SERIES[i % len(SERIES)], height=0.7, alpha=0.85)
             if share > 0.12:
                 label, letters = signal_text(network, inputs.signals[i]), int(105 * share)
                 label = label if len(label) <= letters else label[: letters - 1] + "…"
-                axes.text(left + 0.005, row, label, va="center", fontsize=7, color="white")
-            left += share
+                axes.text(start + 0.005, row, label, va="center", fontsize=7, color="white")
+            start += share
         cost = number(inputs.top_held.circularity.value)
         axes.text(1.01, row, cost, va="center", fontsize=7, transform=axes.get_yaxis_transform())
     axes.set_yticks(

@@ -171,5 +171,5 @@ def save_pareto(path: str | Path, front: ParetoFront, *, title: str = "") -> Pat
         if parts:
             service = np.array([interquartile_mean([point.service for point in part]) for part in parts])
             mean = np.array([interquartile_mean([point.circularity for point in part]) for part in parts])
-            series.append(PointSeries(name, service, mean, joined=len(parts) > 1))
+            series.append(PointSeries(name, service, mean, is_line=len(parts) > 1))
     return save_fronts(path, network, series, front.front, title=title)

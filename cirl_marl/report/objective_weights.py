@@ -39,8 +39,8 @@ def weights_sentences(weights: ObjectiveWeights) -> list[str]:
         if j not in weights.identifiable and j not in idle:
             sentences.append(f"The weight of {name} cannot be told closely: all from {' to '.join(spans[j])} fit.")
     if idle:
-        unmoved = joined_text([names[j] for j in idle])
-        sentences.append(f"Of {unmoved} there is no telling: nothing that can be done changes it.")
+        idle_names = joined_text([names[j] for j in idle])
+        sentences.append(f"Of {idle_names} there is no telling: nothing that can be done changes it.")
     return sentences
 
 

@@ -45,7 +45,7 @@ def page_data(page: ReportPage) -> Values:
     for episode in page.episodes:
         if episode.network not in networks:
             networks.append(episode.network)
-    installed = versions()
+    packages = versions()
     return {
         "title": page.title,
         "name": network.name,
@@ -56,7 +56,7 @@ def page_data(page: ReportPage) -> Values:
         "time": network.time_unit,
         "interval": network.episode.control_interval,
         "clock": _clock(page.episodes),
-        "networks": [_network(one, [e for e in page.episodes if e.network == one]) for one in networks],
+        "networks": [_network(of_page, [e for e in page.episodes if e.network == of_page]) for of_page in networks],
         "scenes": [_episode(episode, networks.index(episode.network)) for episode in page.episodes],
         "points": [
             {"name": p.name, "service": _number(p.service), "lambda": _number(p.circularity), "about": p.about}
@@ -66,7 +66,7 @@ def page_data(page: ReportPage) -> Values:
         "notes": list(page.notes),
         "reasons": [{"title": heading, "said": list(sentences)} for heading, sentences in page.reasons],
         "made": {
-            "versions": [f"{name} {installed[name]}" for name in SHOWN_VERSIONS],
+            "versions": [f"{name} {packages[name]}" for name in SHOWN_VERSIONS],
             "definition": fingerprint(network),
         },
     }
@@ -79,11 +79,11 @@ def _clock(episodes: Sequence[PageEpisode]) -> Values:
     first, network = episodes[0], episodes[0].network
     interval = network.episode.control_interval
     for episode in episodes[1:]:
-        other = episode.network.episode.control_interval
-        if (len(episode.flow), other) != (len(first.flow), interval):
+        own_interval = episode.network.episode.control_interval
+        if (len(episode.flow), own_interval) != (len(first.flow), interval):
             raise CirlError(
                 f"'{first.name}' has {len(first.flow)} intervals of {interval:g} {network.time_unit}, '{episode.name}'"
-                f" {len(episode.flow)} of {other:g}: a page shows them by one clock; give a number of steps for both,"
+                f" {len(episode.flow)} of {own_interval:g}: a page shows them by one clock; give a number of steps for both,"
                 " or write two pages"
             )
     ends = interval_ends(network)

@@ -24,8 +24,8 @@ def page_of_evaluation(evaluation: Evaluation, progress: Callable[[float], None]
     """
     run, comparison = evaluation.run, evaluation.comparison
     page = page_of_comparison(comparison, without=CONTROLLERS[1:])
-    reasons, missing = read_reasons(run, comparison.entries[0].checkpoint)
-    notes = (*page.notes, f"{missing}.") if missing else page.notes
+    reasons, advice = read_reasons(run, comparison.entries[0].checkpoint)
+    notes = (*page.notes, f"{advice}.") if advice else page.notes
     return add_plan(replace(page, reasons=reasons, notes=notes), comparison, run.make_env(1), progress)
 
 

@@ -28,12 +28,12 @@ ROWS = 8
 
 def sensitivity_table(samples: SampledEpisodes, causes: Sequence[Sensitivity]) -> Table:
     """Return the numbers that cause most of the spread, with the share of each figure that they cause."""
-    rows = [[samples.names[i], *(_share_text(cause, i) for cause in causes)] for i in _ranking(causes)[:ROWS]]
+    rows = [[samples.names[i], *(_share_text(cause, i) for cause in causes)] for i in _order(causes)[:ROWS]]
     headings = ["number", *(cause.figure for cause in causes)]
     return text_table("share of the spread that a number causes by itself", headings, rows, text=["number"])
 
 
-def _ranking(causes: Sequence[Sensitivity]) -> list[int]:
+def _order(causes: Sequence[Sensitivity]) -> list[int]:
     """Return the numbers, first what causes most of the spread of anything."""
     most = np.nan_to_num(np.array([cause.shares for cause in causes]), nan=-1.0).max(axis=0)
     return [int(i) for i in np.argsort(-most, kind="stable")]
@@ -81,7 +81,7 @@ def _causes(samples: SampledEpisodes, causes: Sequence[Sensitivity]) -> tuple[li
     header = ["number", *(part for cause in causes for part in (f"share of {cause.figure}", "half-width"))]
     return header, [
         [samples.names[i], *(defined(float(x)) for cause in causes for x in (cause.shares[i], cause.margins[i]))]
-        for i in _ranking(causes)
+        for i in _order(causes)
     ]
 
 

@@ -74,9 +74,11 @@ def ages_table(network: Network, of_ages: Sequence[Pyramid]) -> tuple[list[str],
     rows: list[list[object]] = []
     for pyramid in of_ages:
         edges = (pyramid.interval * np.arange(pyramid.mass.shape[1] + 1)).tolist()
-        for when, masses in zip(clock, pyramid.mass.tolist(), strict=True):
+        for time_cells, masses in zip(clock, pyramid.mass.tolist(), strict=True):
             rows += [
-                [*when, pyramid.node, edges[i], edges[i + 1], amount] for i, amount in enumerate(masses) if amount > 0
+                [*time_cells, pyramid.node, edges[i], edges[i + 1], amount]
+                for i, amount in enumerate(masses)
+                if amount > 0
             ]
     return header, rows
 
