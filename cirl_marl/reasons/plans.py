@@ -157,14 +157,12 @@ def _carry_out(network: Network, table: _Table, seed: int | None) -> PlannedEpis
     start.reset(env)
     initial = _stocks(env)
     episode = rollout(env, _TableController(values), seed=start.seed, start=start.initial_state)
-    mass, circularity_of_table = network.mass_unit, table.column(f"mean circularity ({network.mass_unit})")
+    mass, on_file = network.mass_unit, table.column(f"mean circularity ({network.mass_unit})")
     circularity = episode.circularity_mean[0]
-    if not np.allclose(
-        circularity, circularity_of_table, rtol=ALIKE, atol=ALIKE * float(np.abs(circularity).max(initial=0.0))
-    ):
+    if not np.allclose(circularity, on_file, rtol=ALIKE, atol=ALIKE * float(np.abs(circularity).max(initial=0.0))):
         raise CirlError(
             f"{table.path}: carried out from {start.description} its mean circularity is {circularity.mean():.6g} "
-            f"{mass}, but the file says {circularity_of_table.mean():.6g}: it is of another start (--seed), scenario or definition"
+            f"{mass}, but the file says {on_file.mean():.6g}: it is of another start (--seed), scenario or definition"
         )
     return PlannedEpisode(str(table.path), initial, episode.stock, episode.flow)
 

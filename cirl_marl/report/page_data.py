@@ -79,11 +79,11 @@ def _clock(episodes: Sequence[PageEpisode]) -> Values:
     first, network = episodes[0], episodes[0].network
     interval = network.episode.control_interval
     for episode in episodes[1:]:
-        own_interval = episode.network.episode.control_interval
-        if (len(episode.flow), own_interval) != (len(first.flow), interval):
+        length = episode.network.episode.control_interval
+        if (len(episode.flow), length) != (len(first.flow), interval):
             raise CirlError(
                 f"'{first.name}' has {len(first.flow)} intervals of {interval:g} {network.time_unit}, '{episode.name}'"
-                f" {len(episode.flow)} of {own_interval:g}: a page shows them by one clock; give a number of steps for both,"
+                f" {len(episode.flow)} of {length:g}: a page shows them by one clock; give a number of steps for both,"
                 " or write two pages"
             )
     ends = interval_ends(network)
