@@ -62,7 +62,7 @@ def solved(regions: int) -> dict[str, float]:
     network = yearly_network(regions=regions)
     begun = time.process_time()
     admissible = Admissible.of(network, None)
-    program = Programs(admissible, 1, None).program(starting_stocks(network, None))
+    program = Programs(admissible, 1, None).program(starting_stocks(admissible.lifetimes, None))
     written = time.process_time()
     memory = _peak()
     solve(program)

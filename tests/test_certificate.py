@@ -15,6 +15,7 @@ from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import solve
+from cirl_marl.optimum.vintages import Lifetimes
 
 
 @pytest.mark.parametrize(("name", "horizon"), [("copper_net", 6), ("carbo_net", 6)])
@@ -25,7 +26,7 @@ def test_multipliers_of_an_over_constrained_program_prove_nothing_false(name: st
     and its multipliers would prove it, if the certificate trusted their sign.
     """
     network = load_network(name).with_options(episode={"horizon": horizon})
-    problem = Programs(Admissible.of(network), 1, None).program(starting_stocks(network, None))
+    problem = Programs(Admissible.of(network), 1, None).program(starting_stocks(Lifetimes(network, ()), None))
     multipliers = _over_constrained(problem)
     wrong = float(multipliers.under.max())
     best = bound(network, degree=1)

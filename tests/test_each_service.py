@@ -36,6 +36,7 @@ from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.optimum.mpc import MPC, Optimum
 from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Programs
+from cirl_marl.optimum.vintages import Lifetimes
 
 Levels = float | list[float]
 
@@ -160,7 +161,7 @@ def test_episodes_are_held_against_what_each_service_got() -> None:
     plan = found.entries[1]
     assert plan.gap is not None and plan.bound is not None
     assert (plan.gap >= 0).all() and (plan.gap < 0.02).all()
-    starts = np.tile(starting_stocks(town(), None), (2, 1))
+    starts = np.tile(starting_stocks(Lifetimes(town(), ()), None), (2, 1))
     np.testing.assert_array_equal(plan.bound, found.baseline.at(starts, plan.rollout.episode_levels))
     np.testing.assert_allclose(plan.rollout.least_service, 0.4, atol=1e-3)
     np.testing.assert_allclose(plan.service, 0.7, atol=1e-3)
@@ -237,7 +238,7 @@ def test_one_service_is_the_mean() -> None:
     """Of a single service the row is that of the mean level: −1/steps for its level in each interval."""
     admissible = Admissible.of(load_network("copper_net").with_options(episode={"horizon": 5}))
     programs = Programs(admissible, 1, None)
-    start = starting_stocks(admissible.network, None)
+    start = starting_stocks(admissible.lifetimes, None)
     free, held = programs.program(start), programs.program(start, 0.9)
     assert held.under.shape[0] == free.under.shape[0] + 1
     row = held.under[[-1]].toarray().reshape(5, -1)

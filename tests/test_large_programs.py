@@ -56,13 +56,13 @@ def test_hipo_proves_the_bound_that_the_others_prove(monkeypatch: pytest.MonkeyP
     pytest.importorskip("highspy_extras")
     usual = bound("copper_net", min_service=0.9, degree=1, horizon=40)
     monkeypatch.setattr(solver, "LARGE_PROGRAM", 0)
-    tried, run = list[solver.HighsOptions | None](), solver._Scaled.run
+    tried, run = list[solver.HighsOptions | None](), solver._ScaledProgram.run
 
     def noted(scaled: Any, options: solver.HighsOptions | None, basis: Any, **others: Any) -> Any:
         tried.append(options)
         return run(scaled, options, basis, **others)
 
-    monkeypatch.setattr(solver._Scaled, "run", noted)
+    monkeypatch.setattr(solver._ScaledProgram, "run", noted)
     found = bound("copper_net", min_service=0.9, degree=1, horizon=40)
     assert tried == [solver.LARGE_SETTINGS[0]]
     assert found.basis is None

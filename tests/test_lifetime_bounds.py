@@ -60,7 +60,7 @@ def test_kernels_enclose_what_leaves(distribution: str, deviation: float, mean: 
             leaving[p, k] = rate[p] * middle[-1] + chain.weights[0] * inflow[p, k]
             stages = whole[:size, :size] @ stages + whole[:size, size] * inflow[p, k]
     entered, left = weighted(inflow, degree), weighted(leaving, degree)
-    known = kernel.known @ start
+    known = kernel.start_outflow @ start
     low, high = (known + np.einsum("piqj,qj->pi", each, entered) for each in (kernel.low, kernel.high))
     rounding = 1e-4 * left.max()  # of the fine steps
     assert (low <= left + rounding).all() and (left <= high + rounding).all()
@@ -77,7 +77,7 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     network = town(lifetime, INFLOW[:years], initial=30.0, growth=0.02, stretch=stretch)
     programs = Programs(Admissible.of(network), 2, None)
     lifetimes, layout = programs.admissible.lifetimes, programs.layout
-    start = by_stage(network, network.initial[1])
+    start = by_stage(network, lifetimes.state_layout, network.initial[1])
     problem = programs.program(start)
     matrix, to = lifetimes.rows(layout, start, range(years))
     steps = layout.pieces * FINE
@@ -87,9 +87,9 @@ def test_rows_and_boxes_hold_in_an_episode(lifetime: Lifetime, stretch: float | 
     (each,) = lifetimes.passive
     values = np.zeros((years, layout.size))
     for i, moment in enumerate(layout.moments):
-        values[:, layout.flow[moment] + each.leaving] = left[:, i]
-        values[:, layout.flow[moment] + each.entering[0]] = INFLOW[:years]
-        columns = layout.size * np.arange(years) + layout.flow[moment] + each.leaving
+        values[:, layout.flow[moment] + each.exit_arc] = left[:, i]
+        values[:, layout.flow[moment] + each.inflow_arcs[0]] = INFLOW[:years]
+        columns = layout.size * np.arange(years) + layout.flow[moment] + each.exit_arc
         assert (left[:, i] <= problem.high[columns] * (1 + 1e-6)).all()
     assert (matrix @ values.ravel() <= to + 1e-5 * left.max()).all()
     # and they leave little room

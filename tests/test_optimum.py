@@ -42,6 +42,7 @@ from cirl_marl.optimum.options import starting_stocks
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.reach import ComparisonSystem
 from cirl_marl.optimum.solver import solve
+from cirl_marl.optimum.vintages import Lifetimes
 
 Floats = NDArray[np.float64]
 COPIES = 48
@@ -165,7 +166,9 @@ def test_reach(network: Network, interval: float, seed: int) -> None:
     network = certifiable(network, interval, pulls=False)
     single = started(network, network.initial[1])
     admissible = Admissible.of(single)
-    reached = ComparisonSystem(admissible).reach(starting_stocks(single, None), range(single.episode.horizon))
+    reached = ComparisonSystem(admissible).reach(
+        starting_stocks(admissible.lifetimes, None), range(single.episode.horizon)
+    )
     *_, highest = episodes(single, seed)
     assert (highest <= reached.upper[:, : len(highest)].max(axis=0) * (1 + 1e-9) + 1e-12).all()
     run = rollout(MultiAgentVectorEnv(single, num_envs=1), Neutral())
@@ -305,7 +308,7 @@ def test_exogenous_series_that_is_cut_still_bounds() -> None:
 def test_controls_held_to_first_order_lie_below_the_bound() -> None:
     """Rows that hold the controls within an interval can only lower the optimum, and neutral control satisfies them."""
     admissible = Admissible.of(load_network("copper_net").with_options(episode={"horizon": 8}))
-    start = starting_stocks(admissible.network, None)
+    start = starting_stocks(admissible.lifetimes, None)
     free, held = (Programs(admissible, 2, None, hold_controls=each).program(start) for each in (False, True))
     best, planned = (-float(problem.cost @ solve(problem).plan) for problem in (free, held))
     neutral = rollout(MultiAgentVectorEnv("copper_net", num_envs=1, horizon=8), Neutral()).episode_circularity[0]
@@ -499,7 +502,7 @@ def test_networks_without_certificate(name: str, scenario: str | None, said: str
 def test_large_networks_are_reached_by_the_same_formula(network: Network, interval: float) -> None:
     """The series that stands for matrices of nodes by nodes gives the same bounds, no closer than they are."""
     network = certifiable(network, interval, pulls=False)
-    start, when = starting_stocks(network, None), range(network.episode.horizon)
+    start, when = starting_stocks(Lifetimes(network, ()), None), range(network.episode.horizon)
     small = ComparisonSystem(Admissible.of(network)).reach(start, when)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reach, "DENSE", 0)
@@ -537,7 +540,7 @@ def test_a_network_of_five_thousand_nodes() -> None:
     ]
     network = small(nodes, [*arcs, order("o", "n0", "n1", 1.0)], horizon=3)
     programs = Programs(Admissible.of(network), degree, None)
-    problem = programs.program(starting_stocks(network, None))
+    problem = programs.program(starting_stocks(Lifetimes(network, ()), None))
     assert problem.equal.shape[1] == 3 * programs.layout.size
     run = rollout(MultiAgentVectorEnv(network, num_envs=1), Neutral())
     ends_of = problem.high.reshape(3, -1)[:, programs.layout.last]

@@ -119,9 +119,9 @@ def test_other_settings_are_tried(failing: int, monkeypatch: pytest.MonkeyPatch)
 def test_the_first_settings_may_lie(monkeypatch: pytest.MonkeyPatch) -> None:
     """That nothing satisfies a program is for the settings without presolve to say."""
     network = yearly(0.5, horizon=3)
-    usual, run = bound(network).objective, solver._Scaled.run
+    usual, run = bound(network).objective, solver._ScaledProgram.run
 
-    def lying(self: solver._Scaled, settings: Any, basis: Any, **options: Any) -> highspy.Highs:
+    def lying(self: solver._ScaledProgram, settings: Any, basis: Any, **options: Any) -> highspy.Highs:
         highs = run(self, settings, basis, **options)
         if (settings or {}).get("presolve") != "off":
             highs.clearSolver()
@@ -130,7 +130,7 @@ def test_the_first_settings_may_lie(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setattr(highspy.Highs, "getModelStatus", lambda _: highspy.HighsModelStatus.kOptimal)
         return highs
 
-    monkeypatch.setattr(solver._Scaled, "run", lying)
+    monkeypatch.setattr(solver._ScaledProgram, "run", lying)
     assert bound(network).objective == pytest.approx(usual, rel=1e-5)
 
 
@@ -140,7 +140,7 @@ def test_mpc_goes_on_where_a_plan_is_missing(monkeypatch: pytest.MonkeyPatch) ->
     env = MultiAgentVectorEnv(network, num_envs=1, horizon=12)
     usual = rollout(env, MPC(min_service=0.9), seed=1)
     controller, asked = MPC(min_service=0.9), 0
-    solve = MPC._solved
+    solve = MPC._solve_window
 
     def hindered(self: MPC, *arguments: object) -> object:
         nonlocal asked
@@ -149,7 +149,7 @@ def test_mpc_goes_on_where_a_plan_is_missing(monkeypatch: pytest.MonkeyPatch) ->
             raise solver.SolverFailure("here")
         return solve(self, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(MPC, "_solved", hindered)
+    monkeypatch.setattr(MPC, "_solve_window", hindered)
     found = rollout(env, controller, seed=1)
     assert "here" in controller.note
     neutral = rollout(env, Neutral(), seed=1).episode_circularity[0]
@@ -158,7 +158,7 @@ def test_mpc_goes_on_where_a_plan_is_missing(monkeypatch: pytest.MonkeyPatch) ->
     asked = 1
     rollout(env, controller, seed=1)
     assert controller.note
-    monkeypatch.setattr(MPC, "_solved", solve)
+    monkeypatch.setattr(MPC, "_solve_window", solve)
     rollout(env, controller, seed=1)
     assert not controller.note
 
@@ -175,7 +175,7 @@ def test_a_plan_lies_within_its_boxes_too() -> None:
     problem, layout = found.problem, found.problem.layout
     size = np.maximum(np.abs(problem.low), np.abs(problem.high))
     size[size == 0] = 1.0
-    scaled = solver._Scaled(problem, size)
+    scaled = solver._ScaledProgram(problem, size)
 
     def feasible(plan: Floats) -> bool:
         answer = SimpleNamespace(getSolution=lambda: SimpleNamespace(col_value=plan / size))

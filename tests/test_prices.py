@@ -20,6 +20,7 @@ from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.options import by_stage
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import solve
+from cirl_marl.optimum.vintages import Lifetimes
 from cirl_marl.reasons.prices import shadow_prices, with_bound
 
 Floats = NDArray[np.floating]
@@ -176,7 +177,7 @@ def test_a_cycle_against_programs_solved_again() -> None:
             rise = optimum(bound(with_bound(network, agent, side, values * (1 + 1e-4 * way)), min_service=0.9)) - basic
             assert found.room[side, :, a].sum() / 0.01 == pytest.approx(rise / 1e-4, rel=5e-2, abs=5e-3), agent
     for i, node in enumerate(network.stores):
-        stocks = by_stage(network, network.initial.mean(axis=0))
+        stocks = by_stage(network, Lifetimes(network, ()).state_layout, network.initial.mean(axis=0))
         stocks[i] += 1e-3
         rise = (optimum(bound(network, stocks, min_service=0.9)) - basic) / 1e-3
         assert found.stock[0, i] == pytest.approx(rise, rel=1e-2, abs=1e-5), node.id

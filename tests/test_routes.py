@@ -38,7 +38,7 @@ def test_shares_lie_in_their_ranges(network: Network, seed: int) -> None:
         rate = laws.rate(asked, np.full(200, step))
         least, most = admissible.rate[:, step]
         for each in (rate.min(axis=1) - least, most - rate.max(axis=1)):
-            assert (each >= -1e-12 * (1 + most))[~admissible.scheduled].all()
+            assert (each >= -1e-12 * (1 + most))[~admissible.by_schedule].all()
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -78,7 +78,7 @@ class IntervalRanges:
 
     network: Network
     driver: Integers
-    scheduled: NDArray[np.bool_]
+    by_schedule: NDArray[np.bool_]
     proportional: NDArray[np.bool_]
     share_arcs: NDArray[np.bool_]
     base: Floats
@@ -137,14 +137,14 @@ class Admissible:
             NoCertificate: for inner physics, batches, or a solver that is not exact.
             CirlError: for an unknown agent.
         """
-        reasons = list(_uncertified(network))
+        reasons = list(_exclusions(network))
         if reasons:
             name = f"network '{network.name}', scenario '{network.scenario_name}'"
             raise NoCertificate(f"{name}: no bound is proved: {'; '.join(reasons)}")
         actuators = Actuators(network, agents, 1)
         agents = actuators.agents
         lifetimes = Lifetimes(network, agents)
-        network = lifetimes.planned
+        network = lifetimes.plan_network
         steps = network.episode.horizon
         # lowest, neutral and highest
         setting, valve = np.ones((3, steps, len(network.arcs))), np.ones((3, steps, len(network.nodes)))
@@ -156,7 +156,7 @@ class Admissible:
                 if network.compartments[id_].control is not None:
                     stretch = _control_range(network, network.compartments[id_], agents)
                     valve[:, :, network.node_index[store]] = 1.0 / stretch[::-1]
-        setting[0][:, lifetimes.leaving] = 0.0  # what leaves at the end of a life may be nothing
+        setting[0][:, lifetimes.exit_arcs] = 0.0  # what leaves at the end of a life may be nothing
         for k, arc in enumerate(network.arcs):
             compartment = _setter(network, arc)
             if compartment is not None:
@@ -189,7 +189,7 @@ class Admissible:
         return self.actuators.agents
 
     @property
-    def scheduled(self) -> NDArray[np.bool_]:
+    def by_schedule(self) -> NDArray[np.bool_]:
         """Arcs that flow by schedule, as far as their donor holds enough, shape (arcs,)."""
         return self.driver < 0
 
@@ -211,8 +211,13 @@ class Admissible:
     @cached_property
     def kinds(self) -> Integers:
         """For each interval the first that is like it but for what flows by schedule, shape (steps,)."""
-        driven = ~self.scheduled
-        parts = [*self.setting[:, :, driven], self.base[:, driven], *self.valve, self.neutral_rate[:, driven]]
+        stock_driven = ~self.by_schedule
+        parts = [
+            *self.setting[:, :, stock_driven],
+            self.base[:, stock_driven],
+            *self.valve,
+            self.neutral_rate[:, stock_driven],
+        ]
         parts += [self.service_low, *(split.proportions.T for split in self.splits)]
         _, first, kind = np.unique(np.concatenate(parts, axis=1), axis=0, return_index=True, return_inverse=True)
         kinds: Integers = first[kind.ravel()]
@@ -236,12 +241,12 @@ class Admissible:
         # shares of a release do not leave one by one: the release as a whole does
         single = rate * ((self.driver == donors) & ~self.share_arcs)
         exits = np.array([np.bincount(donors, bound, nodes) for bound in single], dtype=float) + release
-        proportional = ~self.scheduled
-        proportional[self.lifetimes.leaving] = False
+        proportional = ~self.by_schedule
+        proportional[self.lifetimes.exit_arcs] = False
         return IntervalRanges(
             network=network,
             driver=self.driver,
-            scheduled=self.scheduled,
+            by_schedule=self.by_schedule,
             proportional=proportional,
             share_arcs=self.share_arcs,
             base=self.base[step],
@@ -301,7 +306,7 @@ def _driver(network: Network, arc: Arc) -> int:
     return network.node_index[arc.recipient if arc.law is Law.RECIPIENT else arc.donor]
 
 
-def _uncertified(network: Network) -> Iterator[str]:
+def _exclusions(network: Network) -> Iterator[str]:
     """Yield why the theorem does not hold for the flows of ``network``."""
     if network.episode.solver != "exact":
         yield f"solver '{network.episode.solver}' is not exact within a control interval"
@@ -330,10 +335,10 @@ def normalised_actions(admissible: Admissible, layout: Layout, plan: Floats, int
         Actions in [−1, 1], in the order of ``MultiAgentVectorEnv.stack``, shape (steps, entries).
     """
     network, first = admissible.network, 0 if intervals is None else intervals.start
-    when = slice(first, first + len(plan))
-    valve_range, base = admissible.valve[:, when], admissible.base[when]
+    period = slice(first, first + len(plan))
+    valve_range, base = admissible.valve[:, period], admissible.base[period]
     stock, flow, through = layout.means(plan)
-    neutral, valve = admissible.neutral_setting[when], admissible.neutral_valve[when].copy()
+    neutral, valve = admissible.neutral_setting[period], admissible.neutral_valve[period].copy()
     by_donor = admissible.driver == network.donors
     for k in np.flatnonzero(by_donor):
         donor = int(network.donors[k])
@@ -343,15 +348,15 @@ def normalised_actions(admissible: Admissible, layout: Layout, plan: Floats, int
     for z, node in enumerate(layout.valves):
         valve[:, node] = _ratio(through[:, z], stock[:, node], valve[:, node])
     if isinstance(network, StagedNetwork):
-        for living in dict.fromkeys(network.valves.values()):
-            arcs = [k for k in np.flatnonzero(by_donor) if network.valves.get(network.arcs[k].donor) == living]
-            unit, place = base[:, arcs] * stock[:, network.donors[arcs]], network.node_index[living]
+        for lifetime_node in dict.fromkeys(network.valves.values()):
+            arcs = [k for k in np.flatnonzero(by_donor) if network.valves.get(network.arcs[k].donor) == lifetime_node]
+            unit, place = base[:, arcs] * stock[:, network.donors[arcs]], network.node_index[lifetime_node]
             valve[:, place] = _ratio(flow[:, arcs].sum(axis=1), unit.sum(axis=1), valve[:, place])
     # what is left of f̄_k after the valve is the arc's own factor, w_k = f̄_k/(a_k·v·X̄_p)
     valve = np.clip(valve, *valve_range)
-    driver = np.where(admissible.scheduled, 1.0, stock[:, admissible.driver])
-    setting = np.clip(_ratio(flow, base * driver * valve[:, network.donors], neutral), *admissible.setting[:, when])
-    actuators, steps = admissible.actuators, np.arange(when.start, when.stop)
+    driver = np.where(admissible.by_schedule, 1.0, stock[:, admissible.driver])
+    setting = np.clip(_ratio(flow, base * driver * valve[:, network.donors], neutral), *admissible.setting[:, period])
+    actuators, steps = admissible.actuators, np.arange(period.start, period.stop)
     actions = np.zeros((len(steps), len(actuators.control_rows)))
     for agent, entries in actuators.entries.items():
         control = network.compartments[agent].control

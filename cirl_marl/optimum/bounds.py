@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from cirl_marl.definitions.catalogue import load_network
-from cirl_marl.dynamics.stages import simulated_network
-from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
@@ -38,13 +36,13 @@ def relative(difference: ArrayLike, reference: ArrayLike) -> Floats:
     return ratio
 
 
-def gap(bound: ArrayLike, achieved: ArrayLike) -> Floats:
+def gap(bound: ArrayLike, value: ArrayLike) -> Floats:
     """Return (bound − achieved)/|bound| in the broadcast shape, NaN where the bound is 0.
 
     >>> float(gap(-10.0, -12.0))
     0.2
     """
-    return relative(np.subtract(bound, achieved), bound)
+    return relative(np.subtract(bound, value), bound)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,18 +94,18 @@ class Bound:
         mass, demand = self.network.mass_unit, ""
         if self.min_service is not None and self.network.services:
             demand = f", service level at least {levels_text(self.network, self.min_service)}"
-        what = f"λ̄ ≤ {self.objective:.6g} {mass}{demand}"
+        statement = f"λ̄ ≤ {self.objective:.6g} {mass}{demand}"
         if self.service_weight is not None:
-            what = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
-        promised = f"λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
-        where = f"bound of {self.network.name} over {self.network.episode.horizon} steps"
-        return f"{where}: {what}; its plan promises {promised}{self._idle}"
+            statement = f"λ̄/scale + {self.service_weight:g}·service ≤ {self.objective:.6g}"
+        plan = f"λ̄ = {float(self.circularity.mean()):.6g} {mass} and serves {self.service:.4f}"
+        subject = f"bound of {self.network.name} over {self.network.episode.horizon} steps"
+        return f"{subject}: {statement}; its plan promises {plan}{self._idle}"
 
     @property
     def _idle(self) -> str:
         """Say which supplies nobody acts on, of which the program knows the bounds alone."""
-        acting = self.agents or self.network.agents
-        idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in acting]
+        agents = self.agents or self.network.agents
+        idle = [arc.id for arc in self.network.arcs if arc.makes_up_for and arc.id not in agents]
         return f"; {', '.join(idle)} may supply any amount within bounds in it" if idle else ""
 
     def verify(self) -> Verification:
@@ -139,11 +137,11 @@ class Bound:
 
         Service counts in a weighted objective only. NaN if the bound is 0.
         """
-        achieved = np.asarray(circularity, dtype=float)
+        value = np.asarray(circularity, dtype=float)
         if self.service_weight is not None:
             scale = self.network.objective.circularity_scale
-            achieved = achieved / scale + self.service_weight * np.asarray(service, dtype=float)
-        return gap(self.objective, achieved)
+            value = value / scale + self.service_weight * np.asarray(service, dtype=float)
+        return gap(self.objective, value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,23 +157,23 @@ class Envelope:
     def at(self, initial: ArrayLike | None = None, min_service: ArrayLike | None = None) -> Floats:
         """Return the least of the bounds that the members prove; see ``Bound.at``, whose defaults are the first's."""
         first = self.members[0]
-        starts = by_stage(first.network, first.initial if initial is None else initial)
-        nodes = len(first.initial)
-        demanded = _demanded(first, min_service)
-        shape = np.broadcast_shapes(starts.shape[:-1], () if demanded is None else demanded.shape[:-1])
-        names = StateLayout(simulated_network(first.network)).start_names
-        programs = Programs(Admissible.of(first.network, first.agents or None), first.degree, first.service_weight)
-        starts = np.broadcast_to(starts, (*shape, nodes))
-        levels = None if demanded is None else np.broadcast_to(demanded, (*shape, demanded.shape[-1]))
-        found = np.empty(shape)
+        admissible = Admissible.of(first.network, first.agents or None)
+        state_layout = admissible.lifetimes.state_layout
+        starts = by_stage(first.network, state_layout, first.initial if initial is None else initial)
+        demand = _demand(first, min_service)
+        shape = np.broadcast_shapes(starts.shape[:-1], () if demand is None else demand.shape[:-1])
+        programs = Programs(admissible, first.degree, first.service_weight)
+        starts = np.broadcast_to(starts, (*shape, len(first.initial)))
+        levels = None if demand is None else np.broadcast_to(demand, (*shape, demand.shape[-1]))
+        bounds = np.empty(shape)
         for i in np.ndindex(shape):
-            check_stocks(names, starts[i])
+            check_stocks(state_layout, starts[i])
             problem = programs.program(starts[i], None if levels is None else levels[i])
-            found[i] = min(dual_bound(problem, each.certificate) for each in self.members)
-        return found
+            bounds[i] = min(dual_bound(problem, member.certificate) for member in self.members)
+        return bounds
 
 
-def _demanded(bound: Bound, min_service: ArrayLike | None) -> Floats | None:
+def _demand(bound: Bound, min_service: ArrayLike | None) -> Floats | None:
     """Return the demanded levels, shape (..., services); None if there are none."""
     if min_service is None:
         return bound.min_service
@@ -223,11 +221,11 @@ def bound(
             solver's tolerance of 1e-7), or a solver that fails.
     """
     check_options(service_weight, min_service, degree)
-    admissible = Admissible.of(_found(network, scenario, horizon), agents)
-    start = starting_stocks(admissible.lifetimes.network, initial)
+    admissible = Admissible.of(_episode_network(network, scenario, horizon), agents)
+    start = starting_stocks(admissible.lifetimes, initial)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service)
     basis = None if near is None else near.basis
-    return _bounded(Programs(admissible, degree, service_weight), start, service_weight, levels, basis)
+    return _solve_bound(Programs(admissible, degree, service_weight), start, service_weight, levels, basis)
 
 
 def envelope(
@@ -242,7 +240,7 @@ def envelope(
     horizon: int | None = None,
     degree: int = DEGREE,
     near: Bound | None = None,
-    progress: Callable[[int], None] = lambda solved: None,
+    progress: Callable[[int], None] = lambda solves: None,
 ) -> Envelope:
     """Bound the objective from many starts with a few solutions.
 
@@ -256,32 +254,30 @@ def envelope(
     """
     if not isinstance(solves, int | np.integer) or isinstance(solves, bool) or solves < 1:
         raise CirlError(f"solves must be a whole number of at least 1, got {solves!r}")
-    admissible = Admissible.of(_found(network, scenario, horizon), agents)
-    network_, nodes = admissible.lifetimes.network, len(admissible.lifetimes.network.stores)
+    admissible = Admissible.of(_episode_network(network, scenario, horizon), agents)
+    lifetimes = admissible.lifetimes
     if np.ndim(initial) != 2 or not len(np.asarray(initial)):
-        raise CirlError(f"initial has shape {np.shape(initial)}, expected (episodes, {nodes})")
-    starts = by_stage(network_, initial)
+        raise CirlError(f"initial has shape {np.shape(initial)}, expected (episodes, {len(lifetimes.network.stores)})")
+    starts = by_stage(lifetimes.network, lifetimes.state_layout, initial)
     check_options(service_weight, min_service, degree)
     levels = None if min_service is None else demanded_levels(admissible.network, min_service, (len(starts),))
     programs = Programs(admissible, degree, service_weight)
 
-    names = StateLayout(simulated_network(network_)).start_names
-
-    def solved(start: Floats, demanded: Floats | None, basis: Basis | None) -> Bound:
-        check_stocks(names, start)
-        return _bounded(programs, start, service_weight, demanded, basis)
+    def solve_from(start: Floats, demand: Floats | None, basis: Basis | None) -> Bound:
+        check_stocks(lifetimes.state_layout, start)
+        return _solve_bound(programs, start, service_weight, demand, basis)
 
     basis = None if near is None else near.basis
-    first = solved(starts.mean(axis=0), None if levels is None else levels.mean(axis=0), basis)
+    first = solve_from(starts.mean(axis=0), None if levels is None else levels.mean(axis=0), basis)
     progress(1)
-    found, open_ = Envelope((first,)), np.ones(len(starts), dtype=bool)
+    bounds, candidates = Envelope((first,)), np.ones(len(starts), dtype=bool)
     for count in range(min(solves - 1, len(starts))):
-        worst = int(np.where(open_, found.at(starts, levels), np.inf).argmin())
-        open_[worst] = False
-        demanded = None if levels is None else levels[worst]
-        found = Envelope((*found.members, solved(starts[worst], demanded, first.basis)))
+        worst = int(np.where(candidates, bounds.at(starts, levels), np.inf).argmin())
+        candidates[worst] = False
+        demand = None if levels is None else levels[worst]
+        bounds = Envelope((*bounds.members, solve_from(starts[worst], demand, first.basis)))
         progress(count + 2)
-    return found
+    return bounds
 
 
 def highest_service(network: Network) -> float:
@@ -290,17 +286,18 @@ def highest_service(network: Network) -> float:
     Raises:
         NoCertificate: for a network whose flows are not linear laws.
     """
-    programs = Programs(Admissible.of(network, None), DEGREE, None)
-    return 1.0 - _least_cut(programs.program(starting_stocks(network, None), 1.0), range(len(network.services)))
+    admissible = Admissible.of(network)
+    problem = Programs(admissible, DEGREE, None).program(starting_stocks(admissible.lifetimes, None), 1.0)
+    return 1.0 - _least_cut(problem, range(len(network.services)))
 
 
-def _found(network: str | Path | Network, scenario: str | None, horizon: int | None) -> Network:
-    found = load_network(network) if isinstance(network, str | Path) else network
-    found = found.scenario(scenario)
-    return found if horizon is None else found.with_options(episode={"horizon": horizon})
+def _episode_network(network: str | Path | Network, scenario: str | None, horizon: int | None) -> Network:
+    loaded = load_network(network) if isinstance(network, str | Path) else network
+    loaded = loaded.scenario(scenario)
+    return loaded if horizon is None else loaded.with_options(episode={"horizon": horizon})
 
 
-def _bounded(
+def _solve_bound(
     programs: Programs,
     start: Floats,
     service_weight: float | None,
@@ -309,17 +306,17 @@ def _bounded(
 ) -> Bound:
     admissible, layout = programs.admissible, programs.layout
     problem = programs.program(start, min_service)
-    what = "the program of the bound" + _asked(admissible.network, service_weight, min_service)
+    label = "the program of the bound" + _request(admissible.network, service_weight, min_service)
     try:
-        solution = solve(problem, basis, label=what)
+        solution = solve(problem, basis, label=label)
     except Infeasible:
         raise CirlError(_unreachable(problem, min_service)) from None
     proof = verify(problem, solution.certificate, solution.plan)
-    planned = solution.plan.reshape(-1, layout.size)
-    circularity = planned @ circularity_weights(layout)
-    levels = planned[:, layout.level : layout.imbalance]
+    plan = solution.plan.reshape(-1, layout.size)
+    circularity = plan @ circularity_weights(layout)
+    levels = plan[:, layout.level : layout.imbalance]
     lifetimes = admissible.lifetimes
-    stocks = np.concatenate([(lifetimes.start_planned @ start)[None], planned[:, layout.last]])
+    stocks = np.concatenate([(lifetimes.start_planned @ start)[None], plan[:, layout.last]])
     return Bound(
         network=lifetimes.network,
         agents=admissible.agents,
@@ -333,8 +330,8 @@ def _bounded(
         degree=layout.degree,
         circularity=circularity,
         stock=stocks @ lifetimes.totals.T,
-        flow=layout.means(planned)[1][:, : len(lifetimes.network.arcs)],
-        actions=normalised_actions(admissible, layout, planned),
+        flow=layout.means(plan)[1][:, : len(lifetimes.network.arcs)],
+        actions=normalised_actions(admissible, layout, plan),
         problem=problem,
         solution=solution.plan,
         certificate=solution.certificate,
@@ -342,7 +339,7 @@ def _bounded(
     )
 
 
-def _asked(network: Network, service_weight: float | None, min_service: Floats | None) -> str:
+def _request(network: Network, service_weight: float | None, min_service: Floats | None) -> str:
     if min_service is not None and network.services:
         return f" with a mean service level of {levels_text(network, min_service)}"
     return "" if service_weight is None else f" with a service weight of {service_weight:.6g}"
@@ -353,16 +350,16 @@ def _unreachable(problem: Program, min_service: Floats | None) -> str:
     network = problem.layout.network
     if min_service is None or not network.services:
         return f"network '{network.name}': HiGHS calls the program infeasible, though neutral control solves it"
-    everyone, when = range(len(network.services)), ""
-    cuts = {s: _least_cut(problem, [s]) for s in everyone}
-    lacking = {s: cut for s, cut in cuts.items() if cut > FEASIBLE}
-    if not lacking:
-        lacking, when = dict.fromkeys(everyone, _least_cut(problem, everyone)), " at the same time"
-    said = [
+    services, suffix = range(len(network.services)), ""
+    cuts = {s: _least_cut(problem, [s]) for s in services}
+    shortfalls = {s: cut for s, cut in cuts.items() if cut > FEASIBLE}
+    if not shortfalls:
+        shortfalls, suffix = dict.fromkeys(services, _least_cut(problem, services)), " at the same time"
+    levels = [
         f"{min_service[s]:g} of '{network.services[s].id}' (at most {min_service[s] - cut:.6g})"
-        for s, cut in lacking.items()
+        for s, cut in shortfalls.items()
     ]
-    return f"network '{network.name}': no actions reach a mean service level of {', '.join(said)}{when}"
+    return f"network '{network.name}': no actions reach a mean service level of {', '.join(levels)}{suffix}"
 
 
 def _least_cut(problem: Program, services: Sequence[int]) -> float:
@@ -370,13 +367,13 @@ def _least_cut(problem: Program, services: Sequence[int]) -> float:
     first = len(problem.under_to) - len(problem.layout.network.services)
     rows = [*range(first), *(first + s for s in services)]
     # minimise t, one more variable, with mean level + t ≥ demanded level
-    lowered = sparse.csr_array((np.arange(len(rows)) >= first)[:, None] * -1.0)
+    allowance = sparse.csr_array((np.arange(len(rows)) >= first)[:, None] * -1.0)
     cut = replace(
         problem,
         cost=np.append(np.zeros_like(problem.cost), 1.0),
         constant=0.0,
         equal=sparse.hstack([problem.equal, sparse.csr_array((len(problem.equal_to), 1))], format="csr"),
-        under=sparse.hstack([problem.under[rows], lowered], format="csr"),
+        under=sparse.hstack([problem.under[rows], allowance], format="csr"),
         under_to=problem.under_to[rows],
         low=np.append(problem.low, 0.0),
         high=np.append(problem.high, 1.0),

@@ -29,7 +29,7 @@ class Verification:
     bound: float
     objective: float
     infeasibility: float
-    charged: float
+    small_costs: float
     rounding: float
 
 
@@ -65,35 +65,35 @@ def verify(problem: Program, certificate: Certificate, plan: Floats) -> Verifica
     Raises:
         CirlError: for a multiplier that is not finite; names its row.
     """
-    bound, rounding, reduced, columns = _proved(problem, certificate)
-    small = np.abs(reduced) < 1e-6 * np.abs(problem.cost).max(initial=0.0)
+    bound, rounding, reduced_cost, columns = _dual_bound(problem, certificate)
+    small = np.abs(reduced_cost) < 1e-6 * np.abs(problem.cost).max(initial=0.0)
     return Verification(
         bound=bound,
         objective=problem.constant - math.fsum(problem.cost * plan),
         infeasibility=float(np.maximum(certificate.under, 0.0).max(initial=0.0)),
-        charged=-math.fsum(columns[small]),
+        small_costs=-math.fsum(columns[small]),
         rounding=rounding,
     )
 
 
 def dual_bound(problem: Program, certificate: Certificate) -> float:
     """Return the bound of ``verified`` alone."""
-    return _proved(problem, certificate)[0]
+    return _dual_bound(problem, certificate)[0]
 
 
-def _proved(problem: Program, certificate: Certificate) -> tuple[float, float, Floats, Floats]:
+def _dual_bound(problem: Program, certificate: Certificate) -> tuple[float, float, Floats, Floats]:
     """Return the bound, the allowance for rounding in it, d, and min(d_j l_j, d_j u_j)."""
     for rows, multipliers in (("A", certificate.equal), ("G", certificate.under)):
         if not np.isfinite(multipliers).all():
             row = int(np.flatnonzero(~np.isfinite(multipliers))[0])
             raise CirlError(f"certificate: the multiplier of row {row} of {rows} is {multipliers[row]}")
     y, mu = certificate.equal, np.minimum(certificate.under, 0.0)
-    reduced = problem.cost - problem.equal.T @ y - problem.under.T @ mu
+    reduced_cost = problem.cost - problem.equal.T @ y - problem.under.T @ mu
     size = np.abs(problem.cost) + abs(problem.equal).T @ np.abs(y) + abs(problem.under).T @ np.abs(mu)
     terms_per_column = np.diff(problem.equal.tocsc().indptr) + np.diff(problem.under.tocsc().indptr) + 4
     reach = np.maximum(np.abs(problem.low), np.abs(problem.high))
-    columns = np.minimum(reduced * problem.low, reduced * problem.high)
+    columns = np.minimum(reduced_cost * problem.low, reduced_cost * problem.high)
     terms = np.concatenate([problem.equal_to * y, problem.under_to * mu, columns])
     # twice what the errors can be, which leaves room for the errors of these two sums
     rounding = 2 * EPSILON * (float(terms_per_column * size @ reach) + 4 * float(np.abs(terms).sum()))
-    return problem.constant - math.fsum(terms) + rounding, rounding, reduced, columns
+    return problem.constant - math.fsum(terms) + rounding, rounding, reduced_cost, columns

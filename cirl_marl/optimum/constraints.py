@@ -127,7 +127,7 @@ def delivery_limits(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -
     turnover = ranges.exits[0] * layout.length
     # U·δ ≤ x_start·z/(e^z − 1); the factor falls with z, so the least rate of the exits gives the weakest, valid row
     share = np.divide(turnover, np.expm1(turnover), out=np.ones(len(turnover)), where=turnover > 1e-9)
-    arcs = np.flatnonzero(ranges.scheduled)
+    arcs = np.flatnonzero(ranges.by_schedule)
     nodes, place = np.unique(ranges.network.donors[arcs], return_inverse=True)
     piece = np.arange(layout.pieces)[:, None]
     row = rows.add(0, piece, nodes)
@@ -140,7 +140,7 @@ def constant_schedules(ranges: IntervalRanges, layout: Layout, equal: ProgramRow
 
     If pieces are coarse, a flow that nothing can cut is constant in the interval.
     """
-    moment, arcs = layout.moment_column, np.flatnonzero(ranges.scheduled)
+    moment, arcs = layout.moment_column, np.flatnonzero(ranges.by_schedule)
     first = 0 * moment if layout.coarse else moment - moment % (layout.degree + 1)
     later = (moment > first).ravel()
     for rows, side, sign in ((under, 0, 1.0), (under, 1, -1.0)) if layout.coarse else ((equal, 0, 1.0),):
@@ -168,10 +168,10 @@ def service_levels(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) ->
             rows.put(row, layout.flow[layout.moment_column] + network.service_arcs(service), -1.0 / count)
     weights = -network.circularity_weights[1]
     arcs = np.flatnonzero(weights)
-    both = rows.add(1, len(network.services), [0, 1])
-    for row, sign in zip(both, (1.0, -1.0), strict=True):
+    pair = rows.add(1, len(network.services), [0, 1])
+    for row, sign in zip(pair, (1.0, -1.0), strict=True):
         rows.put(row, layout.flow[layout.moment_column] + arcs, sign * weights[arcs] / count)
-    rows.put(both, layout.imbalance, -1.0)
+    rows.put(pair, layout.imbalance, -1.0)
 
 
 def valve_envelopes(admissible: Admissible, reach: Reach, intervals: range, rows: ProgramRows) -> None:
@@ -181,11 +181,11 @@ def valve_envelopes(admissible: Admissible, reach: Reach, intervals: range, rows
     (v − v̲)(x̄ − X) ≥ 0 gives Z − v̲ X − x̄ v ≤ −v̲ x̄ (McCormick 1976).
     """
     network, layout, nodes = admissible.network, rows.layout, rows.layout.free_valves
-    when = slice(intervals.start, intervals.stop)
+    period = slice(intervals.start, intervals.stop)
     t = np.arange(len(intervals))[:, None]
     valve = layout.free_valve + np.arange(len(nodes))
     place, most = np.searchsorted(layout.valves, nodes), reach.upper[:, nodes]
-    low, high = admissible.valve[:, when, nodes]
+    low, high = admissible.valve[:, period, nodes]
     for i in layout.moments:
         for side, (x, z, v, limit) in enumerate(((high, -1.0, most, high * most), (-low, 1.0, -most, -low * most))):
             row = rows.add(0, t, nodes, 0, i, side)
@@ -193,9 +193,9 @@ def valve_envelopes(admissible: Admissible, reach: Reach, intervals: range, rows
             rows.put(row, t * layout.size + layout.valve[i] + place, z)
             rows.put(row, t * layout.size + valve, v)
             rows.limit(row, limit)
-    arcs = np.flatnonzero(admissible.scheduled & np.isin(network.donors, nodes))
+    arcs = np.flatnonzero(admissible.by_schedule & np.isin(network.donors, nodes))
     donors = network.donors[arcs]
-    capacity = admissible.setting[1, when, arcs].T * admissible.base[when, arcs]
+    capacity = admissible.setting[1, period, arcs].T * admissible.base[period, arcs]
     for piece in range(layout.pieces):
         row = rows.add(0, t, donors, 1 + arcs, piece)
         rows.put(row, t * layout.size + layout.flow[piece * (layout.degree + 1)] + arcs, 1.0)
@@ -212,11 +212,11 @@ def idle_supplies(admissible: Admissible, reach: Reach, intervals: range, rows: 
 
     Where a donor may deliver less than it is asked for, there is room for all that may be asked.
     """
-    when, layout = slice(intervals.start, intervals.stop), rows.layout
+    period, layout = slice(intervals.start, intervals.stop), rows.layout
     starts = [layout.flow[piece * (layout.degree + 1)] for piece in range(layout.pieces)]
     starts += [layout.end_flow[piece] for piece in range(layout.pieces)] if layout.has_end_flows else []
-    low, high = admissible.setting[:, when]
-    missing = np.where(reach.uncut, 0.0, high)
+    low, high = admissible.setting[:, period]
+    undelivered = np.where(reach.uncut, 0.0, high)
     t = np.arange(len(intervals))[:, None]
     for arcs, weight in _idle_groups(admissible):
         room = np.where(weight > 0, (high - low)[:, arcs], 0.0)  # of weight 0 never more than the least
@@ -230,7 +230,7 @@ def idle_supplies(admissible: Admissible, reach: Reach, intervals: range, rows: 
                 row = rows.add(1, t, arcs, at, side)
                 rows.put(row, t * layout.size + start + arcs, sign)
                 rows.put(row, t * layout.size + start + last, -sign * slope)
-                allowance = slope * missing[t, last] if side == 0 else missing[:, arcs]
+                allowance = slope * undelivered[t, last] if side == 0 else undelivered[:, arcs]
                 rows.limit(row, sign * (low[:, arcs] - slope * low[t, last]) + allowance)
 
 

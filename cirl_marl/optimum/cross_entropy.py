@@ -126,12 +126,12 @@ def search(
         CirlError: for input that cannot be used.
     """
     env = MultiAgentVectorEnv(network, num_envs=1, agents=agents, scenario=scenario, horizon=horizon)
-    given: Mapping[str, ArrayLike] = {}
+    initial_state: Mapping[str, ArrayLike] = {}
     if isinstance(initial, Mapping):
-        given = initial
+        initial_state = initial
     elif initial is not None:
-        given = by_state_name(env, np.asarray(initial, dtype=float)[None])
-    env.reset(seed=EVALUATION_SEEDS, options={"initial_state": given})
+        initial_state = by_state_name(env, np.asarray(initial, dtype=float)[None])
+    env.reset(seed=EVALUATION_SEEDS, options={"initial_state": initial_state})
     return search_each(
         env.network,
         starting_states(env),
@@ -173,36 +173,36 @@ def search_each(
             raise CirlError(f"{name} must be a whole number of at least {least}, got {value!r}")
     if knots > network.episode.horizon:
         raise CirlError(f"knots: {knots} are more than the {network.episode.horizon} decisions of an episode")
-    demanded = None if min_service is None else demanded_levels(network, min_service)
-    merit = _Objective(network.objective.circularity_scale, service_weight, demanded)
+    demand = None if min_service is None else demanded_levels(network, min_service)
+    merit = _Objective(network.objective.circularity_scale, service_weight, demand)
     starts = np.asarray(initial, dtype=float)
     copies = Population(network, agents, starts, population)
-    known = standard_candidates(copies.agents) if candidates is None else dict(candidates)
-    if not known:
+    options = standard_candidates(copies.agents) if candidates is None else dict(candidates)
+    if not options:
         raise CirlError("candidates: give at least one controller to begin with")
-    evaluations = len(known) + population * iterations
+    evaluations = len(options) + population * iterations
     highest = np.full(len(starts), -np.inf)
-    simulated = 0
+    episodes_done = 0
 
-    def told(episodes: int) -> Callable[[float], None]:
-        return lambda share: progress((simulated + episodes * share) / evaluations, highest)
+    def report(episodes: int) -> Callable[[float], None]:
+        return lambda share: progress((episodes_done + episodes * share) / evaluations, highest)
 
-    controllers = list(known.values())
-    entrants = np.tile(np.arange(len(known)), (len(starts), 1))
-    first = Population(network, copies.agents, starts, len(known)).run(
-        controllers, entrants, np.zeros((*entrants.shape, 1, copies.entries)), told(len(known))
+    controllers = list(options.values())
+    entrants = np.tile(np.arange(len(options)), (len(starts), 1))
+    first = Population(network, copies.agents, starts, len(options)).run(
+        controllers, entrants, np.zeros((*entrants.shape, 1, copies.entries)), report(len(options))
     )
     best = _Best.among(first, merit.of(first))
     origin = best.copy
     gaussians = Gaussians(best.merit, population, copies.entries, seed)
-    simulated, highest = len(known), best.merit
+    episodes_done, highest = len(options), best.merit
     for count in knot_counts(knots, iterations):
         gaussians.refine(count)
-        which = np.repeat(origin[:, None], population, axis=1)
-        tried = copies.run(controllers, which, gaussians.draw(), told(population))
+        controller = np.repeat(origin[:, None], population, axis=1)
+        tried = copies.run(controllers, controller, gaussians.draw(), report(population))
         gaussians.learn(merit.of(tried), tried.deviation)
         best = best.or_better(_Best.among(tried, merit.of(tried)))
-        simulated, highest = simulated + population, best.merit
+        episodes_done, highest = episodes_done + population, best.merit
     progress(1.0, best.merit)
     return [
         Incumbent(
@@ -214,9 +214,9 @@ def search_each(
             service=float(best.service[i]),
             levels=best.levels[i],
             candidates=dict(
-                zip(known, zip(first.circularity[i].tolist(), first.service[i].tolist(), strict=True), strict=True)
+                zip(options, zip(first.circularity[i].tolist(), first.service[i].tolist(), strict=True), strict=True)
             ),
-            origin=list(known)[origin[i]],
+            origin=list(options)[origin[i]],
             evaluations=evaluations,
         )
         for i in range(len(starts))
@@ -226,8 +226,8 @@ def search_each(
 def standard_candidates(agents: Sequence[str]) -> dict[str, Controller]:
     """Return neutral control, scripts (neutral for agents without one), and all agents at either end of their range."""
     ends = {"lowest": -1.0, "highest": 1.0}
-    held = {name: Constant(dict.fromkeys(agents, value)) for name, value in ends.items()}
-    return {"neutral": Neutral(), "scripted": ScriptController(), **held}
+    constants = {name: Constant(dict.fromkeys(agents, value)) for name, value in ends.items()}
+    return {"neutral": Neutral(), "scripted": ScriptController(), **constants}
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,16 +277,16 @@ class _Best:
         figures = episodes.circularity[start, copy], episodes.service[start, copy], episodes.levels[:, start, copy].T
         return cls(copy, merit[start, copy], *figures, actions)
 
-    def or_better(self, other: _Best) -> _Best:
+    def or_better(self, rival: _Best) -> _Best:
         """Return the better of the two from each start, these if they are equal."""
-        better = other.merit > self.merit
+        better = rival.merit > self.merit
         return _Best(
-            np.where(better, other.copy, self.copy),
-            np.where(better, other.merit, self.merit),
-            np.where(better, other.circularity, self.circularity),
-            np.where(better, other.service, self.service),
-            np.where(better[:, None], other.levels, self.levels),
-            np.where(better[:, None, None], other.actions, self.actions),
+            np.where(better, rival.copy, self.copy),
+            np.where(better, rival.merit, self.merit),
+            np.where(better, rival.circularity, self.circularity),
+            np.where(better, rival.service, self.service),
+            np.where(better[:, None], rival.levels, self.levels),
+            np.where(better[:, None, None], rival.actions, self.actions),
         )
 
 
@@ -323,8 +323,8 @@ class Gaussians:
     def draw(self) -> Floats:
         """Draw deviations, from the same normal numbers for each start, shape (starts, population, knots, entries)."""
         normal = self._random.standard_normal((self._population, *self._mean.shape[1:]))
-        drawn: Floats = self._mean[:, None] + np.sqrt(self._variance)[:, None] * normal
-        return drawn
+        deviation: Floats = self._mean[:, None] + np.sqrt(self._variance)[:, None] * normal
+        return deviation
 
     def learn(self, merit: Floats, deviation: Floats) -> None:
         """Move the Gaussians towards the best deviations so far; those of earlier iterations compete.

@@ -38,7 +38,7 @@ ROUNDS = 2
 """Most programs that are solved."""
 DEGREE = 1
 """Degree of these programs, whatever that of the bound: they are solved several times."""
-TOLERATED = 1e-4
+TOLERANCE = 1e-4
 """What a service may lack of its demand without a further round."""
 
 
@@ -66,23 +66,23 @@ def improved(
     inputs = dynamics.rows.nodes.stop + bound.actions.shape[1]
     if bound.actions.shape[0] * inputs * (dynamics.rows.nodes.stop + len(bound.network.arcs)) > MOST_SLOPES:
         return refine(bound, enough=enough, progress=progress)
-    charged = prices(bound)
+    price = prices(bound)
     best, run = bound, achieved(bound)
-    reached, trust, slopes = penalised_objective(bound, run, charged), TRUST, None
+    value, trust, slopes = penalised_objective(bound, run, price), TRUST, None
     for done in range(rounds):
         if trust < SMALLEST or enough(run):
             break
         slopes = _jacobians(best) if slopes is None else slopes
-        step = _step(best, run, charged, trust, slopes)
+        step = _step(best, run, price, trust, slopes)
         progress((done + 1) / rounds)
         if step is None:  # a smaller region is another program
             trust /= 4
             continue
         candidate = replace(best, actions=np.clip(best.actions + step, -1.0, 1.0))
-        tried = achieved(candidate)
-        gained = penalised_objective(bound, tried, charged) - reached
-        if gained > 0:
-            best, run, reached, trust, slopes = candidate, tried, reached + gained, min(1.0, 2 * trust), None
+        trial = achieved(candidate)
+        gain = penalised_objective(bound, trial, price) - value
+        if gain > 0:
+            best, run, value, trust, slopes = candidate, trial, value + gain, min(1.0, 2 * trust), None
         else:
             trust /= 4
     progress(1.0)
@@ -110,14 +110,16 @@ def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
     columns[:, np.arange(nodes + entries), np.arange(nodes + entries)] += shift
     flat = np.ascontiguousarray(columns.transpose(1, 0, 2).reshape(nodes + entries, -1))
     actuators = Actuators(bound.network, bound.agents or None, flat.shape[1])
-    when = np.repeat(np.arange(steps), nodes + entries + 1)
+    interval = np.repeat(np.arange(steps), nodes + entries + 1)
     inner = np.empty((0, flat.shape[1]))
     stocks, supply = dynamics.extend(flat[:nodes]), Supply(dynamics)
-    controls = supply(stocks, inner, actuators.controls(flat[nodes:], when), when, supply.idle(actuators.agents))
-    done = dynamics.advance(stocks, inner, controls, when)
+    controls = supply(
+        stocks, inner, actuators.controls(flat[nodes:], interval), interval, supply.idle(actuators.agents)
+    )
+    done = dynamics.advance(stocks, inner, controls, interval)
     outputs = np.concatenate([done.stock[rows.nodes], done.moved_mass / network.episode.control_interval])
-    shaped = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
-    slopes = (shaped[:, :, :-1] - shaped[:, :, -1:]) / shift[:, None]
+    by_interval = outputs.reshape(len(outputs), steps, -1).transpose(1, 0, 2)
+    slopes = (by_interval[:, :, :-1] - by_interval[:, :, -1:]) / shift[:, None]
     return slopes[:, :, :nodes], slopes[:, :, nodes:], stock[1:]
 
 
@@ -125,17 +127,17 @@ def _path(bound: Bound, dynamics: Dynamics) -> Floats:
     """Return the stocks at the start and after each interval under the bound's actions, shape (steps + 1, stocks)."""
     actuators, inner = Actuators(bound.network, bound.agents or None, 1), np.empty((0, 1))
     masses, supply = dynamics.extend(bound.initial[:, None]), Supply(dynamics)
-    idle, found = supply.idle(actuators.agents), [bound.initial]
+    idle, stocks = supply.idle(actuators.agents), [bound.initial]
     for step, actions in enumerate(bound.actions):
-        when = np.array([step])
-        controls = supply(masses, inner, actuators.controls(actions[:, None], when), when, idle)
-        masses = dynamics.advance(masses, inner, controls, when).stock
-        found.append(masses[dynamics.rows.nodes, 0])
-    return np.array(found)
+        interval = np.array([step])
+        controls = supply(masses, inner, actuators.controls(actions[:, None], interval), interval, idle)
+        masses = dynamics.advance(masses, inner, controls, interval).stock
+        stocks.append(masses[dynamics.rows.nodes, 0])
+    return np.array(stocks)
 
 
 def _step(
-    bound: Bound, run: Rollout, charged: Floats, trust: float, slopes: tuple[Floats, Floats, Floats]
+    bound: Bound, run: Rollout, price: Floats, trust: float, slopes: tuple[Floats, Floats, Floats]
 ) -> Floats | None:
     """Return the best change of the actions within the trust region to first order, shape (steps, entries).
 
@@ -153,21 +155,21 @@ def _step(
     # δ(x', f̄)_t − J_x δx'_{t−1} − J_a δa_t = 0, block row t of the equations
     once = sparse.identity(steps)
     carry = sparse.csr_array(_diagonal(-by_stock, (outputs, nodes)))
-    carried = carry @ sparse.kron(sparse.eye_array(steps, k=-1), sparse.eye_array(nodes, size))
+    carry_over = carry @ sparse.kron(sparse.eye_array(steps, k=-1), sparse.eye_array(nodes, size))
     select_out, select_in = sparse.eye_array(outputs, size), sparse.eye_array(entries, size, k=outputs)
     linear = sparse.kron(once, select_out) - sparse.csr_array(_diagonal(by_action, (outputs, entries))) @ sparse.kron(
         once, select_in
     )
     dynamics = Dynamics(network)
     measure, imbalances = _measures(bound, dynamics)
-    realised = np.concatenate([stocks, run.flow], axis=1)
+    state = np.concatenate([stocks, run.flow], axis=1)
     low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)
     # low·level − δq ≤ q, and ±(φ + δφ) ≤ imbalance, with q and φ those of the simulated episode
     rows = np.zeros((steps, services + 2, size))
     rows[:, :services, :outputs] = -measure
     rows[:, np.arange(services), level + np.arange(services)] = low.T
     rows[:, services:, :outputs], rows[:, services:, imbalance] = np.stack([imbalances, -imbalances]), -1.0
-    limits = np.concatenate([realised @ measure.T, -(realised @ imbalances)[:, None] * [1.0, -1.0]], axis=1)
+    limits = np.concatenate([state @ measure.T, -(state @ imbalances)[:, None] * [1.0, -1.0]], axis=1)
     # mean level + lack ≥ demanded level
     means = sparse.kron(np.full((1, steps), -1.0 / steps), sparse.eye_array(services, size, k=level))
     per_interval = _diagonal(rows, rows.shape[1:])
@@ -181,8 +183,8 @@ def _step(
     bounds[:, imbalance, 0] = 0.0
     low, high = np.concatenate([bounds.reshape(-1, 2), np.tile([0.0, np.inf], (services, 1))]).T
     problem = LinearProgram(
-        cost=np.append(np.tile(_cost(bound, size, level, nodes), steps), charged),
-        equal=sparse.hstack([linear + carried, sparse.csr_array((steps * outputs, services))], format="csr"),
+        cost=np.append(np.tile(_cost(bound, size, level, nodes), steps), price),
+        equal=sparse.hstack([linear + carry_over, sparse.csr_array((steps * outputs, services))], format="csr"),
         equal_to=np.zeros(steps * outputs),
         under=under,
         under_to=np.append(limits.ravel(), -demand(bound)),
@@ -191,11 +193,11 @@ def _step(
     )
     # states and flows change by shares of their largest values, the others by shares of 1
     parts = (*dynamics.staged_network.stores, *network.arcs)
-    largest = np.maximum(np.abs(realised).max(axis=0), [part.scale for part in parts])
-    net = max(float(np.abs(realised @ imbalances).max()), network.objective.circularity_scale)
+    largest = np.maximum(np.abs(state).max(axis=0), [part.scale for part in parts])
+    net = max(float(np.abs(state @ imbalances).max()), network.objective.circularity_scale)
     sizes = np.concatenate([largest, np.ones(entries + services), [net]])
-    found = best_values(problem, np.append(np.tile(sizes, steps), np.ones(services)))
-    return None if found is None else found[: steps * size].reshape(steps, size)[:, outputs:level]
+    values = best_values(problem, np.append(np.tile(sizes, steps), np.ones(services)))
+    return None if values is None else values[: steps * size].reshape(steps, size)[:, outputs:level]
 
 
 def _diagonal(blocks: Floats, shape: tuple[int, int]) -> Any:
@@ -209,7 +211,7 @@ def _measures(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats]:
     measure = np.zeros((len(network.services), nodes + len(network.arcs)))
     for s, service in enumerate(network.services):
         if service.quantity == "stock":
-            for place in (network.node_index[each] for each in service.providers):
+            for place in (network.node_index[node] for node in service.providers):
                 measure[s, dynamics.rows.stages.get(place, place)] = 1.0
         else:
             measure[s, nodes + network.service_arcs(service)] = 1.0
@@ -221,11 +223,11 @@ def _cost(bound: Bound, size: int, level: int, nodes: int) -> Floats:
     network, steps = bound.network, len(bound.actions)
     services = len(network.services)
     cost = np.zeros(size)
-    counted = network.circularity_weights.sum(axis=0)
+    weights = network.circularity_weights.sum(axis=0)
     if network.objective.net_zero == "abs":
-        counted = network.circularity_weights[0]
+        weights = network.circularity_weights[0]
         cost[-1] = 1.0 / steps
-    cost[nodes : nodes + len(counted)] = -counted / steps
+    cost[nodes : nodes + len(weights)] = -weights / steps
     if bound.service_weight is not None:
         cost /= network.objective.circularity_scale
         cost[level : level + services] = -bound.service_weight / (steps * max(services, 1))
@@ -240,8 +242,8 @@ def prices(bound: Bound) -> Floats:
     services = len(bound.network.services)
     if bound.min_service is None:
         return np.zeros(services)
-    charged = -bound.certificate.under[len(bound.certificate.under) - services :]
-    return PENALTY * np.maximum(charged, bound.network.objective.circularity_scale)
+    multipliers = -bound.certificate.under[len(bound.certificate.under) - services :]
+    return PENALTY * np.maximum(multipliers, bound.network.objective.circularity_scale)
 
 
 def penalised_objective(bound: Bound, run: Rollout, prices: Floats) -> float:
@@ -283,38 +285,38 @@ def refine(
         progress: called with the share of them that is solved; 1 when no more are needed.
     """
     admissible = Admissible.of(bound.network, bound.agents or None)
-    charged, best, run = prices(bound), bound, achieved(bound)
-    reached = penalised_objective(bound, run, charged)
-    raised = 1.0 + _shortfall(bound.problem.layout, bound.solution, run, 1.0)
+    price, best, run = prices(bound), bound, achieved(bound)
+    value = penalised_objective(bound, run, price)
+    factor = 1.0 + _shortfall(bound.problem.layout, bound.solution, run, 1.0)
     for done in range(rounds):
         if enough(run):
             break
-        asked = replace(admissible, service_low=admissible.service_low * raised)
-        programs = Programs(asked, DEGREE, bound.service_weight, hold_controls=True)
+        demanding = replace(admissible, service_low=admissible.service_low * factor)
+        programs = Programs(demanding, DEGREE, bound.service_weight, hold_controls=True)
         try:
             problem = programs.program(bound.initial, bound.min_service)
             planned = solve(problem, label="the program of a better plan", certify=False).plan
         except (Infeasible, SolverFailure):  # more than can be had: what was found so far is the plan
             break
         layout = programs.layout
-        candidate = replace(bound, actions=normalised_actions(asked, layout, planned.reshape(-1, layout.size)))
-        tried = achieved(candidate)
+        candidate = replace(bound, actions=normalised_actions(demanding, layout, planned.reshape(-1, layout.size)))
+        trial = achieved(candidate)
         progress((done + 1) / rounds)
-        if (worth := penalised_objective(bound, tried, charged)) > reached:
-            best, run, reached = candidate, tried, worth
-        lacking = _shortfall(layout, planned, tried, raised)
-        if lacking.mean(axis=0).max(initial=0.0) <= TOLERATED:
+        if (worth := penalised_objective(bound, trial, price)) > value:
+            best, run, value = candidate, trial, worth
+        shortfall = _shortfall(layout, planned, trial, factor)
+        if shortfall.mean(axis=0).max(initial=0.0) <= TOLERANCE:
             break
-        raised += lacking
+        factor += shortfall
     progress(1.0)
     return best
 
 
-def _shortfall(layout: Layout, planned: Floats, run: Rollout, raised: float | Floats) -> Floats:
+def _shortfall(layout: Layout, plan: Floats, run: Rollout, factor: float | Floats) -> Floats:
     """Return what an episode lacks of the levels that its program promised, shape (steps, services).
 
-    The program's levels are of bands that were ``raised``.
+    The program's levels are of bands that were ``factor``.
     """
-    levels = planned.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
-    lacking: Floats = np.maximum(np.minimum(levels * raised, 1.0) - run.levels[0].T, 0.0)
-    return lacking
+    levels = plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
+    shortfall: Floats = np.maximum(np.minimum(levels * factor, 1.0) - run.levels[0].T, 0.0)
+    return shortfall

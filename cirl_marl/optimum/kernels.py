@@ -23,7 +23,7 @@ class Kernel:
     """What leaves a chain in pieces of equal length, of what is there and of what enters.
 
     Attributes:
-        known: of what is there in each stage, shape (pieces, d + 1, stages), 1/time.
+        start_outflow: of what is there in each stage, shape (pieces, d + 1, stages), 1/time.
         low: c̲ of each piece and moment, by those of what enters, shape (pieces, d + 1, pieces, d + 1).
         high: c̄, likewise; both with w_0.
     """
@@ -32,31 +32,31 @@ class Kernel:
         """Compute it for a rate μ in each piece, shape (pieces,), 1/time."""
         pieces, stages, moments = len(rate), chain.stages, degree + 1
         shape = (pieces, moments, pieces, moments)
-        self.known, self.low, self.high = np.zeros((pieces, moments, stages)), np.zeros(shape), np.zeros(shape)
+        self.start_outflow, self.low, self.high = np.zeros((pieces, moments, stages)), np.zeros(shape), np.zeros(shape)
         unit = chain.matrix / chain.rate
-        motions = {each: _Motion(unit, each * length, chain.inflow_shares, degree) for each in np.unique(rate).tolist()}
-        parts = [motions[each] for each in rate.tolist()]
-        gathered, passed = np.empty((0, moments, stages)), np.eye(stages)
+        motions = {mu: _Motion(unit, mu * length, chain.inflow_shares, degree) for mu in np.unique(rate).tolist()}
+        parts = [motions[mu] for mu in rate.tolist()]
+        later_outflow, transfer = np.empty((0, moments, stages)), np.eye(stages)
         for p, motion in enumerate(parts):
-            self.known[p] = motion.left @ passed / length
-            passed = motion.whole @ passed
+            self.start_outflow[p] = motion.outflow @ transfer / length
+            transfer = motion.whole @ transfer
         for q in reversed(range(pieces)):
             # of what is there at the end of piece q, what leaves in each later one
             if q + 1 < pieces:
-                gathered = np.concatenate([parts[q + 1].left[None], gathered @ parts[q + 1].whole])
+                later_outflow = np.concatenate([parts[q + 1].outflow[None], later_outflow @ parts[q + 1].whole])
             for target, (low, high) in (
-                (slice(q, q + 1), parts[q].own),
-                (slice(q + 1, pieces), parts[q].later.enclosed(gathered.reshape(-1, stages) / moments)),
+                (slice(q, q + 1), parts[q].own_bounds),
+                (slice(q + 1, pieces), parts[q].later.bounds(later_outflow.reshape(-1, stages) / moments)),
             ):
                 self.low[target, :, q], self.high[target, :, q] = (
-                    each.reshape(-1, moments, moments) for each in (low, high)
+                    mu.reshape(-1, moments, moments) for mu in (low, high)
                 )
         at_once = chain.weights[0] * np.eye(pieces * moments).reshape(shape)
         self.low += at_once
         self.high += at_once
 
 
-def released(chain: Chain, rate: Floats, length: float, degree: int) -> Floats:
+def unit_outflow(chain: Chain, rate: Floats, length: float, degree: int) -> Floats:
     """Return what leaves of a unit of mass that has just entered a chain at the start of each piece, and has stayed.
 
     Args:
@@ -69,17 +69,15 @@ def released(chain: Chain, rate: Floats, length: float, degree: int) -> Floats:
         Means weighted with B_i over each piece p of what entered at the start of piece q, 1/time, shape
         (q, p, d + 1); 0 before.
     """
-    parts = {
-        each: bernstein_means(chain.matrix / chain.rate * each * length, degree) for each in np.unique(rate).tolist()
-    }
-    found = np.zeros((len(rate), len(rate), degree + 1))
-    held = np.zeros((chain.stages, len(rate)))
-    for p, each in enumerate(rate.tolist()):
-        means, whole = parts[each]
-        held[:, p] = chain.inflow_shares / chain.inflow_shares.sum()
-        found[:, p] = (each * means[:, -1] @ held).T
-        held = whole @ held
-    return found
+    parts = {mu: bernstein_means(chain.matrix / chain.rate * mu * length, degree) for mu in np.unique(rate).tolist()}
+    outflow = np.zeros((len(rate), len(rate), degree + 1))
+    stock = np.zeros((chain.stages, len(rate)))
+    for p, mu in enumerate(rate.tolist()):
+        means, whole = parts[mu]
+        stock[:, p] = chain.inflow_shares / chain.inflow_shares.sum()
+        outflow[:, p] = (mu * means[:, -1] @ stock).T
+        stock = whole @ stock
+    return outflow
 
 
 class _Motion:
@@ -92,21 +90,21 @@ class _Motion:
         own: enclosure of what leaves in the piece of what enters in it, shape (d + 1, d + 1) each.
     """
 
-    def __init__(self, unit: Floats, turnover: float, entering: Floats, degree: int) -> None:
+    def __init__(self, unit: Floats, turnover: float, inflow_shares: Floats, degree: int) -> None:
         stages, matrix = len(unit), unit * turnover
         means, self.whole = bernstein_means(matrix, degree)
-        self.left = turnover * means[:, -1]
-        self.later = _Smooth(matrix, entering[:, None], degree)
+        self.outflow = turnover * means[:, -1]
+        self.later = _Smooth(matrix, inflow_shares[:, None], degree)
         # y' = A y + E ψ_0, ψ_l' = ψ_(l+1): with ψ_0 the polynomial, read from the end of the piece
-        chained = np.zeros((stages + degree + 1,) * 2)
-        chained[:stages, :stages], chained[:stages, stages] = matrix, entering
-        chained[stages:, stages:] = np.eye(degree + 1, k=1)
+        augmented = np.zeros((stages + degree + 1,) * 2)
+        augmented[:stages, :stages], augmented[:stages, stages] = matrix, inflow_shares
+        augmented[stages:, stages:] = np.eye(degree + 1, k=1)
         start = np.zeros((stages + degree + 1, degree + 1))
         start[stages:] = np.stack([_derivatives(degree, degree - i) for i in range(degree + 1)], axis=1)
         last = np.zeros((1, stages + degree + 1))
         last[0, stages - 1] = turnover
-        low, high = _Smooth(chained, start, degree).enclosed(last)
-        self.own = low, high
+        low, high = _Smooth(augmented, start, degree).bounds(last)
+        self.own_bounds = low, high
 
 
 class _Smooth:
@@ -121,17 +119,17 @@ class _Smooth:
         values = np.stack([expm(matrix * node) @ start for node in nodes], axis=2)
         self._near = values @ np.linalg.inv(bernstein).T  # coefficients of B_j(σ) that interpolate, shape (n, z, d + 1)
         step, at = expm(matrix / count), start
-        found = []
+        pieces = []
         for part in range(count):
             term, powers = at, []
             for m in range(TERMS + 1):
                 powers.append(term)
                 term = matrix @ term / (count * (m + 1))
-            found.append(np.stack(powers, axis=2) @ _to_bernstein(TERMS) - self._near @ _within(degree, part, count))
+            pieces.append(np.stack(powers, axis=2) @ _to_bernstein(TERMS) - self._near @ _within(degree, part, count))
             at = step @ at
-        self._rest = np.concatenate(found, axis=2)
+        self._rest = np.concatenate(pieces, axis=2)
 
-    def enclosed(self, rows: Floats) -> tuple[Floats, Floats]:
+    def bounds(self, rows: Floats) -> tuple[Floats, Floats]:
         """Return the coefficients of B_j(τ) below and above f, shape (v, z, d + 1) each."""
         near = np.einsum("vn,nzj->vzj", rows, self._near, optimize=True)
         rest = np.einsum("vn,nzj->vzj", rows, self._rest, optimize=True)
@@ -168,8 +166,8 @@ def _derivatives(degree: int, j: int) -> Floats:
     """Return the derivatives of B_j at 0, of order 0 … d."""
     power = np.polynomial.polynomial.polypow([1.0, -1.0], degree - j)
     coefficients = np.concatenate([np.zeros(j), math.comb(degree, j) * power])
-    found: Floats = coefficients * np.array([math.factorial(order) for order in range(degree + 1)])
-    return found
+    derivatives: Floats = coefficients * np.array([math.factorial(order) for order in range(degree + 1)])
+    return derivatives
 
 
 def _to_bernstein(degree: int) -> Floats:
@@ -184,9 +182,9 @@ def _to_bernstein(degree: int) -> Floats:
 
 def _within(degree: int, part: int, count: int) -> Floats:
     """Return what turns coefficients of B_j on [0, 1] into those of degree ``TERMS`` on one of equal parts of it."""
-    found = np.zeros((degree + 1, TERMS + 1))
+    powers_of = np.zeros((degree + 1, TERMS + 1))
     inside = np.polynomial.Polynomial([part / count, 1 / count])
     for j in range(degree + 1):
         powers = np.polynomial.Polynomial(_derivatives(degree, j) / [math.factorial(m) for m in range(degree + 1)])
-        found[j, : degree + 1] = np.resize(np.append(powers(inside).coef, np.zeros(degree + 1)), degree + 1)
-    return found @ _to_bernstein(TERMS)
+        powers_of[j, : degree + 1] = np.resize(np.append(powers(inside).coef, np.zeros(degree + 1)), degree + 1)
+    return powers_of @ _to_bernstein(TERMS)

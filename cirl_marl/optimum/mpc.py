@@ -86,17 +86,17 @@ class _Plan:
         assert self.problem is not None and self.solution is not None
         problem, certificate = self.problem, self.solution.certificate
         layout = problem.layout
-        charged = np.zeros(len(problem.cost))
+        costs = np.zeros(len(problem.cost))
         for matrix, multipliers in ((problem.equal, certificate.equal), (problem.under, certificate.under)):
             # entry (row, column): the row belongs to the last interval that it touches, the column to its own
             entries = matrix.tocoo()
-            own = entries.col // layout.size
-            ends = entries.col - own * layout.size
-            later = problem.interval_of_rows(matrix)[entries.row] > own
+            interval = entries.col // layout.size
+            ends = entries.col - interval * layout.size
+            later = problem.interval_of_rows(matrix)[entries.row] > interval
             later &= (ends >= layout.last.start) & (ends < layout.last.stop)
-            np.subtract.at(charged, entries.col[later], (entries.data * multipliers[entries.row])[later])
-        priced: Floats = charged.reshape(-1, layout.size)[:, layout.last]
-        return priced * self.unit
+            np.subtract.at(costs, entries.col[later], (entries.data * multipliers[entries.row])[later])
+        prices: Floats = costs.reshape(-1, layout.size)[:, layout.last]
+        return prices * self.unit
 
 
 class MPC(Planner):
@@ -139,7 +139,7 @@ class MPC(Planner):
         if horizon is not None and horizon < replan:
             raise CirlError(f"horizon {horizon} is shorter than the {replan} decisions carried out of each plan")
         self._horizon, self._replan = horizon, replan
-        self._demanded, self._weight, self._degree = min_service, service_weight, degree
+        self._min_service, self._weight, self._degree = min_service, service_weight, degree
 
     def plan(self, env: MultiAgentVectorEnv, seed: int, progress: Callable[[float], None]) -> None:
         """Make the first plan of every copy; ``seed`` has no effect.
@@ -149,7 +149,7 @@ class MPC(Planner):
             CirlError: for another number of demanded levels than services.
         """
         network = env.network
-        self._levels = None if self._demanded is None else demanded_levels(network, self._demanded)
+        self._levels = None if self._min_service is None else demanded_levels(network, self._min_service)
         self.note = ""
         self._env = env
         self._admissible = Admissible.of(network, env.agents or None)
@@ -187,46 +187,46 @@ class MPC(Planner):
         rest = range(step, steps)
         window = rest if self._horizon is None else rest[: self._horizon]
         try:
-            return self._solved(copy, rest, window, last)
+            return self._solve_window(copy, rest, window, last)
         except SolverFailure as missing:
             self.note = f"MPC goes on as it planned before, or neutrally, where a plan is missing: {missing}"
             return self._older(copy, window, last)
 
-    def _solved(self, copy: int, rest: range, window: range, last: _Plan | None) -> _Plan:
+    def _solve_window(self, copy: int, rest: range, window: range, last: _Plan | None) -> _Plan:
         """Plan the ``window`` of what is left of the episode, the ``rest``."""
         state, steps = self._env.physical, self._env.network.episode.horizon
-        missing = None if self._levels is None else self._levels * steps - state.service[:, copy]
+        deficit = None if self._levels is None else self._levels * steps - state.service[:, copy]
         if len(window) == len(rest):
-            return self._plan(copy, window, missing, last.basis(window) if last else None)
+            return self._plan(copy, window, deficit, last.basis(window) if last else None)
         if last is None:
             self._outlooks.pop(copy, None)
         if copy not in self._outlooks:
-            self._outlooks[copy] = self._plan(copy, rest, missing, None, certified=True)  # its multipliers are prices
+            self._outlooks[copy] = self._plan(copy, rest, deficit, None, certified=True)  # its multipliers are prices
         outlook = self._outlooks[copy]
         after = window.stop - outlook.intervals.start
-        if missing is not None:
-            missing -= outlook.levels()[after:].sum(axis=0)
-        return self._plan(copy, window, missing, last.basis(window) if last else None, outlook.prices()[after - 1])
+        if deficit is not None:
+            deficit -= outlook.levels()[after:].sum(axis=0)
+        return self._plan(copy, window, deficit, last.basis(window) if last else None, outlook.prices()[after - 1])
 
     def _older(self, copy: int, window: range, last: _Plan | None) -> _Plan:
         """Return the last plan, to be carried out for longer, or one to be neutral where it has come to its end."""
-        known = last is not None and window.start in last.intervals
-        if known and last is not None and last.problem is not None and last.solution is not None:
+        is_running = last is not None and window.start in last.intervals
+        if is_running and last is not None and last.problem is not None and last.solution is not None:
             done = window.start - last.intervals.start + self._replan
             planned = last.solution.plan.reshape(len(last.intervals), -1)[:done]
             return replace(last, actions=self._actions(last.problem, last.intervals, planned))
-        neutral = np.concatenate([each[copy] for each in self._env.neutral_action.values()])
+        neutral = np.concatenate([action[copy] for action in self._env.neutral_action.values()])
         return _Plan(int(self._env.episodes[copy]), window, None, None, np.tile(neutral, (self._replan, 1)), 1.0)
 
-    def _actions(self, problem: Program, intervals: range, planned: Floats) -> Floats:
+    def _actions(self, problem: Program, intervals: range, plan: Floats) -> Floats:
         """Return the actions of planned intervals, the first of ``intervals``, shape (decisions, entries)."""
-        return normalised_actions(self._admissible, problem.layout, planned, intervals)
+        return normalised_actions(self._admissible, problem.layout, plan, intervals)
 
     def _plan(
         self,
         copy: int,
         intervals: range,
-        missing: Floats | None,
+        deficit: Floats | None,
         basis: Basis | None,
         prices: Floats | None = None,
         certified: bool = False,
@@ -236,35 +236,35 @@ class MPC(Planner):
         Args:
             copy: whose stocks they start from.
             intervals: to be planned.
-            missing: least sum of the levels of each service over all intervals, shape (services,); None if nothing is
+            deficit: least sum of the levels of each service over all intervals, shape (services,); None if nothing is
                 demanded.
             basis: from which the solver starts.
             prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
             certified: whether the multipliers must be good.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
-        demanded = None if missing is None else np.maximum(0.0, missing / len(intervals))
+        demand = None if deficit is None else np.maximum(0.0, deficit / len(intervals))
         unit = 1.0
         what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
-            problem = self._priced(self._programs, stock, intervals, demanded, prices)
+            problem = self._with_prices(self._programs, stock, intervals, demand, prices)
             solution = solve(problem, basis, label=what, certify=certified)
         except Infeasible:
-            if demanded is None:
+            if demand is None:
                 raise
             unit = self._env.network.objective.circularity_scale
             prices = None if prices is None else prices / unit
-            problem = _capped(self._priced(self._urgent, stock, intervals, demanded, prices))
+            problem = _without_demand(self._with_prices(self._urgent, stock, intervals, demand, prices))
             solution = solve(problem, basis, label=what, certify=certified)
         planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
         actions = self._actions(problem, intervals, planned)
         return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)
 
-    def _priced(
-        self, programs: Programs, stock: Floats, intervals: range, demanded: Floats | None, prices: Floats | None
+    def _with_prices(
+        self, programs: Programs, stock: Floats, intervals: range, demand: Floats | None, prices: Floats | None
     ) -> Program:
         """Return the program of some intervals with the objective of the episode, plus what the last stocks cost."""
-        problem = programs.program(stock, demanded, intervals)
+        problem = programs.program(stock, demand, intervals)
         layout = problem.layout
         cost = problem.cost.reshape(len(intervals), -1) * (len(intervals) / self._env.network.episode.horizon)
         if prices is not None:
@@ -272,14 +272,14 @@ class MPC(Planner):
         return replace(problem, cost=cost.ravel())
 
 
-def _capped(problem: Program) -> Program:
+def _without_demand(problem: Program) -> Program:
     """Return the program in which the mean level of each service counts up to what is demanded, and is not held there.
 
     A level is a variable of at most q/low, so that a service may be better than what is counted of it.
     """
     under, services = problem.under, len(problem.layout.network.services)
-    held = np.arange(len(problem.under_to)) >= len(problem.under_to) - services
-    sign = np.where(held, -1.0, 1.0)
+    is_demand = np.arange(len(problem.under_to)) >= len(problem.under_to) - services
+    sign = np.where(is_demand, -1.0, 1.0)
     return replace(problem, under=sparse.csr_array(sparse.diags_array(sign) @ under), under_to=problem.under_to * sign)
 
 
@@ -308,9 +308,9 @@ class Optimum(Planner):
             CirlError: for a service that no plan reaches, a solver that fails, or an environment in which nobody acts.
         """
         try:
-            self.plans, self.note = self._bounded(env, progress), ""
+            self.plans, self.note = self._bound_plans(env, progress), ""
         except NoCertificate as missing:
-            self.plans = self._found(env, progress)
+            self.plans = self._search_plans(env, progress)
             self.note = f"best plan found, no certificate: {missing}"
         self._plan = Plan(self.plans)
         self._plan.start(env, seed)
@@ -319,28 +319,28 @@ class Optimum(Planner):
         """Return the planned actions of the next interval."""
         return self._plan.act(observations)
 
-    def _bounded(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Bound]:
+    def _bound_plans(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Bound]:
         plans: list[Bound] = []
-        known: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
+        by_start: dict[bytes, Bound] = {}  # copies that start alike have the same plan, though their draws differ
         for copy, start in enumerate(env.physical.stock[env.rows.nodes].T):
-            told = _told(progress, copy, env.num_envs)
-            if (key := start.tobytes()) in known:
-                plans.append(known[key])
-                told(1.0)
+            report = _report(progress, copy, env.num_envs)
+            if (key := start.tobytes()) in by_start:
+                plans.append(by_start[key])
+                report(1.0)
                 continue
-            found = bound(
+            solution = bound(
                 env.network,
                 start,
                 min_service=self._min_service,
                 service_weight=self._service_weight,
                 agents=env.agents or None,
             )
-            told(0.0)
-            plans.append(improved(found, progress=told))
-            known[key] = plans[-1]
+            report(0.0)
+            plans.append(improved(solution, progress=report))
+            by_start[key] = plans[-1]
         return plans
 
-    def _found(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Incumbent]:
+    def _search_plans(self, env: MultiAgentVectorEnv, progress: Callable[[float], None]) -> list[Incumbent]:
         return search_each(
             env.network,
             starting_states(env),
@@ -352,6 +352,6 @@ class Optimum(Planner):
         )
 
 
-def _told(progress: Callable[[float], None], copy: int, copies: int) -> Callable[[float], None]:
+def _report(progress: Callable[[float], None], copy: int, copies: int) -> Callable[[float], None]:
     """Return what takes the share of a copy's improvement that is done; its bound is solved."""
     return lambda improvement: progress((copy + BOUND + (1 - BOUND) * improvement) / copies)

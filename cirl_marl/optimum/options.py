@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cirl_marl.dynamics.stages import simulated_network
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Network
 from cirl_marl.network.initial_ages import age_shares
+from cirl_marl.optimum.vintages import Lifetimes
 
 DEGREE = 2
 """Degree of the test polynomials; docs/bound.md has the gap against it."""
 
 
-def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike | None) -> Floats:
+def starting_stocks(lifetimes: Lifetimes, initial: Mapping[str, float] | ArrayLike | None) -> Floats:
     """Return the stocks that ``initial`` describes (see ``bound``), as the simulator has them, mass.
 
     Those of nodes with a lifetime are spread over its stages by history or growth, unless they are given by stage.
@@ -26,6 +26,7 @@ def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike |
     Raises:
         CirlError: for an unknown node, a wrong shape, or a stock that is negative or not finite.
     """
+    network = lifetimes.network
     start: Floats = network.initial.mean(axis=0)
     stores = {node.id: i for i, node in enumerate(network.stores)}
     if isinstance(initial, Mapping):
@@ -37,8 +38,8 @@ def starting_stocks(network: Network, initial: Mapping[str, float] | ArrayLike |
         start = np.asarray(initial, dtype=float)
         if start.ndim != 1:
             raise CirlError(f"initial has shape {start.shape}, expected {(len(stores),)}")
-    start = by_stage(network, start)
-    check_stocks(StateLayout(simulated_network(network)).start_names, start)
+    start = by_stage(network, lifetimes.state_layout, start)
+    check_stocks(lifetimes.state_layout, start)
     return start
 
 
@@ -58,7 +59,7 @@ def check_options(service_weight: float | None, min_service: ArrayLike | None, d
         raise CirlError(f"degree must be a whole number of at least 1, got {degree!r}")
 
 
-def by_stage(network: Network, stocks: ArrayLike) -> Floats:
+def by_stage(network: Network, state_layout: StateLayout, stocks: ArrayLike) -> Floats:
     """Return stocks of nodes, shape (..., stores), as the simulator has them, those with a lifetime by stage.
 
     What is given by stage already stays as it is; the others are spread by history or growth.
@@ -66,26 +67,26 @@ def by_stage(network: Network, stocks: ArrayLike) -> Floats:
     Raises:
         CirlError: for another shape.
     """
-    given, rows = np.asarray(stocks, dtype=float), StateLayout(simulated_network(network))
-    count = len(network.stores)
-    if given.shape[-1:] == (rows.nodes.stop,):
-        return given.copy()
-    if given.shape[-1:] != (count,):
-        raise CirlError(f"initial has shape {given.shape}, expected (..., {count})")
-    whole = np.zeros((*given.shape[:-1], rows.nodes.stop))
-    whole[..., :count] = given
-    for i, stages in rows.stages.items():
-        whole[..., stages] = given[..., i, None] * age_shares(network.stores[i], network.episode.control_interval)
-    return whole
+    masses, count, rows = np.asarray(stocks, dtype=float), len(network.stores), state_layout.nodes.stop
+    if masses.shape[-1:] == (rows,):
+        return masses.copy()
+    if masses.shape[-1:] != (count,):
+        raise CirlError(f"initial has shape {masses.shape}, expected (..., {count})")
+    staged_masses = np.zeros((*masses.shape[:-1], rows))
+    staged_masses[..., :count] = masses
+    for i, stages in state_layout.stages.items():
+        shares = age_shares(network.stores[i], network.episode.control_interval)
+        staged_masses[..., stages] = masses[..., i, None] * shares
+    return staged_masses
 
 
-def check_stocks(names: Sequence[str], stocks: Floats) -> None:
-    """Refuse stocks, as many as ``names`` begin with, that no episode can start from.
+def check_stocks(state_layout: StateLayout, stocks: Floats) -> None:
+    """Refuse stocks that no episode can start from.
 
     Raises:
         CirlError: naming a stock that is negative or not finite.
     """
-    for name, stock in zip(names, stocks.tolist(), strict=False):
+    for name, stock in zip(state_layout.start_names, stocks.tolist(), strict=False):
         if not 0 <= stock < math.inf:
             raise CirlError(f"initial: the stock of '{name}' is {stock}; it must be finite and not negative")
 

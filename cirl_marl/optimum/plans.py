@@ -75,11 +75,11 @@ class Plan(Controller):
         return dict(self._env.unstack(actions))
 
     def _check(self, plan: HasPlan, env: MultiAgentVectorEnv, start: Floats, copy: int) -> None:
-        ours, theirs = plan.network, env.network
-        if (ours.nodes, ours.arcs, ours.episode) != (theirs.nodes, theirs.arcs, theirs.episode):
+        ours, env_network = plan.network, env.network
+        if (ours.nodes, ours.arcs, ours.episode) != (env_network.nodes, env_network.arcs, env_network.episode):
             raise ControlError(
                 f"plan: it is for network '{ours.name}', scenario '{ours.scenario_name}', {ours.episode.horizon} steps,"
-                f" not for '{theirs.name}', '{theirs.scenario_name}', {theirs.episode.horizon} steps"
+                f" not for '{env_network.name}', '{env_network.scenario_name}', {env_network.episode.horizon} steps"
             )
         if plan.agents != env.agents:
             raise ControlError(f"plan: it is for agents {list(plan.agents)}, not {list(env.agents)}")
@@ -88,19 +88,19 @@ class Plan(Controller):
         distant = np.abs(start[: len(size)] - plan.initial) > SAME_START * size
         if distant.any():
             row = int(distant.argmax())
-            planned = f"{plan.initial[row]:g} in '{env.state_names[row]}'"
-            raise ControlError(f"plan: it starts from {planned}, copy {copy} from {start[row]:g}")
+            amount = f"{plan.initial[row]:g} in '{env.state_names[row]}'"
+            raise ControlError(f"plan: it starts from {amount}, copy {copy} from {start[row]:g}")
 
 
 def achieved(bound: Bound) -> Rollout:
     """Return the episode that the plan of ``bound`` makes in the simulator."""
     network = bound.network
     stores = [replace(n, initial=(x, x)) for n, x in zip(network.stores, bound.stock[0].tolist(), strict=True)]
-    pinned = replace(network, nodes=(*stores, *network.nodes[len(stores) :]))
-    env = MultiAgentVectorEnv(pinned, num_envs=1, agents=bound.agents or None)
+    start_network = replace(network, nodes=(*stores, *network.nodes[len(stores) :]))
+    env = MultiAgentVectorEnv(start_network, num_envs=1, agents=bound.agents or None)
     stages = [row for rows in env.rows.stages.values() for row in rows.tolist()]
     start = {env.rows.start_names[row]: float(bound.initial[row]) for row in stages}
-    return rollout(env, Plan(replace(bound, network=pinned)), start=start)
+    return rollout(env, Plan(replace(bound, network=start_network)), start=start)
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,25 +168,28 @@ class Population:
         """
         env, shape = self._env, self._shape
         observations = env.restore(self._start)
-        taken = which.ravel()
-        acting = {int(i): controllers[i] for i in np.unique(taken)}
-        for controller in acting.values():
+        choice = which.ravel()
+        chosen_controllers = {int(i): controllers[i] for i in np.unique(choice)}
+        for controller in chosen_controllers.values():
             controller.start(env, EVALUATION_SEEDS)
         steps, knots = env.network.episode.horizon, deviation.shape[2]
-        added = np.ascontiguousarray(np.moveaxis(deviation.reshape(len(taken), knots, -1), 0, 2))
-        realised, counts = np.zeros_like(added), np.bincount(np.arange(steps) * knots // steps, minlength=knots)
-        actions = np.empty((steps, *added.shape[1:]))
+        added_deviation = np.ascontiguousarray(np.moveaxis(deviation.reshape(len(choice), knots, -1), 0, 2))
+        applied, counts = (
+            np.zeros_like(added_deviation),
+            np.bincount(np.arange(steps) * knots // steps, minlength=knots),
+        )
+        actions = np.empty((steps, *added_deviation.shape[1:]))
         for t in range(steps):
-            unchanged = actions[t]
-            for i, controller in acting.items():
-                np.copyto(unchanged, env.stack(controller.act(observations)), where=taken == i)
+            action = actions[t]
+            for i, controller in chosen_controllers.items():
+                np.copyto(action, env.stack(controller.act(observations)), where=choice == i)
             knot = t * knots // steps
-            clipped = np.clip(unchanged + added[knot], -1.0, 1.0)
-            realised[knot] += clipped - unchanged
-            actions[t] = clipped
-            observations = env.by_agent(env.advance(clipped).observation)
+            bounded_action = np.clip(action + added_deviation[knot], -1.0, 1.0)
+            applied[knot] += bounded_action - action
+            actions[t] = bounded_action
+            observations = env.by_agent(env.advance(bounded_action).observation)
             progress((t + 1) / steps)
-        realised /= counts[:, None, None]
+        applied /= counts[:, None, None]
         state = env.physical
         levels = state.service / steps
         return Episodes(
@@ -194,7 +197,7 @@ class Population:
             env.scoring.service_level(levels).reshape(shape),
             levels.reshape(-1, *shape),
             actions.reshape(*actions.shape[:2], *shape),
-            np.moveaxis(realised, 2, 0).reshape(deviation.shape),
+            np.moveaxis(applied, 2, 0).reshape(deviation.shape),
         )
 
 

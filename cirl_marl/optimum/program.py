@@ -104,9 +104,9 @@ class Programs:
                 were large otherwise.
         """
         self.admissible, lifetimes = admissible, admissible.lifetimes
-        has_lifetimes = lifetimes.planned is not lifetimes.reached
-        chained = Admissible.of(lifetimes.reached, admissible.agents) if has_lifetimes else admissible
-        self._system = ComparisonSystem(chained)
+        has_lifetimes = lifetimes.plan_network is not lifetimes.reach_network
+        chain_form = Admissible.of(lifetimes.reach_network, admissible.agents) if has_lifetimes else admissible
+        self._system = ComparisonSystem(chain_form)
         self.layout = layout = _layout(admissible, self._system.substeps, merge_pieces, degree)
         fast_system = ComparisonSystem(admissible) if has_lifetimes and layout.has_end_flows else self._system
         self._equal, self._under = ChainedRows(layout), ChainedRows(layout)
@@ -147,10 +147,10 @@ class Programs:
         """
         layout, admissible, network = self.layout, self.admissible, self.admissible.network
         intervals = range(network.episode.horizon) if intervals is None else intervals
-        steps, when, lifetimes = len(intervals), slice(intervals.start, intervals.stop), admissible.lifetimes
+        steps, period, lifetimes = len(intervals), slice(intervals.start, intervals.stop), admissible.lifetimes
         reach, lifetime_flow = _reach(lifetimes, self._system, initial, intervals)
-        cut = np.where(admissible.scheduled & ~reach.uncut, admissible.rate[1, when], 0.0)
-        start, kinds = lifetimes.start_planned @ initial, admissible.kinds[when]
+        cut = np.where(admissible.by_schedule & ~reach.uncut, admissible.rate[1, period], 0.0)
+        start, kinds = lifetimes.start_planned @ initial, admissible.kinds[period]
         equal, equal_to = self._equal.over(kinds, start, cut)
         under, under_to = self._under.over(kinds, start, cut)
         rows = ProgramRows(layout, steps)
@@ -165,7 +165,7 @@ class Programs:
             levels = sparse.eye_array(services, layout.size, k=layout.level)
             blocks.append(sparse.kron(np.full((1, steps), -1.0 / steps), levels, format="csr"))
             limits.append(-np.broadcast_to(min_service, services))
-        low, high = _box(admissible, reach, lifetime_flow, layout, when)
+        low, high = _box(admissible, reach, lifetime_flow, layout, period)
         return Program(
             layout=layout,
             cost=np.tile(-self._weights / steps, steps),
@@ -204,31 +204,31 @@ def _layout(admissible: Admissible, substeps: int, merge_pieces: bool | None, de
     network, nodes = admissible.network, len(admissible.network.nodes)
     pieces = admissible.lifetimes.pieces(degree, substeps) if admissible.lifetimes.passive else substeps
     exits = np.bincount(network.donors[admissible.driver == network.donors], minlength=nodes)
-    schedules = np.bincount(network.donors[admissible.scheduled], minlength=nodes)
+    schedules = np.bincount(network.donors[admissible.by_schedule], minlength=nodes)
     movable = (admissible.valve[0] < admissible.valve[1]).any(axis=0)
     valves = np.flatnonzero(movable & ((exits > 1) | (exits > 0) & (schedules > 0)))
     free_valves = np.flatnonzero(movable & (exits > 0) & (schedules > 0))
     fine = Layout(network, pieces, pieces < substeps, False, degree, valves, free_valves)
-    few = max(1, degree - 1)
+    least_pieces = max(1, degree - 1)
     is_large = fine.size * network.episode.horizon > LARGE if merge_pieces is None else merge_pieces
-    if pieces <= few or not is_large:
+    if pieces <= least_pieces or not is_large:
         return fine
-    coarse = replace(fine, pieces=few, coarse=True)
+    coarse = replace(fine, pieces=least_pieces, coarse=True)
     return replace(coarse, has_end_flows=bool(merge_pieces) or has_fast_stocks(admissible, coarse.length))
 
 
 def _box(
-    admissible: Admissible, reach: Reach, lifetime_flow: Floats, layout: Layout, when: slice
+    admissible: Admissible, reach: Reach, lifetime_flow: Floats, layout: Layout, period: slice
 ) -> tuple[Floats, Floats]:
     """Return the lowest and highest value of every variable; all are finite, which makes every multiplier a bound."""
-    network, scheduled = admissible.network, admissible.scheduled
+    network, by_schedule = admissible.network, admissible.by_schedule
     stores, nodes, arcs = len(network.stores), len(network.nodes), len(network.arcs)
     low, high = np.zeros((2, len(reach.upper), layout.size))
-    rate, valve = admissible.rate[:, when], admissible.valve[:, when]
+    rate, valve = admissible.rate[:, period], admissible.valve[:, period]
     # no weighted mean exceeds the supremum: F ≤ r̄·x̄_p, and U ≤ ū; U ≥ u̲ only where nothing is ever cut
-    most = rate[1] * np.where(scheduled, 1.0, reach.upper[:, admissible.driver])
-    least = np.where(scheduled & reach.uncut, rate[0], 0.0)
-    most[:, admissible.lifetimes.leaving] = lifetime_flow
+    most = rate[1] * np.where(by_schedule, 1.0, reach.upper[:, admissible.driver])
+    least = np.where(by_schedule & reach.uncut, rate[0], 0.0)
+    most[:, admissible.lifetimes.exit_arcs] = lifetime_flow
     for stock, flow, through in zip(layout.stock, layout.flow, layout.valve, strict=True):
         high[:, stock:flow] = reach.upper
         high[:, flow:through], low[:, flow:through] = most, least

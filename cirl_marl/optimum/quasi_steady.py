@@ -45,8 +45,8 @@ def decay_rows(ranges: IntervalRanges, layout: Layout, rows: ProgramRows) -> Non
     """Add the rows of theorem 2 on an interval, each at most 0; their keys are (1, node, piece, quantity, i)."""
     network, driver, valves = ranges.network, ranges.driver, layout.valves
     # what recipients pull may make a stock fall faster than in proportion to it
-    pulled = network.donors[~ranges.scheduled & (driver != network.donors)]
-    nodes = np.setdiff1d(driver[~ranges.scheduled], pulled)
+    pull_donors = network.donors[~ranges.by_schedule & (driver != network.donors)]
+    nodes = np.setdiff1d(driver[~ranges.by_schedule], pull_donors)
     nodes = nodes[nodes < len(network.stores)]
     if not len(nodes):
         return
@@ -88,7 +88,7 @@ class _DecayChains:
         self.delays = np.divide(1.0 - self.means, rate[:, None], out=slow.copy(), where=turnover >= 1e-6)
         self.layout, self.rows = layout, rows
         self.first = np.arange(layout.pieces) * (d + 1)  # moment of each piece
-        donors = np.where(ranges.scheduled, ranges.network.donors, len(rate))
+        donors = np.where(ranges.by_schedule, ranges.network.donors, len(rate))
         self.schedules = np.argsort(donors, kind="stable")  # scheduled arcs, donor after donor
         self.counts = np.bincount(donors, minlength=len(rate))[: len(rate)]
         self.starts = np.cumsum(self.counts) - self.counts
@@ -190,7 +190,7 @@ def end_laws(ranges: IntervalRanges, layout: Layout, equal: ProgramRows, under: 
     """Add the flow laws at the end of merged pieces; keys (3, piece, family, index, side)."""
     network, rate, piece = ranges.network, ranges.rate, np.arange(layout.pieces)[:, None]
     stores, nodes, arcs = len(network.stores), len(network.nodes), np.arange(len(network.arcs))
-    schedules = np.flatnonzero(ranges.scheduled)
+    schedules = np.flatnonzero(ranges.by_schedule)
     for side, sign in ((0, 1.0), (1, -1.0)):
         row = under.add(3, piece, 0, schedules, side)
         under.put(row, layout.end_flow[piece] + schedules, sign)
@@ -225,12 +225,12 @@ def end_laws(ranges: IntervalRanges, layout: Layout, equal: ProgramRows, under: 
 
 def quasi_steady_rows(ranges: IntervalRanges, layout: Layout, linear: Linear, rows: ProgramRows) -> None:
     """Add the rows of theorem 3, at most 0, on an interval and the stocks before; keys (2, …)."""
-    network, scheduled = ranges.network, ranges.scheduled
-    if (ranges.driver[~scheduled] != network.donors[~scheduled]).any():
+    network, has_schedule = ranges.network, ranges.by_schedule
+    if (ranges.driver[~has_schedule] != network.donors[~has_schedule]).any():
         return  # what recipients pull may make a stock fall faster than in proportion to it
     stores = len(network.stores)
     least, most = ranges.exits[:, :stores]
-    by_schedule = np.bincount(network.donors[scheduled], minlength=stores)[:stores] > 0
+    by_schedule = np.bincount(network.donors[has_schedule], minlength=stores)[:stores] > 0
     _write_held_factors(ranges, layout, rows, ~by_schedule)
     choices: set[bytes] = set()
     for turnover in FAST:
@@ -309,14 +309,14 @@ class _QuasiSteady:
 
     def _find_sources(self, fast: NDArray[np.bool_]) -> None:
         """Find the nodes that follow from slow stocks and schedules, and the schedules that they follow from."""
-        network, arcs = self.network, np.flatnonzero(self.ranges.scheduled)
+        network, arcs = self.network, np.flatnonzero(self.ranges.by_schedule)
         hands_on = np.append(fast, np.ones(len(network.nodes) - self.stores, dtype=bool))
         self.schedules = np.zeros((len(network.nodes), len(network.arcs)), dtype=bool)
         self.schedules[network.recipients[arcs], arcs] = True
         by_schedule = np.bincount(network.donors[arcs], minlength=len(network.nodes)) > 0
         wrong, before = by_schedule & ~hands_on, -1
-        driven = np.flatnonzero(~self.ranges.scheduled)
-        donors, recipients = network.donors[driven], network.recipients[driven]
+        stock_driven = np.flatnonzero(~self.ranges.by_schedule)
+        donors, recipients = network.donors[stock_driven], network.recipients[stock_driven]
         # go on along the arcs until nothing is added
         while before != (before := int(self.schedules.sum() + wrong.sum())):
             through = hands_on[recipients]
@@ -330,7 +330,7 @@ class _QuasiSteady:
         ranges, layout, network, slowest = self.ranges, self.layout, self.network, self.slowest
         piece, (low, high) = np.arange(layout.pieces)[:, None], ranges.rate
         nodes = np.flatnonzero(self.follows)
-        arcs = np.setdiff1d(np.flatnonzero((low < high) & ~ranges.scheduled), ranges.followers)
+        arcs = np.setdiff1d(np.flatnonzero((low < high) & ~ranges.by_schedule), ranges.followers)
         arcs = arcs[self.follows[ranges.driver[arcs]]]
         for i in range(layout.degree + 1):
             moment, growth = piece * (layout.degree + 1) + i, _growth(slowest, layout, i)

@@ -28,7 +28,7 @@ TRUNCATION = 1e-17
 """Sum of the terms of the series that are left out, relative to the change that the first term makes."""
 ROUNDING = 1e-9
 """Relative widening of every bound; rounding errors are far smaller."""
-CONVERGED = 1e-3
+LEAST_FALL = 1e-3
 """Relative fall of an upper bound in a round below which no further is made."""
 ROUNDS = 1000
 """Most such rounds."""
@@ -111,7 +111,7 @@ class RouteBounds:
             fewer = np.minimum(visits, np.eye(inner) + visit_bounds.best(visits, step))
             fall = (visits - fewer).max()
             visits = fewer
-            if fall <= CONVERGED * visits.max():
+            if fall <= LEAST_FALL * visits.max():
                 break
         most = np.minimum(visits @ high[:, :stores].toarray(), 1.0)
         self._least = sparse.csr_array(arrivals.T * (1 - ROUNDING))
@@ -220,7 +220,7 @@ class ComparisonSystem:
         Raises:
             NoCertificate: if recipients may pull more from a node than it holds: the solver then departs from the laws.
         """
-        network, schedules = self.network, self.admissible.scheduled
+        network, schedules = self.network, self.admissible.by_schedule
         nodes, stores, steps = len(network.nodes), len(network.stores), len(intervals)
         mass = float(initial.sum()) * (1 + ROUNDING)
         lower, upper = initial.copy(), initial.copy()
@@ -304,7 +304,7 @@ class Linear:
         """Compile it for the intervals of one kind."""
         network, self.routes = ranges.network, routes
         stores, nodes = len(network.stores), len(network.nodes)
-        arcs = ~ranges.scheduled & (network.donors < stores)
+        arcs = ~ranges.by_schedule & (network.donors < stores)
         low, high = ranges.rate[:, arcs]
         donor, recipient, driver = network.donors[arcs], network.recipients[arcs], ranges.driver[arcs]
         pulls, split = donor != driver, ranges.share_arcs[arcs]

@@ -27,50 +27,48 @@ WIDER = 10.0
 """Factor by which boxes are widened that follow from the start, so that no multiplier rests on them."""
 
 
-def resting_on_rows(proven: Bound, admissible: Admissible) -> Bound:
+def resting_on_rows(bound: Bound, admissible: Admissible) -> Bound:
     """Return a bound with boxes so wide that its multipliers rest on rows wherever they can.
 
     Boxes of stocks and of what these drive follow from the start and from all that may happen. An optimum that lies on
     one lies on rows as well, as a rule, and either may have the multiplier; more of a stock moves both. Where no rows
     hold it the objective rises a little; it is a bound all the same.
     """
-    problem, free = proven.problem, _reached(admissible, proven.problem.layout)
+    problem, free = bound.problem, _start_dependent(admissible, bound.problem.layout)
     high = problem.high.reshape(-1, problem.layout.size).copy()
     largest = high.max(axis=0)
     # a stock that nothing reaches has a box of 0, which no factor widens
     largest[free & (largest == 0)] = high.max()
     high[:, free] = WIDER * np.maximum(high, largest)[:, free]
     wider = replace(problem, high=high.ravel())
-    solution = solve(wider, proven.basis, label="the program of the shadow prices")
-    return replace(
-        proven, problem=wider, solution=solution.plan, certificate=solution.certificate, basis=solution.basis
-    )
+    solution = solve(wider, bound.basis, label="the program of the shadow prices")
+    return replace(bound, problem=wider, solution=solution.plan, certificate=solution.certificate, basis=solution.basis)
 
 
-def _reached(admissible: Admissible, layout: Layout) -> NDArray[np.bool_]:
+def _start_dependent(admissible: Admissible, layout: Layout) -> NDArray[np.bool_]:
     """Return which variables of an interval have boxes that follow from the start, shape (size,)."""
-    found, driven = np.zeros(layout.size, dtype=bool), ~admissible.scheduled
+    follows, by_stock = np.zeros(layout.size, dtype=bool), ~admissible.by_schedule
     nodes, arcs = len(layout.network.nodes), len(layout.network.arcs)
     for i in layout.moments:
-        found[layout.stock[i] : layout.flow[i]] = True
-        found[layout.flow[i] : layout.valve[i]] = driven
-        found[layout.valve[i] :][: len(layout.valves)] = True
+        follows[layout.stock[i] : layout.flow[i]] = True
+        follows[layout.flow[i] : layout.valve[i]] = by_stock
+        follows[layout.valve[i] :][: len(layout.valves)] = True
     for piece in range(layout.pieces):
-        found[layout.end[piece] :][: len(layout.network.stores)] = True
+        follows[layout.end[piece] :][: len(layout.network.stores)] = True
         if layout.has_end_flows:
-            found[layout.end[piece] :][:nodes] = True
-            found[layout.end_flow[piece] :][:arcs] = driven
-    found[layout.imbalance] = True
-    return found
+            follows[layout.end[piece] :][:nodes] = True
+            follows[layout.end_flow[piece] :][:arcs] = by_stock
+    follows[layout.imbalance] = True
+    return follows
 
 
-def changes(proven: Bound, admissible: Admissible, altered: Program) -> Floats:
+def changes(bound: Bound, admissible: Admissible, variant: Program) -> Floats:
     """Return how much the objective of a bound rises, to first order, with the numbers of another program.
 
     Args:
-        proven: the bound, resting on rows.
+        bound: the bound, resting on rows.
         admissible: of its network.
-        altered: a program with the same rows and variables.
+        variant: a program with the same rows and variables.
 
     Returns:
         The parts of it by interval, shape (steps,). What changes in one interval may make room in later ones, and these
@@ -79,40 +77,42 @@ def changes(proven: Bound, admissible: Admissible, altered: Program) -> Floats:
     Raises:
         ValueError: if the rows or variables differ.
     """
-    problem, v, layout = proven.problem, proven.solution, proven.problem.layout
-    y, mu = proven.certificate.equal, np.minimum(proven.certificate.under, 0.0)
-    pairs = ((problem.equal, altered.equal), (problem.under, altered.under))
-    if any(ours.shape != theirs.shape for ours, theirs in pairs) or layout.size != altered.layout.size:
+    problem, v, layout = bound.problem, bound.solution, bound.problem.layout
+    y, mu = bound.certificate.equal, np.minimum(bound.certificate.under, 0.0)
+    pairs = ((problem.equal, variant.equal), (problem.under, variant.under))
+    if any(rows.shape != variant_rows.shape for rows, variant_rows in pairs) or layout.size != variant.layout.size:
         raise ValueError("the programs differ in their rows or variables")
-    reduced = problem.cost - problem.equal.T @ y - problem.under.T @ mu
-    least, most = np.maximum(reduced, 0.0), np.minimum(reduced, 0.0)
-    wider = np.where(np.tile(_reached(admissible, layout), len(v) // layout.size), 0.0, altered.high - problem.high)
-    cost = (altered.cost - problem.cost) * v + least * (altered.low - problem.low) + most * wider
+    reduced_cost = problem.cost - problem.equal.T @ y - problem.under.T @ mu
+    least, most = np.maximum(reduced_cost, 0.0), np.minimum(reduced_cost, 0.0)
+    wider = np.where(
+        np.tile(_start_dependent(admissible, layout), len(v) // layout.size), 0.0, variant.high - problem.high
+    )
+    cost = (variant.cost - problem.cost) * v + least * (variant.low - problem.low) + most * wider
     steps = len(v) // layout.size
     by_interval = cost.reshape(steps, -1).sum(axis=1)
-    rights = (altered.equal_to - problem.equal_to, altered.under_to - problem.under_to)
-    for (ours, theirs), multipliers, right in zip(pairs, (y, mu), rights, strict=True):
-        parts = multipliers * (right - (theirs @ v - ours @ v))
-        by_interval += np.bincount(problem.interval_of_rows(ours), parts, steps)
-    rise: Floats = altered.constant - problem.constant - by_interval
+    rights = (variant.equal_to - problem.equal_to, variant.under_to - problem.under_to)
+    for (rows, variant_rows), multipliers, right in zip(pairs, (y, mu), rights, strict=True):
+        parts = multipliers * (right - (variant_rows @ v - rows @ v))
+        by_interval += np.bincount(problem.interval_of_rows(rows), parts, steps)
+    rise: Floats = variant.constant - problem.constant - by_interval
     return rise
 
 
-def of_stocks(proven: Bound, programs: Programs) -> Floats:
+def of_stocks(bound: Bound, programs: Programs) -> Floats:
     """Return how much the objective of a bound rises for a unit of mass more in a stock, new at the start of intervals.
 
     Of a node with a lifetime it is new as well: it leaves as what has just entered does. What more of a stock changes
     in boxes and in the envelopes of products is left out.
 
     Args:
-        proven: the bound of a whole episode, resting on rows.
+        bound: the bound of a whole episode, resting on rows.
         programs: what its program was made by, or made alike.
 
     Returns:
         Shape (steps, stores), 1.
     """
-    problem, lifetimes = proven.problem, programs.admissible.lifetimes
-    y, mu = proven.certificate.equal, np.minimum(proven.certificate.under, 0.0)
+    problem, lifetimes = bound.problem, programs.admissible.lifetimes
+    y, mu = bound.certificate.equal, np.minimum(bound.certificate.under, 0.0)
     planned, steps = problem.layout.network, programs.admissible.network.episode.horizon
     worth, tops = np.empty((steps, len(planned.stores))), [0, 0]
     for step in range(steps):
@@ -123,7 +123,7 @@ def of_stocks(proven: Bound, programs: Programs) -> Floats:
             for block, multipliers, top in zip(blocks, (y, mu), tops, strict=True)
         )
         tops = [top + block.shape[0] for top, block in zip(tops, blocks, strict=True)]
-    last = len(mu) - (0 if proven.min_service is None else len(planned.services))
+    last = len(mu) - (0 if bound.min_service is None else len(planned.services))
     for each in reversed(lifetimes.passive):
         out = lifetimes.of_new(each, problem.layout)
         rows = out.shape[1]

@@ -127,32 +127,34 @@ def solve(
         Infeasible: if there is no solution.
         Unsolved: if HiGHS finds no usable answer; names the network, what was not solved, and HiGHS's status.
     """
-    name, found, best, status, refused = problem.layout.network.name, None, math.inf, "", False
-    several = _settings(problem)
-    scaled = _Scaled(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
-    for settings in (None, *several) if basis is not None else several:
-        highs = scaled.run(settings, basis if settings is None else None, primal=same_rows)
-        ended = highs.getModelStatus()
-        status, refused = highs.modelStatusToString(ended), ended in NO_PLAN
-        if refused and settings is not None and not certify:
+    name, answer, best, status, is_refused = problem.layout.network.name, None, math.inf, "", False
+    attempts = _settings(problem)
+    program = _ScaledProgram(problem, np.maximum(np.abs(problem.low), np.abs(problem.high)))
+    for settings in (None, *attempts) if basis is not None else attempts:
+        highs = program.run(settings, basis if settings is None else None, primal=same_rows)
+        model_status = highs.getModelStatus()
+        status, is_refused = highs.modelStatusToString(model_status), model_status in NO_PLAN
+        if is_refused and settings is not None and not certify:
             break
-        if not scaled.is_feasible(highs):
+        if not program.is_feasible(highs):
             continue
-        solution = scaled.solution(highs)
-        if not certify and ended == highspy.HighsModelStatus.kOptimal:
+        solution = program.solution(highs)
+        if not certify and model_status == highspy.HighsModelStatus.kOptimal:
             return solution
-        distance = scaled.distance(problem, solution)
+        distance = program.distance(problem, solution)
         if distance < best:
-            found, best = solution, distance
-        if best <= (OPTIMAL if several is SETTINGS else NEAR):
+            answer, best = solution, distance
+        if best <= (OPTIMAL if attempts is SETTINGS else NEAR):
             break
-    if found is None and refused:  # presolve errs now and then, so the last settings, without it, have the last word
+    if (
+        answer is None and is_refused
+    ):  # presolve errs now and then, so the last settings, without it, have the last word
         raise Infeasible(f"network '{name}': HiGHS finds that nothing satisfies {label}")
-    if found is None or (certify and best > USABLE):
-        missing = len(problem.cost) >= LARGE_PROGRAM and not find_spec(EXTRA)
-        advice = f"; of {len(problem.cost):,} variables HiPO may: pip install 'cirl-marl[large]'" if missing else ""
+    if answer is None or (certify and best > USABLE):
+        lacks_hipo = len(problem.cost) >= LARGE_PROGRAM and not find_spec(EXTRA)
+        advice = f"; of {len(problem.cost):,} variables HiPO may: pip install 'cirl-marl[large]'" if lacks_hipo else ""
         raise SolverFailure(f"network '{name}': HiGHS did not solve {label}: {status}{advice}")
-    return found
+    return answer
 
 
 def best_values(problem: LinearProgram, size: Floats) -> Floats | None:
@@ -162,11 +164,11 @@ def best_values(problem: LinearProgram, size: Floats) -> Floats | None:
         problem: the program.
         size: of each variable, such as the largest that it will be.
     """
-    scaled = _Scaled(problem, size)
+    program = _ScaledProgram(problem, size)
     for settings in SETTINGS:
-        highs = scaled.run(settings, None)
-        if scaled.is_feasible(highs):
-            return scaled.solution(highs).plan
+        highs = program.run(settings, None)
+        if program.is_feasible(highs):
+            return program.solution(highs).plan
     return None
 
 
@@ -177,7 +179,7 @@ def _settings(problem: LinearProgram) -> Sequence[HighsOptions]:
     return LARGE_SETTINGS if find_spec(EXTRA) else LARGE_SETTINGS[1:]
 
 
-class _Scaled:
+class _ScaledProgram:
     """A program in its own measures: every variable a share of the box that it lies in, every row of its largest term.
 
     So the units of mass and time of a network, and stocks that differ by orders of magnitude, make no difference to the
@@ -227,23 +229,23 @@ class _Scaled:
 
     def is_feasible(self, highs: highspy.Highs) -> bool:
         """Whether HiGHS has values that satisfy every row and box, whatever it says of them."""
-        found = np.array(highs.getSolution().col_value)
-        if found.shape != self._size.shape or not np.isfinite(found).all():
+        values = np.array(highs.getSolution().col_value)
+        if values.shape != self._size.shape or not np.isfinite(values).all():
             return False
-        missed = self._rows @ found - self._to
-        missed[: self._equal] = np.abs(missed[: self._equal])
-        outside = np.maximum(self.problem.low / self._size - found, found - self.problem.high / self._size)
-        return bool(max(missed.max(initial=0.0), outside.max(initial=0.0)) <= FEASIBLE)
+        violation = self._rows @ values - self._to
+        violation[: self._equal] = np.abs(violation[: self._equal])
+        outside = np.maximum(self.problem.low / self._size - values, values - self.problem.high / self._size)
+        return bool(max(violation.max(initial=0.0), outside.max(initial=0.0)) <= FEASIBLE)
 
     def solution(self, highs: highspy.Highs) -> Solution:
         """Return what HiGHS found, in the units of the network; of a run that failed there is no basis."""
-        found, final, basis = highs.getSolution(), highs.getBasis(), None
-        multipliers = np.array(found.row_dual) * self._row * self._scale
+        values, final, basis = highs.getSolution(), highs.getBasis(), None
+        multipliers = np.array(values.row_dual) * self._row * self._scale
         if final.valid and highs.getModelStatus() == highspy.HighsModelStatus.kOptimal:
-            status = ([int(each) for each in part] for part in (final.col_status, final.row_status))
-            basis = Basis(*(np.array(each, dtype=np.intp) for each in status))
+            status = ([int(number) for number in part] for part in (final.col_status, final.row_status))
+            basis = Basis(*(np.array(number, dtype=np.intp) for number in status))
         return Solution(
-            plan=np.array(found.col_value) * self._size,
+            plan=np.array(values.col_value) * self._size,
             certificate=Certificate(equal=multipliers[: self._equal], under=multipliers[self._equal :]),
             basis=basis,
         )
@@ -259,8 +261,8 @@ class _Scaled:
 
 def _highs_basis(basis: Basis) -> highspy.HighsBasis:
     result = highspy.HighsBasis()
-    result.col_status = [STATUS[each] for each in basis.columns.tolist()]
-    result.row_status = [STATUS[each] for each in basis.rows.tolist()]
+    result.col_status = [STATUS[status] for status in basis.columns.tolist()]
+    result.row_status = [STATUS[status] for status in basis.rows.tolist()]
     result.alien = True
     result.valid = True
     return result

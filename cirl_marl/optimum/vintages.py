@@ -30,7 +30,8 @@ from cirl_marl.dynamics.stages import StagedNetwork, simulated_network, staged_n
 from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.elements import Node
-from cirl_marl.optimum.kernels import Kernel, released
+from cirl_marl.network.lifetimes import Chain
+from cirl_marl.optimum.kernels import Kernel, unit_outflow
 from cirl_marl.optimum.matrices import Layout
 
 LOOSE = 2e-4
@@ -55,19 +56,25 @@ class PassiveLifetime:
 
     node: Node
     rows: Integers
-    leaving: int
-    entering: Integers
+    exit_arc: int
+    inflow_arcs: Integers
     rate: Floats
     at_once: float
     reached_node: int
     reached_entry: int
     reached_arc: int
 
+    @property
+    def chain(self) -> Chain:
+        """Its stages, if it is not fixed."""
+        assert self.node.lifetime is not None and self.node.lifetime.chain is not None
+        return self.node.lifetime.chain
+
     def slots(self, initial: Floats) -> Floats:
         """Return what is in the slots of a fixed lifetime, first what comes out first, of all stocks, mass."""
-        held = initial[self.rows]
+        masses = initial[self.rows]
         # what rounding left of what came out before comes with the oldest
-        return np.concatenate([[held[-2] + held[-1]], held[-3::-1]])
+        return np.concatenate([[masses[-2] + masses[-1]], masses[-3::-1]])
 
 
 class Lifetimes:
@@ -75,28 +82,31 @@ class Lifetimes:
 
     Attributes:
         network: as it is given.
-        planned: as the program has it.
-        reached: as stocks are bounded, all lifetimes but fixed ones being chains.
+        simulator_network: as the simulator has it.
+        state_layout: which row of its stocks is what.
+        plan_network: as the program has it.
+        reach_network: as stocks are bounded, all lifetimes but fixed ones being chains.
         passive: the lifetimes that nobody controls.
     """
 
-    def __init__(self, network: Network, acting: Sequence[str]) -> None:
-        """Compile the lifetimes of ``network`` while ``acting`` act."""
-        self.network = network
-        living = [node for node in network.stores if node.lifetime is not None]
-        whole = [node for node in living if not (node.id in acting and node.control is not None)]
-        fixed = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
-        self.planned: Network = staged_network(network, {node.id for node in whole}) if living else network
-        self.reached: Network = staged_network(network, fixed) if living else network
-        self._written = simulated_network(network)
-        rows = StateLayout(self._written)
-        self.stocks = rows.nodes.stop
-        neutral = network.control_bounds[1]
+    def __init__(self, network: Network, agents: Sequence[str]) -> None:
+        """Compile the lifetimes of ``network`` while ``agents`` act."""
+        self.network = self.plan_network = self.reach_network = network
+        self.simulator_network = simulated_network(network)
+        self.state_layout = StateLayout(self.simulator_network)
         self.passive: list[PassiveLifetime] = []
+        self._kernels: dict[tuple[str, bytes, int], Kernel] = {}
+        nodes = [node for node in network.stores if node.lifetime is not None]
+        if not nodes:
+            return
+        whole = [node for node in nodes if not (node.id in agents and node.control is not None)]
+        fixed = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
+        plan_network = self.plan_network = staged_network(network, {node.id for node in whole})
+        reach_network = self.reach_network = staged_network(network, fixed)
+        neutral = network.control_bounds[1]
         for node in whole:
-            assert node.lifetime is not None and isinstance(self.planned, StagedNetwork)
-            place, chain, planned = network.node_index[node.id], node.lifetime.chain, self.planned
-            rate = np.zeros(0)
+            assert node.lifetime is not None
+            place, chain, rate = network.node_index[node.id], node.lifetime.chain, np.zeros(0)
             if chain is not None:
                 rate = chain.rate / node.lifetime.mean / network.interval_means(node.stretch)
                 if node.control is not None:
@@ -104,69 +114,68 @@ class Lifetimes:
             self.passive.append(
                 PassiveLifetime(
                     node=node,
-                    rows=rows.stages.get(place, np.array([place])),
-                    leaving=planned.arc_index[planned.release_arcs[node.id]],
-                    entering=np.flatnonzero(planned.recipients == planned.node_index[node.id]),
+                    rows=self.state_layout.stages.get(place, np.array([place])),
+                    exit_arc=plan_network.arc_index[plan_network.release_arcs[node.id]],
+                    inflow_arcs=np.flatnonzero(plan_network.recipients == plan_network.node_index[node.id]),
                     rate=rate,
                     at_once=0.0 if chain is None else chain.weights[0],
-                    reached_entry=self.reached.node_index[node.id if chain is None else f"{node.id}.entry"],
-                    reached_node=self.reached.node_index[node.id],
-                    reached_arc=self.reached.arc_index[planned.release_arcs[node.id]],
+                    reached_entry=reach_network.node_index[node.id if chain is None else f"{node.id}.entry"],
+                    reached_node=reach_network.node_index[node.id],
+                    reached_arc=reach_network.arc_index[plan_network.release_arcs[node.id]],
                 )
             )
-        self._known: dict[tuple[str, bytes, int], Kernel] = {}
 
     @cached_property
-    def leaving(self) -> Integers:
+    def exit_arcs(self) -> Integers:
         """Arcs of the planned network that come out of lifetimes that nobody controls."""
-        return np.array([each.leaving for each in self.passive], dtype=np.intp)
+        return np.array([lifetime.exit_arc for lifetime in self.passive], dtype=np.intp)
 
     def pieces(self, degree: int, most: int) -> int:
         """Return the pieces of an interval, at most ``most``, in which stocks turn over once and kernels are smooth."""
-        interval = self.network.episode.control_interval
-        turnover = ArcRates(self.planned).turnover
-        driven = [each for each in self.passive if len(each.rate)]
-        for each in driven:
-            turnover[self.planned.donors[each.leaving]] = 0.0
+        interval, turnover = self.network.episode.control_interval, ArcRates(self.plan_network).turnover
+        chains = [lifetime for lifetime in self.passive if len(lifetime.rate)]
+        for lifetime in chains:
+            turnover[self.plan_network.donors[lifetime.exit_arc]] = 0.0
         pieces = max(1, math.ceil(interval * float(turnover.max(initial=0.0)) - 1e-9))
-        for each in driven:
-            while pieces < most and self._looseness(each, pieces, degree) > LOOSE:
+        for lifetime in chains:
+            while pieces < most and self._looseness(lifetime, pieces, degree) > LOOSE:
                 pieces += 1
         return min(pieces, most)
 
-    def _looseness(self, each: PassiveLifetime, pieces: int, degree: int) -> float:
+    def _looseness(self, lifetime: PassiveLifetime, pieces: int, degree: int) -> float:
         """Return how far bounds of what leaves are apart, relative to it, where as much enters all the time."""
-        assert each.node.lifetime is not None and each.node.lifetime.chain is not None
-        count = pieces * self.network.episode.horizon
-        rate = np.full(count, each.rate.max())
-        kernel = Kernel(each.node.lifetime.chain, rate, self.network.episode.control_interval / pieces, degree)
+        rate = np.full(pieces * self.network.episode.horizon, lifetime.rate.max())
+        kernel = Kernel(lifetime.chain, rate, self.network.episode.control_interval / pieces, degree)
         low, high = (bound[-1].sum(axis=(1, 2)) for bound in (kernel.low, kernel.high))
         return float(((high - low) / high).max())
 
     @cached_property
     def start_planned(self) -> Any:
         """What the stores of the planned network hold of the stocks of the simulator, shape (stores, stocks)."""
-        return _sums(self._written, self.planned)[: len(self.planned.stores), : self.stocks]
+        return self._start_of(self.plan_network)
 
     @cached_property
     def start_reached(self) -> Any:
-        """What the stores of ``reached`` hold of them, shape (stores, stocks)."""
-        return _sums(self._written, self.reached)[: len(self.reached.stores), : self.stocks]
+        """What the stores of ``reach_network`` hold of them, shape (stores, stocks)."""
+        return self._start_of(self.reach_network)
+
+    def _start_of(self, network: Network) -> Any:
+        return _sums(self.simulator_network, network)[: len(network.stores), : self.state_layout.nodes.stop]
 
     @cached_property
     def nodes_reached(self) -> Any:
-        """What the nodes of the planned network are of those of ``reached``, shape (nodes, nodes)."""
-        return _sums(self.reached, self.planned)
+        """What the nodes of the planned network are of those of ``reach_network``, shape (nodes, nodes)."""
+        return _sums(self.reach_network, self.plan_network)
 
     @cached_property
     def arcs_reached(self) -> Integers:
-        """Arcs of ``reached`` that are those of the planned network, shape (arcs,)."""
-        return np.array([self.reached.arc_index[arc.id] for arc in self.planned.arcs], dtype=np.intp)
+        """Arcs of ``reach_network`` that are those of the planned network, shape (arcs,)."""
+        return np.array([self.reach_network.arc_index[arc.id] for arc in self.plan_network.arcs], dtype=np.intp)
 
     @cached_property
     def totals(self) -> Any:
         """What the stocks of the network are of those of the planned one, shape (stores, stores)."""
-        return _sums(self.planned, self.network)[: len(self.network.stores), : len(self.planned.stores)]
+        return _sums(self.plan_network, self.network)[: len(self.network.stores), : len(self.plan_network.stores)]
 
     def rows(self, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
         """Return the rows G v ≤ g of all lifetimes that nobody controls, and g.
@@ -178,14 +187,19 @@ class Lifetimes:
         """
         blocks: list[Any] = [sparse.csr_array((0, layout.size * len(intervals)))]
         limits = [np.zeros(0)]
-        for each in self.passive:
-            write = self._of_line if each.node.lifetime is None or not len(each.rate) else self._of_chain
-            matrix, to = write(each, layout, initial, intervals)
-            blocks.append(matrix)
-            limits.append(to)
+        for lifetime in self.passive:
+            # L − c̄ U ≤ from_start and c̲ U − L ≤ −from_start, in the columns of what leaves and of what enters
+            write = self._chain_kernels if len(lifetime.rate) else self._line_kernels
+            low, high, from_start = write(lifetime, layout, initial, intervals)
+            first = (layout.size * np.arange(len(intervals))[:, None] + layout.flow).ravel()[:, None]
+            width = layout.size * len(intervals)
+            outflow = _column_sums(first + lifetime.exit_arc, width)
+            inflow = _column_sums(first + lifetime.inflow_arcs, width)
+            blocks.append(sparse.vstack([outflow - high @ inflow, low @ inflow - outflow], format="csr"))
+            limits.append(np.concatenate([from_start, -from_start]))
         return sparse.vstack(blocks, format="csr"), np.concatenate(limits)
 
-    def of_new(self, each: PassiveLifetime, layout: Layout) -> Floats:
+    def of_new(self, lifetime: PassiveLifetime, layout: Layout) -> Floats:
         """Return what leaves of a unit of mass that is new in a stock at the start of each interval of an episode.
 
         In a fixed lifetime it counts as what entered in the interval before.
@@ -195,65 +209,51 @@ class Lifetimes:
             (steps, steps · moments).
         """
         steps, moments = self.network.episode.horizon, len(layout.moments)
-        lifetime = each.node.lifetime
-        assert lifetime is not None
-        if not len(each.rate):
-            delay = len(each.rows) - 1
-            out = np.kron(np.eye(steps, k=delay - 1), np.ones((1, moments)))
-            return np.asarray(out / self.network.episode.control_interval, dtype=float)
-        assert lifetime.chain is not None
-        found = released(lifetime.chain, np.repeat(each.rate, layout.pieces), layout.length, layout.degree)
-        return found[:: layout.pieces].reshape(steps, -1)
+        if not len(lifetime.rate):
+            delay = len(lifetime.rows) - 1
+            shares = np.kron(np.eye(steps, k=delay - 1), np.ones((1, moments)))
+            return np.asarray(shares / self.network.episode.control_interval, dtype=float)
+        rate = np.repeat(lifetime.rate, layout.pieces)
+        outflow = unit_outflow(lifetime.chain, rate, layout.length, layout.degree)
+        return outflow[:: layout.pieces].reshape(steps, -1)
 
-    def _of_chain(self, each: PassiveLifetime, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
-        assert each.node.lifetime is not None and each.node.lifetime.chain is not None
-        during = each.rate[intervals.start : intervals.stop]
-        key = (each.node.id, during.tobytes(), layout.pieces)
-        if key not in self._known:
-            chain = each.node.lifetime.chain
-            self._known[key] = Kernel(chain, np.repeat(during, layout.pieces), layout.length, layout.degree)
-        kernel = self._known[key]
-        known = (kernel.known @ initial[each.rows]).ravel()
-        leaving, entering = _columns(each, layout, len(intervals))
-        out = _picked(leaving[:, None], layout.size * len(intervals))
-        into = _picked(entering, layout.size * len(intervals))
-        count = len(leaving)
+    def _chain_kernels(
+        self, lifetime: PassiveLifetime, layout: Layout, initial: Floats, intervals: range
+    ) -> tuple[Any, Any, Floats]:
+        """Return c̲ and c̄ of what leaves a chain, sparse, and what leaves of what is there at the start."""
+        rate = lifetime.rate[intervals.start : intervals.stop]
+        key = (lifetime.node.id, rate.tobytes(), layout.pieces)
+        if key not in self._kernels:
+            self._kernels[key] = Kernel(lifetime.chain, np.repeat(rate, layout.pieces), layout.length, layout.degree)
+        kernel, count = self._kernels[key], len(intervals) * len(layout.moments)
         low, high = (sparse.csr_array(bound.reshape(count, count)) for bound in (kernel.low, kernel.high))
-        return sparse.vstack([out - high @ into, low @ into - out], format="csr"), np.concatenate([known, -known])
+        return low, high, (kernel.start_outflow @ initial[lifetime.rows]).ravel()
 
-    def _of_line(self, each: PassiveLifetime, layout: Layout, initial: Floats, intervals: range) -> tuple[Any, Floats]:
-        slots = each.slots(initial)
+    def _line_kernels(
+        self, lifetime: PassiveLifetime, layout: Layout, initial: Floats, intervals: range
+    ) -> tuple[Any, Any, Floats]:
+        """Return the same of a fixed lifetime, out of which comes the mean inflow of one interval."""
+        slots = lifetime.slots(initial)
         steps, moments, delay = len(intervals), len(layout.moments), len(slots)
-        leaving, entering = _columns(each, layout, steps)
-        known = np.zeros((steps, moments))
-        known[:delay] = slots[:steps, None] / self.network.episode.control_interval
-        out = _picked(leaving[:, None], layout.size * steps)
-        into = _picked(entering, layout.size * steps)
-        shifted = sparse.eye_array(steps, k=-delay) if delay < steps else sparse.csr_array((steps, steps))
-        earlier = sparse.kron(shifted, np.full((moments, moments), 1.0 / moments))
-        matrix = out - sparse.csr_array(earlier) @ into
-        return sparse.vstack([matrix, -matrix], format="csr"), np.concatenate([known.ravel(), -known.ravel()])
+        from_start = np.zeros((steps, moments))
+        from_start[:delay] = slots[:steps, None] / self.network.episode.control_interval
+        shift = sparse.eye_array(steps, k=-delay) if delay < steps else sparse.csr_array((steps, steps))
+        kernel = sparse.csr_array(sparse.kron(shift, np.full((moments, moments), 1.0 / moments)))
+        return kernel, kernel, from_start.ravel()
 
 
-def _columns(each: PassiveLifetime, layout: Layout, steps: int) -> tuple[Integers, Integers]:
-    """Return the columns of what leaves, shape (moments of all,), and of what enters, shape (moments of all, arcs)."""
-    moments = layout.flow
-    first = (layout.size * np.arange(steps)[:, None] + moments).ravel()
-    return first + each.leaving, first[:, None] + each.entering
-
-
-def _picked(columns: Integers, width: int) -> Any:
-    """Return the matrix that adds up columns, of shape (rows, some)."""
+def _column_sums(columns: Integers, width: int) -> Any:
+    """Return the matrix of ``width`` columns that adds up those given for each row, shape (rows, some)."""
     rows = np.repeat(np.arange(len(columns)), columns.shape[1])
     return sparse.csr_array((np.ones(columns.size), (rows, columns.ravel())), shape=(len(columns), width))
 
 
-def _sums(given: Network, wanted: Network) -> Any:
+def _sums(fine: Network, coarse: Network) -> Any:
     """Return what the nodes of one writing of a network are of those of another that is written out further."""
-    stages = given.stages if isinstance(given, StagedNetwork) else {}
-    whole = wanted.stages if isinstance(wanted, StagedNetwork) else {}
-    found = sparse.lil_array((len(wanted.nodes), len(given.nodes)))
-    for i, node in enumerate(wanted.nodes):
+    stages = fine.stages if isinstance(fine, StagedNetwork) else {}
+    whole = coarse.stages if isinstance(coarse, StagedNetwork) else {}
+    sums = sparse.lil_array((len(coarse.nodes), len(fine.nodes)))
+    for i, node in enumerate(coarse.nodes):
         for part in (node.id,) if len(whole.get(node.id, ())) > 1 else stages.get(node.id, (node.id,)):
-            found[i, given.node_index[part]] = 1.0
-    return sparse.csr_array(found)
+            sums[i, fine.node_index[part]] = 1.0
+    return sparse.csr_array(sums)

@@ -12,6 +12,8 @@ import numpy as np
 from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import episode_start, first_seed, rollout
 from cirl_marl.controllers.schedule import control_names
+from cirl_marl.dynamics.stages import simulated_network
+from cirl_marl.dynamics.state_layout import StateLayout
 from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RunError, unknown
@@ -128,7 +130,8 @@ def _simulated_episode(network: Network, table: _Table) -> PlannedEpisode:
             raise CirlError(f"{table.path}: {unknown('column', name, columns)} It is a plan of another network")
     stock = np.array([table.column(name) for name in stocks]).T
     flow = np.array([table.column(name, 1) for name in flows]).T
-    return PlannedEpisode(str(table.path), by_stage(network, stock[0]), stock[1:], flow)
+    initial = by_stage(network, StateLayout(simulated_network(network)), stock[0])
+    return PlannedEpisode(str(table.path), initial, stock[1:], flow)
 
 
 class _TableController(Controller):
