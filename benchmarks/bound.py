@@ -120,7 +120,7 @@ def _sections() -> dict[str, Section]:
                 "neutral: λ̄, service",
                 "scripted",
                 "search",
-                "merits of the three",
+                "penalised objectives",
                 "population × iterations",
                 "CPU s",
                 "per episode",

@@ -192,6 +192,24 @@ def test_python_names_resolve(document: Path) -> None:
         resolve(name)
 
 
+@each_document
+def test_tests_that_are_named_exist(document: Path) -> None:
+    """What a page says to run with pytest is there."""
+    for command in spans(document.read_text()):
+        if command.startswith("pytest "):
+            (path,) = re.findall(r"tests/\w+\.py", command)
+            tests = re.findall(r"def (test_\w+)", (ROOT / path).read_text())
+            word = command.partition(" -k ")[2]
+            assert any(word in test for test in tests), command
+
+
+def test_the_citation_is_of_this_version() -> None:
+    """``CITATION.cff`` names the version, and the paper whose environments are repeated."""
+    text = (ROOT / "CITATION.cff").read_text()
+    assert text.startswith("cff-version: 1.2.0\n") and "arXiv:2505.21536" in text
+    assert re.findall(r"^version: (.*)$", text, re.M) == [cirl_marl.__version__]
+
+
 def resolve(name: str) -> object:
     """Return what a dotted name stands for."""
     parts = name.split(".")
