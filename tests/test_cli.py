@@ -921,3 +921,17 @@ def test_bad_input_ends_with_code_2(
     assert run(monkeypatch, *arguments) == 2
     assert message in capsys.readouterr().err
     assert list(Path().iterdir()) == []
+
+
+def test_words_in_the_help_are_those_that_are_taken(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They are written out so that help is quick; the version is that of the package."""
+    from cirl_marl.cli import common
+    from cirl_marl.network.elements import OBSERVE, REWARDS
+    from cirl_marl.optimum.registry import CONTROLLERS
+
+    words = {common.CONTROLLERS: CONTROLLERS, common.REWARDS: REWARDS, common.OBSERVE: OBSERVE}
+    assert {text: tuple(text.split(", ")) for text in words} == words
+    assert run(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out == f"cirl_marl {cirl_marl.__version__}\n"

@@ -116,3 +116,28 @@ def test_import_is_light() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert not done.returncode, done.stderr
+
+
+TRAINERS = {"torch", "stable_baselines3", "mujoco", "matplotlib", "SALib", "pandas"}
+SIMULATOR = {"scipy", "pint", "pydantic", "tomlkit", "cirl_marl.network", "cirl_marl.dynamics"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "absent"),
+    [
+        (["-c", "import cirl_marl"], TRAINERS | SIMULATOR | {"typer", "rich", "pettingzoo"}),
+        (["-m", "cirl_marl.cli", "--help"], TRAINERS | SIMULATOR | {"pettingzoo"}),
+        (["-m", "cirl_marl.cli", "--version"], TRAINERS | SIMULATOR | {"pettingzoo"}),
+        (["-m", "cirl_marl.cli", "networks"], TRAINERS - {"mujoco"} | {"cirl_marl.dynamics", "cirl_marl.optimum"}),
+        (["-m", "cirl_marl.cli", "check", "copper_net"], TRAINERS | {"pettingzoo", "cirl_marl.optimum"}),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_a_start_does_not_load(arguments: list[str], absent: set[str]) -> None:
+    """Commands load what they need: seconds would depend on the machine, modules do not."""
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", *arguments], capture_output=True, text=True, check=True, cwd=CHECKOUT
+    )
+    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    assert {"numpy", "typer", PACKAGE} & loaded
+    assert sorted(absent & loaded) == []

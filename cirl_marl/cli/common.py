@@ -8,16 +8,16 @@ import time as clock
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from cirl_marl.definitions.code_permission import code_allowed
-from cirl_marl.definitions.reader import DEFAULT
 from cirl_marl.errors import CirlError
-from cirl_marl.network import Network
+
+if TYPE_CHECKING:
+    from cirl_marl.network import Network
 
 NETWORKS, EPISODES, LEARNING, COMPARING = "Networks", "Episodes and plans", "Learners", "Comparisons"
 """Groups of commands in ``cirl --help``."""
@@ -25,6 +25,11 @@ EXAMPLES = """
 For example: cirl new my.toml · cirl plan my.toml --control optimum --min-service 1 ·
 cirl train copper_net --seed 0 · cirl report RUN --html page.html
 """
+# Written out, as the modules that know them take longer to import than all else of ``cirl --help``; a test compares.
+CONTROLLERS = "neutral, constant, random, scripted, lqr, mpc, optimum"
+REWARDS = "local, circularity, mixed, difference, mixed_difference, local_sum, team"
+OBSERVE = "local, neighbours, full, stocks, model"
+
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -36,14 +41,26 @@ console = Console(width=None if sys.stdout.isatty() else 140, emoji=False)
 errors = Console(stderr=True, emoji=False)
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from cirl_marl import __version__
+
+        console.print(f"cirl_marl {__version__}", highlight=False)
+        raise typer.Exit
+
+
 @app.callback()
 def everywhere(
     context: typer.Context,
     allow_code: Annotated[
         bool, typer.Option("--allow-code", help="Let definitions import the models of their own that they name.")
     ] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
 ) -> None:
     """Material networks whose compartments learn to raise circularity."""
+    del version
     context.with_resource(code_allowed(allow_code))
 
 
@@ -92,6 +109,8 @@ def say(line: str) -> None:
 
 def stem(network: Network, *more: str) -> str:
     """Return the stem of a file about a network, so that no scenario takes the place of another."""
+    from cirl_marl.definitions.reader import DEFAULT
+
     scenario = [] if network.scenario_name == DEFAULT else [network.scenario_name]
     return "_".join([network.name, *scenario, *more])
 
@@ -140,6 +159,8 @@ def bar(what: str) -> Iterator[Callable[[float], None]]:
 @contextmanager
 def shares() -> Iterator[Callable[[str, float], None]]:
     """Progress bar of several things; the yielded function takes what is being done and the share of all done."""
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("preparing", total=1.0)
@@ -149,6 +170,8 @@ def shares() -> Iterator[Callable[[str, float], None]]:
 @contextmanager
 def training_bar() -> Iterator[Any]:
     """Live line of a training: environment steps/s, λ̄ and service level of the last episode; else plain lines."""
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
     columns = (
         TextColumn("training"),
         BarColumn(),

@@ -10,6 +10,7 @@ import typer
 from cirl_marl.cli import common
 from cirl_marl.cli.common import (
     COMPARING,
+    CONTROLLERS,
     EpisodeCount,
     Html,
     MinService,
@@ -22,9 +23,7 @@ from cirl_marl.cli.common import (
     say,
     shares,
 )
-from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.jobs import PLACES
-from cirl_marl.optimum.registry import CONTROLLERS
 
 
 @app.command(rich_help_panel=COMPARING)
@@ -33,7 +32,7 @@ def compare(
         list[Path] | None, typer.Argument(metavar="RUN...", help="Training runs of one environment; may be left out.")
     ] = None,
     controllers: Annotated[
-        str, typer.Option(help=f"Comma-separated, of {', '.join(CONTROLLERS)}; neutral is always there.")
+        str, typer.Option(help=f"Comma-separated, of {CONTROLLERS}; neutral is always there.")
     ] = "neutral,random",
     network: Annotated[
         str | None,
@@ -103,6 +102,7 @@ def pareto(
     The bound is swept over the service demanded, the learners over the weight of circularity in their reward, 0 to 1.
     Finished trainings are kept: the same command goes on where it was stopped.
     """
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.evaluation.pareto import pareto_front as swept
     from cirl_marl.report.fronts import write_front
 

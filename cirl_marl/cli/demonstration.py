@@ -12,7 +12,6 @@ import typer
 
 from cirl_marl.cli.common import LEARNING, app, folder_for, say, training_bar
 from cirl_marl.cli.learning import evaluate_and_draw, what_is_kept
-from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 
 if TYPE_CHECKING:
@@ -51,6 +50,7 @@ def demo(
 
 def _train(out: Path, steps: int) -> None:
     """Train the team, or what is left of that."""
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.learners.interface import complete_run
     from cirl_marl.learners.run_directory import RunDirectory
 

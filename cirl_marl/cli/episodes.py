@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from cirl_marl.cli.common import (
+    CONTROLLERS,
     EPISODES,
     Html,
     MinService,
@@ -24,11 +24,10 @@ from cirl_marl.cli.common import (
     say,
     stem,
 )
-from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
-from cirl_marl.evaluation.quantities import rank_quantities
-from cirl_marl.evaluation.simulations import Simulation, simulate_alternatives
-from cirl_marl.optimum.registry import CONTROLLERS, SETTABLE
+
+if TYPE_CHECKING:
+    from cirl_marl.evaluation.simulations import Simulation
 
 
 @app.command(rich_help_panel=EPISODES)
@@ -36,7 +35,7 @@ def simulate(
     network: NetworkName,
     control: Annotated[
         list[str] | None,
-        typer.Option(help=f"Who acts: {', '.join(CONTROLLERS)}; repeat it to compare several; default: neutral."),
+        typer.Option(help=f"Who acts: {CONTROLLERS}; repeat it to compare several; default: neutral."),
     ] = None,
     set_: Annotated[
         list[str] | None,
@@ -70,6 +69,8 @@ def simulate(
     if samples is not None:
         _sample(network, scenario or [None], controls, steps, 0 if seed is None else seed, samples, out, page)
         return
+    from cirl_marl.evaluation.simulations import simulate_alternatives
+
     held, folder = _held(controls, set_ or []), folder_for(out or Path(), "--out")
     with bar("simulating") as progress:
         found = simulate_alternatives(
@@ -104,6 +105,9 @@ def _sample(
     page: Path | None,
 ) -> None:
     """Simulate draws of the uncertain numbers, and write and say what came of them."""
+    import numpy as np
+
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.evaluation.sampling import FEWEST, sample_episodes, sensitivities
     from cirl_marl.report.samples import sensitivity_table, write_samples
 
@@ -147,6 +151,7 @@ def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
 
 def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
     """Write and say what became of alternatives, and what differs between them."""
+    from cirl_marl.evaluation.quantities import rank_quantities
     from cirl_marl.report.differences import ROWS, differences_table, write_alternatives
 
     found = list(files.values())
@@ -170,7 +175,7 @@ def plan(
         str, typer.Argument(metavar="RUN | NETWORK", help="Training run; or with --control a network, as elsewhere.")
     ],
     control: Annotated[
-        str | None, typer.Option(help=f"Who acts in a network: {', '.join(CONTROLLERS)}; a run acts by its policies.")
+        str | None, typer.Option(help=f"Who acts in a network: {CONTROLLERS}; a run acts by its policies.")
     ] = None,
     out: Annotated[
         Path | None,
@@ -224,6 +229,8 @@ def _say_lines(text: str, who: str = "") -> None:
 
 def _held(controls: Sequence[str], settings: list[str]) -> dict[str, float]:
     """Return the values of --set by agent."""
+    from cirl_marl.optimum.registry import SETTABLE
+
     if settings and not set(controls) & set(SETTABLE):
         raise CirlError(f"--set goes with --control constant or scripted, not with {', '.join(controls)}")
     held = {}

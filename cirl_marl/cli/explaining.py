@@ -9,7 +9,6 @@ import typer
 
 from cirl_marl.cli import common
 from cirl_marl.cli.common import COMPARING, EpisodeCount, NetworkName, Scenario, Seed, app, console, say, shares
-from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 
 
@@ -47,6 +46,7 @@ def explain(
     what they lose in the policy's place. Inputs and rules need the extra explain. `cirl report RUN --html` shows what
     is found.
     """
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.reasons.explanation import explain as explained
     from cirl_marl.report.explanations import FOLDER, inputs_table, prices_table, write_reasons
 

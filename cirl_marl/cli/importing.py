@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cirl_marl.cli.common import NETWORKS, app, bar, say
-from cirl_marl.network.elements import Role
+
+if TYPE_CHECKING:
+    from cirl_marl.network.elements import Role
 
 Patterns = list[str] | None
 LISTED = 12
@@ -48,18 +50,18 @@ def import_(
     from cirl_marl.importing.balances import ProcessKind
 
     given = {
-        Role.NONRENEWABLE_RESERVOIR: reservoir,
-        Role.LANDFILL: landfill,
-        Role.INCINERATOR: incinerator,
-        Role.ENVIRONMENT: environment,
-        Role.TECHNOSPHERE: outside,
+        "nonrenewable_reservoir": reservoir,
+        "landfill": landfill,
+        "incinerator": incinerator,
+        "environment": environment,
+        "technosphere": outside,
     }
     with bar("checking") as progress:
         found = import_flows(
             flows,
             out,
             stocks,
-            roles={role.value: names for role, names in given.items() if names},
+            roles={role: names for role, names in given.items() if names},
             stores=store or (),
             regions=region or (),
             ask=_ask if sys.stdin.isatty() else None,
@@ -94,15 +96,17 @@ KINDS = {
     "passing": "without stock, as they balance",
     "store": "stores",
 }
-ANSWERS = {"reservoir": Role.NONRENEWABLE_RESERVOIR, "outside": Role.TECHNOSPHERE} | {
-    role.value: role for role in (Role.LANDFILL, Role.INCINERATOR, Role.ENVIRONMENT)
-}
+ANSWERS = {"reservoir": "nonrenewable_reservoir", "outside": "technosphere"}
+ANSWERS |= {role: role for role in ("landfill", "incinerator", "environment")}
+"""Roles by what is answered."""
 
 
 def _ask(name: str, kind: str) -> Role:
     """Ask what a source or a sink is."""
+    from cirl_marl.network.elements import Role
+
     choices = ", ".join(ANSWERS)
     while True:
         answer = str(typer.prompt(f"{kind} '{name}': {choices}?")).strip().lower()
         if answer in ANSWERS:
-            return ANSWERS[answer]
+            return Role(ANSWERS[answer])

@@ -10,6 +10,8 @@ import typer
 
 from cirl_marl.cli.common import (
     LEARNING,
+    OBSERVE,
+    REWARDS,
     EpisodeCount,
     Html,
     RunPath,
@@ -24,11 +26,8 @@ from cirl_marl.cli.common import (
     shares,
     training_bar,
 )
-from cirl_marl.controllers.outcome import lacking
-from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES, Standing, run_jobs
-from cirl_marl.network.elements import OBSERVE, REWARDS
 
 EVALUATED = 0.6
 """Share of the evaluation in the work on a page; the rest is to plan."""
@@ -65,9 +64,9 @@ def train(
         int, typer.Option(min=1, help="So many runs together, of this seed and the next ones, in OUT-seedN.")
     ] = 1,
     scenario: Scenario = None,
-    reward: Annotated[str | None, typer.Option(help=f"{', '.join(REWARDS)}; default: the recipe's.")] = None,
+    reward: Annotated[str | None, typer.Option(help=f"{REWARDS}; default: the recipe's.")] = None,
     observe: Annotated[
-        str | None, typer.Option(help=f"{', '.join(OBSERVE)}; default: the recipe's, else the definition's.")
+        str | None, typer.Option(help=f"{OBSERVE}; default: the recipe's, else the definition's.")
     ] = None,
     uncertain: Uncertain = None,
     out: Annotated[Path | None, typer.Option(help="Run directory; default: runs/NETWORK-RECIPE-seedN.")] = None,
@@ -116,6 +115,8 @@ def train(
 
 def _directories(out: Path | None, network: str, recipe: str, seeds: Sequence[int]) -> list[Path]:
     """Return where the runs are kept."""
+    from cirl_marl.definitions.catalogue import load_network
+
     parent = out or Path("runs") / f"{load_network(network).name}-{Path(recipe).stem}"
     return [out] if out is not None and len(seeds) == 1 else [Path(f"{parent}-seed{seed}") for seed in seeds]
 
@@ -273,6 +274,8 @@ def _write_figures(evaluation: Evaluation) -> None:
 
 def _say_lacking(evaluation: Evaluation) -> None:
     """Say under which control flows and services were less than was asked for, as means over the episodes."""
+    from cirl_marl.controllers.outcome import lacking
+
     for name, rollout in evaluation.rollouts.items():
         for line in lacking(evaluation.env.network, rollout):
             say(f"{name}: {line}")

@@ -7,25 +7,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from cirl_marl.cli.common import NETWORKS, NetworkName, Scenario, StartSeed, app, bar, console, errors, plain, say, stem
-from cirl_marl.controllers.rollout import episode_start
-from cirl_marl.definitions.catalogue import families, load_network, recipes
-from cirl_marl.definitions.reader import Definition
-from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.network import Network
-from cirl_marl.network.series import Series, extremes
 
 if TYPE_CHECKING:
     from cirl_marl.learners import Recipe
+    from cirl_marl.network import Network
 
 
 @app.command("networks", rich_help_panel=NETWORKS)
 def list_networks() -> None:
     """List the networks and the learner recipes of the catalogue."""
+    from cirl_marl.definitions.catalogue import families, load_network, recipes
     from cirl_marl.report.terminal import networks_table
 
     found, known = {}, families()
@@ -76,8 +71,14 @@ def show(
     ] = None,
 ) -> None:
     """Show the compartments, flows and circularity of a network at its start state, and draw it."""
+    import numpy as np
+
+    from cirl_marl.controllers.rollout import episode_start
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.drawing.digraph import save_network
     from cirl_marl.drawing.folding import fold_copies
+    from cirl_marl.environments.vector import MultiAgentVectorEnv
+    from cirl_marl.network.series import Series, extremes
     from cirl_marl.report.terminal import arcs_table, nodes_table
 
     found = load_network(network, scenario=scenario)
@@ -156,11 +157,14 @@ def _is_recipe(source: str) -> bool:
     from cirl_marl.definitions.reader import read_toml
 
     if not source.endswith(".toml"):
+        from cirl_marl.definitions.catalogue import recipes
+
         return source in recipes()
     return bool({"learner", "run", "match"} & set(read_toml(Path(source))))
 
 
 def _check_recipe(source: str, network: str | None) -> None:
+    from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.learners.recipe import load_recipe
 
     recipe = load_recipe(source)
@@ -186,6 +190,9 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
 
 def _check_network(source: str, progress: Callable[[float], None]) -> None:
     from cirl_marl.controllers.lint import lint_warnings
+    from cirl_marl.definitions.catalogue import load_network
+    from cirl_marl.definitions.reader import Definition
+    from cirl_marl.environments.vector import MultiAgentVectorEnv
 
     network = load_network(source)
     assert network.source is not None
