@@ -170,12 +170,18 @@ def set_buffer_state(buffer: ReplayBuffer, state: Mapping[str, Any]) -> None:
                 setattr(buffer, name, part)
 
 
+def observation_statistics(env: VecNormalize) -> dict[str, RunningMeanStd]:
+    """Return the running moments of observations by key, ``observation`` if the space is no dict; {} if none are."""
+    if not env.norm_obs:
+        return {}
+    statistics: Any = env.obs_rms
+    return statistics if isinstance(statistics, dict) else {"observation": statistics}
+
+
 def normaliser_state(env: VecNormalize) -> dict[str, Any]:
     """Return the moments of observations and rewards, and the discounted returns under way, as plain numbers."""
-    moments = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
-    observations = moments if env.norm_obs else {}
     return {
-        "observations": {key: _moments(part) for key, part in observations.items()},
+        "observations": {key: _moments(part) for key, part in observation_statistics(env).items()},
         "rewards": _moments(env.ret_rms),
         "returns": _numbers(env.returns),
     }
@@ -183,27 +189,24 @@ def normaliser_state(env: VecNormalize) -> dict[str, Any]:
 
 def set_normaliser_state(env: VecNormalize, state: Mapping[str, Any], *, returns: bool = True) -> None:
     """Bring a normaliser into a state; a ``RunError`` if it sees something else."""
-    moments = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
-    observations = moments if env.norm_obs else {}
+    observations = observation_statistics(env)
     if set(observations) != set(state["observations"]):
         raise RunError(f"normalises {sorted(state['observations'])}, not {sorted(observations)}")
-    for statistics, saved in (
-        (env.ret_rms, state["rewards"]),
-        *((observations[key], state["observations"][key]) for key in observations),
-    ):
-        mean, var = _array(saved["mean"]), _array(saved["var"])
+    pairs = [(part, state["observations"][key]) for key, part in observations.items()]
+    for statistics, moments in ((env.ret_rms, state["rewards"]), *pairs):
+        mean, var = _array(moments["mean"]), _array(moments["var"])
         if np.shape(statistics.mean) != mean.shape:
             raise RunError(f"is for {mean.size} entries, not {np.size(statistics.mean)}")
-        statistics.mean, statistics.var, statistics.count = mean, var, saved["count"]
+        statistics.mean, statistics.var, statistics.count = mean, var, moments["count"]
     if returns:
         env.returns = _array(state["returns"])
 
 
 class FrozenStatistics(RunningMeanStd):
-    """Statistics that no longer follow what is seen."""
+    """Running moments that no longer follow what is observed."""
 
     def __init__(self, statistics: RunningMeanStd) -> None:
-        """Stay with what is ``statistics``."""
+        """Stay at the moments of ``statistics``."""
         super().__init__(shape=statistics.mean.shape)
         self.mean, self.var, self.count = statistics.mean.copy(), statistics.var.copy(), statistics.count
 
@@ -213,13 +216,8 @@ class FrozenStatistics(RunningMeanStd):
 
 def freeze_statistics(env: VecNormalize) -> None:
     """Let the statistics of observations stay as they are."""
-    known: Any = env.obs_rms
-    settled = (
-        {key: FrozenStatistics(each) for key, each in known.items()}
-        if isinstance(known, dict)
-        else FrozenStatistics(known)
-    )
-    env.obs_rms = settled  # type: ignore[assignment]
+    frozen_by_key = {key: FrozenStatistics(part) for key, part in observation_statistics(env).items()}
+    env.obs_rms = frozen_by_key if isinstance(env.obs_rms, dict) else frozen_by_key["observation"]  # type: ignore[assignment]
 
 
 def _moments(moments: RunningMeanStd) -> dict[str, Any]:
@@ -231,10 +229,10 @@ def _numbers(array: Any) -> dict[str, Any]:
     return {"type": numbers.dtype.name, "values": numbers.tolist()}
 
 
-def _array(saved: Mapping[str, Any]) -> Any:
-    if saved["type"] not in ("float32", "float64"):
-        raise ValueError(f"numbers of type {saved['type']!r}")
-    return np.array(saved["values"], dtype=saved["type"])
+def _array(numbers: Mapping[str, Any]) -> Any:
+    if numbers["type"] not in ("float32", "float64"):
+        raise ValueError(f"numbers of type {numbers['type']!r}")
+    return np.array(numbers["values"], dtype=numbers["type"])
 
 
 def _is_progress(value: object) -> bool:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.definitions.reader import write_network
@@ -22,7 +21,7 @@ from cirl_marl.learners.agent_env import AgentVecEnv
 from cirl_marl.learners.algorithms import has_replay_buffer
 from cirl_marl.learners.learner import Learner, load_acting_learner
 from cirl_marl.learners.lockstep import global_streams_claimed, wait
-from cirl_marl.learners.policies import Policies, Policy
+from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.recipe import ENGINES, OPTIONS, Recipe, load_recipe
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory
 from cirl_marl.learners.trainer import Progress, Training, run_together
@@ -339,8 +338,8 @@ def export(run: str | Path | RunDirectory, folder: str | Path) -> list[Path]:
             ).build()
             learner.take(source.acting_checkpoint).model.save(partial / f"{group.name}.zip")
             files.append(target / f"{group.name}.zip")
-            if isinstance(learner.env, VecNormalize):
-                learner.env.save(str(partial / f"{group.name}.normaliser.pkl"))
+            if learner.normaliser is not None:
+                learner.normaliser.save(str(partial / f"{group.name}.normaliser.pkl"))
                 files.append(target / f"{group.name}.normaliser.pkl")
     return files
 
@@ -357,24 +356,20 @@ class Trained(Policies):
         self.checkpoint = folder = self.run.acting_checkpoint
         env = self.run.make_env(1)
         self._names = env.layout.names
-        policies: dict[str, Policy] = {}
-        for group in self.run.groups():
-            learner = load_acting_learner(folder, group, env)
-            normaliser = learner.env if isinstance(learner.env, VecNormalize) else None
-            policies[group.name] = Policy(learner.model, normaliser, learner.agent_env.view)
+        groups = self.run.groups()
+        policies = {group.name: load_acting_learner(folder, group, env).policy for group in groups}
         super().__init__(policies)
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Forget the last episode; a ``RunError`` if ``env`` has other agents, or shows them something else."""
         if set(env.agents) != set(self._names):
             raise RunError(f"{self.run.path}: trained {sorted(self._names)}, not {sorted(env.agents)}")
-        for agent, seen in self._names.items():
-            if (names_here := env.layout.names[agent]) != seen:
-                difference = next(
-                    (name for name in names_here if name not in seen), f"{len(names_here)} entries, not {len(seen)}"
-                )
+        for agent, entries in self._names.items():
+            if (shown_here := env.layout.names[agent]) != entries:
+                counts = f"{len(shown_here)} entries, not {len(entries)}"
+                difference = next((name for name in shown_here if name not in entries), counts)
                 raise RunError(
-                    f"{self.run.path}: '{agent}' learnt from other observations than this environment's ({difference})"
-                    "; make the environment with the options of the run, as its make_env() does"
+                    f"{self.run.path}: '{agent}' learnt from other observations than this environment's "
+                    f"({difference}); make the environment with the options of the run, as its make_env() does"
                 )
         super().start(env, seed)

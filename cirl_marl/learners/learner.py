@@ -38,6 +38,7 @@ from cirl_marl.learners.checkpoint import (
 )
 from cirl_marl.learners.demonstrations import Demonstrator, demonstrate, keep_parameters, steps_counted
 from cirl_marl.learners.lockstep import BudgetSpent, Streams, wait
+from cirl_marl.learners.policies import Policy
 from cirl_marl.learners.recipe import Group, LearnerSettings
 
 ACTING_PARAMETERS = ("policy_kwargs", "use_sde", "ent_coef", "gamma")
@@ -90,6 +91,16 @@ class Learner:
         self.follows_demonstrator = False
         noisy = spec.parameters.get("action_noise") is not None
         self.streams = Streams(self._seed, keep_gaussian=noisy)
+
+    @property
+    def normaliser(self) -> VecNormalize | None:
+        """The normaliser of what it observes and is paid; None if it takes things as they are."""
+        return self.env if isinstance(self.env, VecNormalize) else None
+
+    @property
+    def policy(self) -> Policy:
+        """What acts, for ``Policies``."""
+        return Policy(self.model, self.normaliser, self.agent_env.view)
 
     def build(self) -> Learner:
         """Make a fresh algorithm; a ``RecipeError`` names the learner if the algorithm refuses its parameters."""
@@ -163,10 +174,10 @@ class Learner:
 
     def _set(self, state: Mapping[str, Any]) -> None:
         set_model_state(self.model, state["model"])
-        if isinstance(self.env, VecNormalize):
-            if self.spec.start is not None and self.env.norm_obs:
-                freeze_statistics(self.env)
-            set_normaliser_state(self.env, state["normaliser"])
+        if self.normaliser is not None:
+            if self.spec.start is not None and self.normaliser.norm_obs:
+                freeze_statistics(self.normaliser)
+            set_normaliser_state(self.normaliser, state["normaliser"])
         buffer = getattr(self.model, "replay_buffer", None)
         if buffer is not None and state["buffer"] is not None:
             set_buffer_state(buffer, state["buffer"])
@@ -184,7 +195,7 @@ class Learner:
         buffer = None if last else getattr(self.model, "replay_buffer", None)
         state = {
             "model": model_state(self.model),
-            "normaliser": normaliser_state(self.env) if isinstance(self.env, VecNormalize) else None,
+            "normaliser": None if self.normaliser is None else normaliser_state(self.normaliser),
             "buffer": None if buffer is None else buffer_state(buffer),
             "streams": self.streams.state_dict(active=not in_stack and not last),
             "stacked": in_stack,
@@ -252,8 +263,8 @@ class Learner:
         while True:
             self.barrier.arrive(dict(state))
             observation = self.agent_env.reset()
-            if isinstance(self.env, VecNormalize):
-                observation = self.env.normalize_obs(observation)  # type: ignore[arg-type]
+            if self.normaliser is not None:
+                observation = self.normaliser.normalize_obs(observation)  # type: ignore[arg-type]
             action, state["memory"] = predict_action(self.model, observation, **state, env=self.agent_env)
             _, _, state["starts"], _ = self.agent_env.step(action)
 
@@ -263,7 +274,7 @@ class Learner:
             "algorithm": self.spec.algorithm,
             "policy": dict(self.model.policy.state_dict()),
             "variables": variables(self.model),
-            "normaliser": normaliser_state(self.env) if isinstance(self.env, VecNormalize) else None,
+            "normaliser": None if self.normaliser is None else normaliser_state(self.normaliser),
         }
         write_tree(folder, self.name, state)
 
@@ -280,8 +291,8 @@ class Learner:
             self.model.policy.load_state_dict(state["policy"])
             set_variables(self.model, state["variables"])
             keep_parameters(self.model)
-            if isinstance(self.env, VecNormalize):
-                set_normaliser_state(self.env, state["normaliser"], returns=False)
+            if self.normaliser is not None:
+                set_normaliser_state(self.normaliser, state["normaliser"], returns=False)
         except (RunError, RuntimeError) as error:
             message = f"{path}: '{self.name}' is for other observations or actions: {error}"
             raise RunError(message) from error

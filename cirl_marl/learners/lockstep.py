@@ -1,8 +1,12 @@
-"""Many learners in one joint environment, in lockstep; or in several environments at once.
+"""Many learners in one joint environment, or in several, in lockstep; each with random streams of its own.
 
-Each learner's own ``learn()`` runs unmodified in a greenlet against its ``Seat``. A seat's ``step_wait`` switches back
-here; when every learner has handed in its actions, the joint environment moves once and the learners go on, in a fixed
-order. Who occupies several seats, of one environment or of more, hands in all their actions before it waits.
+Each learner's own ``learn()`` runs unmodified in a greenlet, a coroutine that need not know that it is one, against its
+``AgentVecEnv``. Its ``step_wait`` switches back here; when every learner has left its actions, the joint environment
+moves once and the learners go on, in a fixed order.
+
+Stable-Baselines3 draws from the global torch and NumPy streams, and torch keeps its gradient mode per thread. Learners
+that take turns in one thread would read each other's; so they are exchanged at every switch, and each learner computes
+exactly what it would compute alone.
 """
 
 from __future__ import annotations
@@ -37,6 +41,9 @@ class Streams:
 
     NumPy's legacy stream caches one Gaussian; exchanging bit generators drops it, saving the full state keeps it but
     costs some 50 µs. ``keep_gaussian`` is for learners with action noise, the only ones that draw such Gaussians.
+
+    Attributes:
+        torch_state: of the torch stream, while it is not active.
     """
 
     def __init__(self, seed: int | None = None, *, keep_gaussian: bool = False) -> None:
@@ -56,27 +63,18 @@ class Streams:
         """The NumPy stream itself, while it is not active; who draws from it moves it on."""
         return self._numpy
 
-    @property
-    def torch_state(self) -> torch.Tensor:
-        """State of the torch stream, while it is not active."""
-        return self._torch
-
-    @torch_state.setter
-    def torch_state(self, state: torch.Tensor) -> None:
-        self._torch = state
-
     def state_dict(self, *, active: bool) -> dict[str, Any]:
         """Return the state of the streams, which are the ``active`` ones or put away."""
         if active:
             self._leave()
         numpy = self._numpy.state if self._numpy_state is None else self._numpy_state
-        return {"torch": self._torch, "numpy": numpy, "gaussian": self._numpy_state is not None}
+        return {"torch": self.torch_state, "numpy": numpy, "gaussian": self._numpy_state is not None}
 
-    def load_state_dict(self, saved: Mapping[str, Any], *, active: bool) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], *, active: bool) -> None:
         """Bring the streams into a state."""
-        self._torch, state = saved["torch"], saved["numpy"]
-        self._numpy.state = {"bit_generator": state["bit_generator"], "state": state["state"]}
-        self._numpy_state = state if saved["gaussian"] else None
+        self.torch_state, numpy = state["torch"], state["numpy"]
+        self._numpy.state = {"bit_generator": numpy["bit_generator"], "state": numpy["state"]}
+        self._numpy_state = numpy if state["gaussian"] else None
         if active:
             self._enter()
 
@@ -96,13 +94,13 @@ class Streams:
         successor._enter()
 
     def _leave(self) -> None:
-        self._torch = torch.get_rng_state()
+        self.torch_state = torch.get_rng_state()
         self._grad = torch.is_grad_enabled()
         self._numpy = get_bit_generator()
         self._numpy_state = np.random.get_state(legacy=False) if self.keep_gaussian else None  # noqa: NPY002 (Stable-Baselines3 draws from it)
 
     def _enter(self) -> None:
-        torch.set_rng_state(self._torch)
+        torch.set_rng_state(self.torch_state)
         torch.set_grad_enabled(self._grad)
         set_bit_generator(self._numpy)
         if self._numpy_state is not None:
@@ -139,7 +137,7 @@ class BudgetSpent(GreenletExit):  # type: ignore[misc]
     """Raised in a learner that would go on beyond its joint steps."""
 
 
-class TrainingInterrupted(Exception):
+class StopTraining(Exception):
     """Raised to end training early; what was learnt is kept."""
 
 
@@ -149,7 +147,7 @@ def wait() -> None:
 
 
 class World:
-    """A joint environment with the seats of its learners.
+    """A joint environment with the environments of its learners, which it feeds.
 
     ``joint_steps`` are steps done, each in every copy, those of a run that is resumed included.
     """
@@ -157,7 +155,7 @@ class World:
     def __init__(
         self, env: JointEnv, seeds: Sequence[int], agent_envs: Mapping[str, AgentVecEnv], *, done: int = 0
     ) -> None:
-        """Reset ``env`` with one of ``seeds`` per copy for those in ``seats``, after ``done`` joint steps before.
+        """Reset ``env`` with one of ``seeds`` per copy for ``agent_envs``, after ``done`` joint steps before.
 
         Together they act for every agent once.
         """
@@ -169,7 +167,7 @@ class World:
         self._lengths = np.zeros((len(env.agents), env.num_envs), dtype=int)
 
     def step(self, hook: StepHook | None = None) -> None:
-        """Move by the actions that were handed in, and show every seat what came of it.
+        """Move by the actions that were handed in, and tell every learner what came of it.
 
         Raises:
             LearnerError: if an action cannot be used.
@@ -217,14 +215,14 @@ class World:
 
 
 class NetworkWorld(World):
-    """The world of a network, which can be saved and go on."""
+    """The world of a network, which can be saved and resumed."""
 
     env: MultiAgentVectorEnv
 
     def __init__(
         self, env: MultiAgentVectorEnv, seeds: Sequence[int], views: Mapping[str, View] | None = None, *, done: int = 0
     ) -> None:
-        """Seat learners in ``env``, as ``World`` does.
+        """Make the learners' environments, and reset ``env`` as ``World`` does.
 
         ``views`` are what each learner sees, by its name; None gives every agent a learner of its own.
         """
@@ -234,31 +232,31 @@ class NetworkWorld(World):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a world goes on from, but for its learners."""
+        """Return all that a world is resumed from, but for its learners."""
         now = self.env.snapshot()
         state = {part.name: getattr(now.state, part.name) for part in fields(State)}
         progress = {"returns": self._returns, "lengths": self._lengths, "weight": self.env.circularity_weight}
         return {"state": state, "streams": list(now.streams), "joint_steps": self.joint_steps, **progress}
 
-    def load_state_dict(self, saved: Mapping[str, Any]) -> None:
-        """Go on from what a world of the same environment told; seats are handed what came last by others."""
-        streams = tuple(saved["streams"])
-        self.env.restore(Snapshot(State(**saved["state"]), streams, self.env.agents, self.env.network))
-        self.env.circularity_weight = saved["weight"]
-        self.joint_steps, self._returns, self._lengths = saved["joint_steps"], saved["returns"], saved["lengths"]
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Resume from the state of a world of the same environment; the learners load their last step themselves."""
+        streams = tuple(state["streams"])
+        self.env.restore(Snapshot(State(**state["state"]), streams, self.env.agents, self.env.network))
+        self.env.circularity_weight = state["weight"]
+        self.joint_steps, self._returns, self._lengths = state["joint_steps"], state["returns"], state["lengths"]
 
 
 @dataclass(frozen=True, slots=True)
 class Participant:
-    """Who acts in one or more seats.
+    """Who acts for one or more learners: a learner itself, or a stack of them.
 
     Attributes:
         title: what messages call it.
         learn: learns, waiting for each joint step; returns when it has learnt enough.
         act: acts for ever, once ``learn`` is done, so that the others' world goes on.
         streams: its random streams.
-        boundaries: of each learner that it is.
-        busy: whether it will come to no boundary before something is over.
+        barriers: of each learner that it is.
+        busy: whether it will not come to a barrier before something is over.
         budget: returns the joint steps after which it is stopped by ``BudgetSpent``, if it has not returned.
         absent: whether it has nothing to do in the next joint step, and is not asked.
     """
@@ -274,10 +272,13 @@ class Participant:
 
 
 class Lockstep:
-    """Lets those who act in some worlds run together; all worlds move at once."""
+    """Runs participants as coroutines: each goes on until it waits for a joint step; then all worlds move at once.
+
+    Greenlets switch where the code says so, unlike threads, so that the order is always the same and no lock is needed.
+    """
 
     def __init__(self, worlds: Sequence[World], participants: Sequence[Participant]) -> None:
-        """``participants`` are resumed in their order; together they occupy every seat of ``worlds``."""
+        """``participants`` are resumed in their order; together they act for every agent of ``worlds``."""
         self._worlds, self._participants = worlds, participants
         self._caller_streams = Streams()
         self._coroutines: list[greenlet] = []
@@ -290,7 +291,7 @@ class Lockstep:
 
     @property
     def busy(self) -> bool:
-        """Whether somebody will come to no boundary soon."""
+        """Whether somebody will not come to a barrier soon."""
         return any(participant.busy() for participant in self._participants)
 
     def run(self, hooks: Sequence[StepHook] | None = None, after: Callable[[], None] = lambda: None) -> None:
@@ -298,16 +299,17 @@ class Lockstep:
 
         Args:
             hooks: of each world, called within each joint step, in the caller's random streams.
-            after: called after each joint step of all worlds; it ends the run by ``TrainingInterrupted``.
+            after: called after each joint step of all worlds; it ends the run by ``StopTraining``.
 
         Raises:
             LearnerError: if a learner raises; names it and the joint step.
-            TrainingInterrupted: if it was enough.
+            StopTraining: if it was enough.
         """
         self._learners = set(range(len(self._participants)))
         try:
             for i, participant in enumerate(self._participants):
                 self._coroutines.append(greenlet(self._task(i, participant)))
+                # a greenlet begins with an empty context otherwise, without ``np.errstate`` of the caller
                 self._coroutines[i].gr_context = copy_context()
                 if not participant.absent():
                     self._resume(i)
@@ -316,8 +318,8 @@ class Lockstep:
                 for place, world in enumerate(self._worlds):
                     world.step(hooks[place] if hooks is not None else None)
                 for participant in self._participants:
-                    for boundary in participant.barriers:
-                        boundary.record()
+                    for barrier in participant.barriers:
+                        barrier.record()
                 after()
                 for i in range(len(self._participants)):
                     self._turn(i, self._joint_steps)
@@ -332,14 +334,14 @@ class Lockstep:
             self._stop_learning(i)
 
     def _replay(self, i: int) -> None:
-        """Hand a participant that goes on again what it was handed before."""
-        boundaries = self._participants[i].barriers
-        count = max((len(barrier.replay_log) for barrier in boundaries), default=0)
+        """Let a resumed participant repeat the steps of its replay log: it ends where the environment is already."""
+        barriers = self._participants[i].barriers
+        count = max((len(barrier.replay_log) for barrier in barriers), default=0)
         for place in range(count):
-            for barrier in boundaries:
+            for barrier in barriers:
                 barrier.replay_step(place)
             self._turn(i, self._joint_steps - count + place + 1)
-        for barrier in boundaries:
+        for barrier in barriers:
             barrier.replay_log = []
 
     @property
@@ -384,7 +386,7 @@ class Lockstep:
         self._coroutines.clear()
 
     def _enter(self, i: int, action: Callable[[], object]) -> None:
-        """Do something in the random streams of a participant."""
+        """Run ``action`` in the random streams and torch modes of a participant: both are global to the thread."""
         streams = self._participants[i].streams
         self._caller_streams.switch_to(streams)
         try:

@@ -68,8 +68,8 @@ def _begin_from(run: RunDirectory, name: str, learner: Learner, env: MultiAgentV
 def begin_again(folder: Path, learner: Learner) -> None:
     """Give a fresh ``learner`` what it had from another run, as a checkpoint of its own keeps it."""
     learner.take(folder)
-    if isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
-        freeze_statistics(learner.env)
+    if learner.normaliser is not None and learner.normaliser.norm_obs:
+        freeze_statistics(learner.normaliser)
 
 
 def _refuse(subject: str, mistakes: Sequence[str]) -> None:

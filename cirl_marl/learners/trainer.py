@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.environments.rewards import CIRCULARITY_REWARDS
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
@@ -26,8 +25,8 @@ from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed
-from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingInterrupted, wait
-from cirl_marl.learners.policies import Policies, Policy
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, StopTraining, Streams, wait
+from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.run_directory import EvaluationsFile, MetricsFile, RunConfig, RunDirectory, steps_of
 from cirl_marl.learners.stacked.conditions import first_obstacle, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
@@ -315,15 +314,10 @@ class Training:
     def _evaluate(self, evaluation: ValidationEpisodes) -> None:
         """Play its episodes by the policies of now, keep these if they are the best so far, and move the price."""
         self._bring_up_to_date()
-        policies = {
-            name: Policy(
-                learner.model, learner.env if isinstance(learner.env, VecNormalize) else None, learner.agent_env.view
-            )
-            for name, learner in self.learners.items()
-        }
-        score, demanded = evaluation.score(Policies(policies)), self.config.recipe.run.min_service
+        policies = Policies({name: learner.policy for name, learner in self.learners.items()})
+        score, target = evaluation.score(policies), self.config.recipe.run.min_service
         self._last_evaluation = self.joint_steps
-        better = self._best is None or score.rank(demanded) > self._best.rank(demanded)
+        better = self._best is None or score.rank(target) > self._best.rank(target)
         if better:
             self._best = score
             if self.run is not None:
@@ -400,7 +394,7 @@ def run_together(
             lockstep.run(hooks, partial(_keep, trainings, lockstep, stop_requested))
             for training in trainings:
                 training.finish()
-    except TrainingInterrupted:
+    except StopTraining:
         for training in trainings:
             training.stop("interrupted", "stopped by the user")
         raise KeyboardInterrupt from None
@@ -418,11 +412,11 @@ def _keep(trainings: Sequence[Training], lockstep: Lockstep, stop_requested: Cal
     """Ask for checkpoints when it is time, or when somebody wants to stop, and write those that are complete.
 
     Raises:
-        TrainingInterrupted: when everything is written, or if somebody who is shown what to do cannot be saved.
+        StopTraining: when everything is written, or if somebody who is shown what to do cannot be saved.
     """
     stops = stop_requested()
     if stops and (lockstep.busy or all(training.run is None for training in trainings)):
-        raise TrainingInterrupted
+        raise StopTraining
     if stops or (any(training.due for training in trainings) and not lockstep.busy):
         for training in trainings:
             training.ask()
@@ -430,7 +424,7 @@ def _keep(trainings: Sequence[Training], lockstep: Lockstep, stop_requested: Cal
         for training in trainings:
             training.keep("interrupted" if stops else "running")
         if stops:
-            raise TrainingInterrupted
+            raise StopTraining
 
 
 def _participants(

@@ -11,9 +11,9 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecNormalize
 from torch import Tensor
 
+from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.learner import Learner
 from cirl_marl.network import Integers
 
@@ -32,7 +32,7 @@ class StackedInputs:
     """
 
     def __init__(self, members: Sequence[Learner], device: torch.device) -> None:
-        """Lay out the inputs and take over what normalisers know."""
+        """Lay out the inputs and take over the moments of the normalisers."""
         self._members, self._device = members, device
         views = [learner.agent_env.view for learner in members]
         self.spaces = [_box(view.action_space) for view in views]
@@ -54,23 +54,20 @@ class StackedInputs:
         self._return_moments = RunningMeanStd(shape=(len(members), 1))
         spec = members[0].spec
         self._follows = spec.normalise.observation and spec.start is None  # statistics stay as they are after a start
-        for i, columns, statistics, learner_statistics in self._statistics():
-            statistics.mean[i, columns], statistics.var[i, columns], statistics.count = (
-                learner_statistics.mean,
-                learner_statistics.var,
-                learner_statistics.count,
-            )
+        for rows_of_all, moments, of_learner in self._statistics():
+            moments.mean[rows_of_all], moments.var[rows_of_all] = of_learner.mean, of_learner.var
+            moments.count = of_learner.count
         for returns, learner in zip(self._returns, members, strict=True):
-            if isinstance(learner.env, VecNormalize):
-                returns[:] = learner.env.returns
+            if learner.normaliser is not None:
+                returns[:] = learner.normaliser.returns
 
     def begin(self) -> Tensor:
-        """Return what is seen, as at a reset: it counts in the moments, and discounted returns begin anew."""
+        """Return the observations as at a reset: they count in the moments, and discounted returns begin anew."""
         self._returns[:] = 0.0
         return self.observe(update_moments=True)
 
     def observe(self, *, update_moments: bool) -> Tensor:
-        """Return what the learners see now, shape (N, B, entries); while learning, it counts in the moments."""
+        """Return the present observations, shape (N, B, entries); ``update_moments`` has them count in the moments."""
         for i, learner in enumerate(self._members):
             self._enter(i, learner.agent_env.reset())
         if update_moments and self._follows:
@@ -79,7 +76,7 @@ class StackedInputs:
         return self._normalise()
 
     def final_observations(self, dones: NDArray[np.bool_]) -> Tensor:
-        """Return what was seen last in the rows that ``dones``, shape (N, B, entries); in others, anything."""
+        """Return the last observations of the episodes that ended, shape (N, B, entries); anything in other rows."""
         for i, learner in enumerate(self._members):
             if dones[i].any():
                 self._enter(i, learner.agent_env.last_step.final_observation)
@@ -87,17 +84,16 @@ class StackedInputs:
 
     def rewards_and_dones(self) -> tuple[Tensor, NDArray[np.bool_]]:
         """Return the rewards as normalisers scale them, and which rows ended, shape (N, B) each."""
-        rewards, dones = (
-            np.stack(parts) for parts in zip(*(x.agent_env.rewards_and_dones() for x in self._members), strict=True)
-        )
-        env = self._members[0].env
-        if isinstance(env, VecNormalize):
-            self._returns = self._returns * env.gamma + rewards
+        outcomes = [learner.agent_env.rewards_and_dones() for learner in self._members]
+        rewards, dones = (np.stack(parts) for parts in zip(*outcomes, strict=True))
+        normaliser = self._members[0].normaliser
+        if normaliser is not None:
+            self._returns = self._returns * normaliser.gamma + rewards
             _update(self._return_moments, self._returns[..., None])
             self._returns[dones] = 0.0
-            if env.norm_reward:
-                rewards = rewards / np.sqrt(self._return_moments.var + env.epsilon)
-                rewards = np.clip(rewards, -env.clip_reward, env.clip_reward)
+            if normaliser.norm_reward:
+                rewards = rewards / np.sqrt(self._return_moments.var + normaliser.epsilon)
+                rewards = np.clip(rewards, -normaliser.clip_reward, normaliser.clip_reward)
         return torch.as_tensor(rewards, dtype=torch.float32, device=self._device), dones
 
     def hand_in(self, actions: Tensor) -> None:
@@ -106,51 +102,38 @@ class StackedInputs:
             learner.agent_env.step_async(np.clip(rows[:, : space.shape[0]], space.low, space.high))
 
     def give(self) -> None:
-        """Give normalisers what they would know by themselves."""
-        for i, columns, statistics, learner_statistics in self._statistics():
-            shape = np.shape(learner_statistics.mean)
-            learner_statistics.mean, learner_statistics.var = (
-                np.array(own[i, columns]).reshape(shape) for own in (statistics.mean, statistics.var)
-            )
-            learner_statistics.count = statistics.count
-        for own, learner in zip(self._returns, self._members, strict=True):
-            if isinstance(learner.env, VecNormalize):
-                learner.env.returns = own.copy()
+        """Bring the normalisers of the learners up to date."""
+        for rows_of_all, moments, of_learner in self._statistics():
+            shape = np.shape(of_learner.mean)
+            of_learner.mean = np.array(moments.mean[rows_of_all]).reshape(shape)
+            of_learner.var = np.array(moments.var[rows_of_all]).reshape(shape)
+            of_learner.count = moments.count
+        for returns, learner in zip(self._returns, self._members, strict=True):
+            if learner.normaliser is not None:
+                learner.normaliser.returns = returns.copy()
 
-    def _statistics(self) -> Iterator[tuple[int, slice, RunningMeanStd, RunningMeanStd]]:
-        """Yield each learner's own moments beside ours, with its row and columns."""
+    def _statistics(self) -> Iterator[tuple[tuple[int, slice], RunningMeanStd, RunningMeanStd]]:
+        """Yield where the moments of a learner stand in those of all, these, and its own."""
         for i, learner in enumerate(self._members):
-            env = learner.env
-            if not isinstance(env, VecNormalize):
-                continue
-            yield i, slice(1), self._return_moments, env.ret_rms
-            if env.norm_obs:
-                by_key = env.obs_rms if isinstance(env.obs_rms, dict) else {"observation": env.obs_rms}
-                for key, moments in by_key.items():
-                    yield (
-                        i,
-                        slice(len(self.actor_columns[i]) if key == "observation" else None),
-                        self._moments[key],
-                        moments,
-                    )
+            if learner.normaliser is not None:
+                yield (i, slice(1)), self._return_moments, learner.normaliser.ret_rms
+                for key, moments in observation_statistics(learner.normaliser).items():
+                    length = len(self.actor_columns[i]) if key == "observation" else None  # the rest is padding
+                    yield (i, slice(length)), self._moments[key], moments
 
     def _enter(self, i: int, observation: Any) -> None:
-        """Enter what a learner sees into the padded parts."""
+        """Write an observation of a learner into the padded parts."""
         for key, part in self._parts.items():
-            part_of_learner = observation[key] if isinstance(observation, dict) else observation
-            part[i, :, : part_of_learner.shape[1]] = part_of_learner
+            rows = observation[key] if isinstance(observation, dict) else observation
+            part[i, :, : rows.shape[1]] = rows
 
     def _normalise(self) -> Tensor:
         """Return what was entered, side by side."""
-        env = self._members[0].env
-        parts: list[NDArray[np.floating]] = []
-        for key, part in self._parts.items():
-            moments = self._moments[key]
-            if isinstance(env, VecNormalize) and env.norm_obs:
-                standard = (part - moments.mean[:, None]) / np.sqrt(moments.var + env.epsilon)[:, None]
-                parts.append(np.clip(standard, -env.clip_obs, env.clip_obs))
-            else:
-                parts.append(part)
+        normaliser, parts = self._members[0].normaliser, list(self._parts.values())
+        if normaliser is not None and normaliser.norm_obs:
+            for place, (part, moments) in enumerate(zip(parts, self._moments.values(), strict=True)):
+                standard = (part - moments.mean[:, None]) / np.sqrt(moments.var + normaliser.epsilon)[:, None]
+                parts[place] = np.clip(standard, -normaliser.clip_obs, normaliser.clip_obs)
         return torch.as_tensor(np.concatenate(parts, axis=2), dtype=torch.float32, device=self._device)
 
 
