@@ -12,7 +12,7 @@ import pytest
 
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners import trainer as module
-from cirl_marl.learners.lockstep import StopTraining
+from cirl_marl.learners.lockstep import TrainingStop
 from cirl_marl.learners.recipe import LearnerSettings, Run
 
 pytestmark = pytest.mark.medium
@@ -100,7 +100,7 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, steps: list[int], *, saved: bool) -
         wanted = bool(steps) and training.joint_steps >= steps[0]
         if wanted and not saved:
             steps.pop(0)
-            raise StopTraining  # as after SIGKILL: nothing is written
+            raise TrainingStop  # as after SIGKILL: nothing is written
         real(trainings, lockstep, lambda: wanted or interrupted())
 
     monkeypatch.setattr(module, "_keep", keep)

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from cirl_marl import LearnerError, MultiAgentVectorEnv
 from cirl_marl.learners.agent_env import AgentVecEnv
-from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, StopTraining, Streams
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, TrainingStop, Streams
 
 HORIZON = 5
 COPIES = 3
@@ -174,14 +174,14 @@ def test_failing_learner_is_named() -> None:
 
 
 def test_everything_can_be_stopped() -> None:
-    """``StopTraining`` ends all learners cleanly."""
+    """``TrainingStop`` ends all learners cleanly."""
     world = make_world(["mine", "use"])
 
     def stop() -> None:
         if world.joint_steps == 4:
-            raise StopTraining
+            raise TrainingStop
 
-    with pytest.raises(StopTraining):
+    with pytest.raises(TrainingStop):
         run_scripted(world, {"mine": 100, "use": 100}, after=stop)
     assert world.joint_steps == 4
 

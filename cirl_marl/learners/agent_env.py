@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, Vec
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
-from cirl_marl.learners.views import ObservedRows, View
+from cirl_marl.learners.views import ObservedRows, View, by_part, rows_of
 from cirl_marl.network import Floats
 from cirl_marl.network.elements import Compartment
 
@@ -69,7 +69,7 @@ class StepResult:
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> StepResult:
         """Return what ``state_dict`` was taken of."""
-        names = {written: name for name, written in cls.NAMES_IN_FILES.items()}
+        names = {key: name for name, key in cls.NAMES_IN_FILES.items()}
         return cls(**{names.get(key, key): value for key, value in state.items()})
 
 
@@ -170,7 +170,7 @@ class AgentVecEnv(VecEnv):
     def receive_reset(self, observations: Arrays, state: Callable[[], Floats]) -> None:
         """Take over the first observation after a reset of the joint environment."""
         rows = self.num_envs
-        first = _rows_in_order(self.view.observe(observations, state))
+        first = _in_rows(self.view.observe(observations, state))
         self.last_step = StepResult(first, np.zeros(rows, dtype=np.float32), np.ones(rows, dtype=bool))
 
     @property
@@ -181,14 +181,14 @@ class AgentVecEnv(VecEnv):
     def receive_step(self, step: JointStep) -> None:
         """Take over the outcome of a joint step."""
         agents, rows = self.view.agents, self.view.row_agents or self.view.agents[:1]
-        observation = _rows_in_order(self.view.observe(step.observations, step.state))
+        observation = _in_rows(self.view.observe(step.observations, step.state))
         rewards = self.view.score(step.rewards).astype(np.float32)
         dones = np.concatenate([step.dones[agent] for agent in rows])
         if not dones.any():
             self.last_step = StepResult(observation, rewards, dones)
             return
         final_by_agent = {agent: step.infos[agent]["final_obs"] for agent in agents}
-        final = _rows_in_order(self.view.observe(final_by_agent, lambda: step.infos[agents[0]]["final_info"]["state"]))
+        final = _in_rows(self.view.observe(final_by_agent, lambda: step.infos[agents[0]]["final_info"]["state"]))
         returns, lengths = self.view.score(step.returns), np.concatenate([step.lengths[agent] for agent in rows])
         truncated = np.concatenate([step.truncated[agent] for agent in rows])
         self.last_step = StepResult(observation, rewards, dones, final, returns, lengths, truncated)
@@ -218,7 +218,7 @@ class AgentVecEnv(VecEnv):
                 out_of_time = now.truncated is None or bool(now.truncated[row])
                 infos[row] = {
                     "TimeLimit.truncated": self.bootstrap and out_of_time,
-                    "terminal_observation": _row(now.final_observation, int(row)),
+                    "terminal_observation": by_part(lambda part: part.copy(), rows_of(now.final_observation, row)),
                     "episode": {"r": float(now.returns[row]), "l": int(now.lengths[row]), "t": 0.0},
                 }
         return self.reset(), rewards, dones, infos
@@ -253,15 +253,7 @@ class AgentVecEnv(VecEnv):
         return [self.views[i] for i in self._get_indices(indices)]
 
 
-def _rows_in_order(observation: ObservedRows) -> ObservedRows:
+def _in_rows(observation: ObservedRows) -> ObservedRows:
     """Return an observation in C order, as replayed ones are: matrix products of other layouts round differently."""
-    if isinstance(observation, dict):
-        return {key: np.ascontiguousarray(value) for key, value in observation.items()}
-    return np.ascontiguousarray(observation)
-
-
-def _row(observation: ObservedRows, row: int) -> ObservedRows:
-    if isinstance(observation, dict):
-        return {key: value[row].copy() for key, value in observation.items()}
-    part: NDArray[np.floating] = observation[row].copy()
-    return part
+    rows: ObservedRows = by_part(np.ascontiguousarray, observation)
+    return rows

@@ -138,11 +138,11 @@ def _takes(parameter: inspect.Parameter, value: object) -> bool:
 
 
 def _requirement(parameter: inspect.Parameter) -> str:
-    stated = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
+    text = inspect.formatannotation(parameter.annotation).replace("collections.abc.", "").replace("typing.", "")
     if parameter.name not in BOUNDS:
-        return stated
+        return text
     low, high = BOUNDS[parameter.name]
-    return f"{stated} of at least {low:g}" if high == math.inf else f"{stated} in [{low:g}, {high:g}]"
+    return f"{text} of at least {low:g}" if high == math.inf else f"{text} in [{low:g}, {high:g}]"
 
 
 def _as_tuple(value: Any) -> Any:

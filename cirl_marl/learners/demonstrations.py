@@ -30,6 +30,7 @@ from cirl_marl.environments.single import SingleAgentEnv
 from cirl_marl.environments.state import State
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError
+from cirl_marl.learners.views import rows_of
 from cirl_marl.optimum.registry import named_controller
 
 Act = Callable[[], NDArray[np.float32]]
@@ -114,24 +115,17 @@ def _concatenate(observations: Sequence[Any]) -> Any:
     return np.concatenate(observations)
 
 
-def _rows(observations: Any, rows: Any) -> Any:
-    """Return some rows of observations, which may be those of a dict."""
-    if isinstance(observations, dict):
-        return {key: part[rows] for key, part in observations.items()}
-    return observations[rows]
-
-
-def _fit(model: BaseAlgorithm, observed: Any, actions_to_copy: NDArray[np.float32]) -> None:
-    """Bring the policy close to what was ``actions_to_copy``, by the statistics that the normaliser has now."""
+def _fit(model: BaseAlgorithm, observations: Any, actions_to_copy: NDArray[np.float32]) -> None:
+    """Bring the policy close to the actions to copy, by the statistics that the normaliser has now."""
     env, policy = model.get_env(), model.policy
-    inputs, _ = policy.obs_to_tensor(env.normalize_obs(observed) if isinstance(env, VecNormalize) else observed)
+    inputs, _ = policy.obs_to_tensor(env.normalize_obs(observations) if isinstance(env, VecNormalize) else observations)
     actions = torch.as_tensor(actions_to_copy)
     optimiser = torch.optim.Adam(policy.parameters(), lr=IMITATION_RATE)
     policy.set_training_mode(True)
     for _ in range(IMITATION_EPOCHS):
         for rows in torch.split(torch.randperm(len(actions)), IMITATION_BATCH):
             optimiser.zero_grad()
-            _unlike(policy, _rows(inputs, rows), actions[rows]).backward()  # type: ignore[no-untyped-call]
+            _unlike(policy, rows_of(inputs, rows), actions[rows]).backward()  # type: ignore[no-untyped-call]
             optimiser.step()
     policy.set_training_mode(False)
     keep_parameters(model)
@@ -214,7 +208,7 @@ def in_copies(name: str, envs: Sequence[gymnasium.Env[Any, Any]], seeds: Sequenc
             demonstrator.check([agent], f"agent '{agent}'")
         return demonstrator.act()[agent]
 
-    return lambda: np.concatenate([row(each) for each in demonstrators], dtype=np.float32, casting="same_kind")
+    return lambda: np.concatenate([row(leader) for leader in demonstrators], dtype=np.float32, casting="same_kind")
 
 
 def _batch_of(env: gymnasium.Env[Any, Any]) -> MultiAgentVectorEnv:

@@ -144,30 +144,29 @@ def prepare(
     **options: Any,
 ) -> Training:
     """Return the training that ``train`` would start with these arguments; nothing is trained and nothing written."""
-    resolved = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
-    steps = resolved.run.steps if steps is None else _whole("steps", steps, 1)
+    full_recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
+    steps = full_recipe.run.steps if steps is None else _whole("steps", steps, 1)
     if engine is not None and engine not in ENGINES:
         raise CirlError(unknown("engine", engine, ENGINES))
     if min_service is not None and not 0 <= min_service <= 1:
         raise CirlError(f"min_service must be a level in [0, 1], got {min_service}")
-    run_options = {
-        key: value for key, value in {"engine": engine, "min_service": min_service}.items() if value is not None
-    }
-    resolved = resolved.model_copy(update={"run": resolved.run.model_copy(update=run_options)})
-    resolved.check(steps)
-    given = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
-    settings = resolved.environment | given
-    copies = resolved.run.envs if envs is None else _whole("envs", envs, 1)
+    run_options: dict[str, Any] = {} if engine is None else {"engine": engine}
+    run_options |= {} if min_service is None else {"min_service": min_service}
+    full_recipe = full_recipe.model_copy(update={"run": full_recipe.run.model_copy(update=run_options)})
+    full_recipe.check(steps)
+    overrides = {n: v.item() if isinstance(v, np.generic) else v for n, v in options.items() if v is not None}
+    settings = full_recipe.environment | overrides
+    copies = full_recipe.run.envs if envs is None else _whole("envs", envs, 1)
     env = MultiAgentVectorEnv(network, num_envs=copies, agents=agents, **settings)
     if not env.agents:
         raise CirlError(f"network '{env.network.name}': no compartment has a control, so nothing can learn")
-    resolved.check_agents(env.agents)
+    full_recipe.check_agents(env.agents)
     settings.pop("scenario", None)
     config = RunConfig(
         network=env.network.name,
         scenario=env.network.scenario_name,
         agents=env.agents,
-        recipe=resolved,
+        recipe=full_recipe,
         seed=_whole("seed", seed, 0),
         steps=steps,
         envs=copies,
@@ -177,7 +176,9 @@ def prepare(
         raise CirlError(f"checkpoint_every must be seconds of at least 0, got {checkpoint_every!r}")
     training = Training(config, env, checkpoint_every=checkpoint_every)
     if not any(learner.spec.share_of_steps for learner in training.learners.values()):
-        raise RecipeError(f"recipe '{resolved.name}': nobody learns: share_of_steps is 0 for all of {list(env.agents)}")
+        raise RecipeError(
+            f"recipe '{full_recipe.name}': nobody learns: share_of_steps is 0 for all of {list(env.agents)}"
+        )
     return training
 
 
@@ -267,8 +268,8 @@ def _create(directory: Path, config: RunConfig, network: Network) -> RunDirector
         read = load_network(network.address, scenario=network.scenario_name).with_options(**changes)
         if read == network:
             data = {**load_network(network.address).data_sha256, **read.data_sha256}  # it is read by its default
-            resolved = config.model_copy(update={"region": read.region, "data_sha256": data})
-            return RunDirectory.create(directory, resolved, source)
+            config = config.model_copy(update={"region": read.region, "data_sha256": data})
+            return RunDirectory.create(directory, config, source)
     with tempfile.TemporaryDirectory() as folder:
         definition = Path(folder) / "network.toml"
         write_network(network, definition)

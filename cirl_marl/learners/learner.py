@@ -6,6 +6,7 @@ import math
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from sb3_contrib import ARS, MaskablePPO
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -43,6 +45,14 @@ from cirl_marl.learners.recipe import Group, LearnerSettings
 
 ACTING_PARAMETERS = ("policy_kwargs", "use_sde", "ent_coef", "gamma")
 """Parameters that shape the policy; the others matter to training only."""
+
+
+TENSORBOARD_ADVICE = "pip install 'cirl-marl[tensorboard]'"
+
+
+def has_tensorboard() -> bool:
+    """Return whether learning curves can be written: TensorBoard is an extra."""
+    return find_spec("tensorboard") is not None
 
 
 def derived_seed(seed: int, *names: str | int) -> int:
@@ -220,6 +230,10 @@ class Learner:
         joint = 0 if settings is None else math.ceil(settings.steps / self.agent_env.copies)
         steps = joint * steps_counted(self.model, self.agent_env.num_envs)
         return steps if steps > self.model.num_timesteps else 0
+
+    def log_to_tensorboard(self, folder: Path) -> None:
+        """Write learning curves to a folder."""
+        self.model.set_logger(configure(str(folder), ["tensorboard"]))
 
     def learn(self, steps: int, callback: BaseCallback | None) -> None:
         """Run the algorithm's own ``learn()`` up to its share of ``steps``, counting what it had learnt before.

@@ -137,7 +137,7 @@ class BudgetSpent(GreenletExit):  # type: ignore[misc]
     """Raised in a learner that would go on beyond its joint steps."""
 
 
-class StopTraining(Exception):
+class TrainingStop(Exception):
     """Raised to end training early; what was learnt is kept."""
 
 
@@ -299,11 +299,11 @@ class Lockstep:
 
         Args:
             hooks: of each world, called within each joint step, in the caller's random streams.
-            after: called after each joint step of all worlds; it ends the run by ``StopTraining``.
+            after: called after each joint step of all worlds; it ends the run by ``TrainingStop``.
 
         Raises:
             LearnerError: if a learner raises; names it and the joint step.
-            StopTraining: if it was enough.
+            TrainingStop: if it was enough.
         """
         self._learners = set(range(len(self._participants)))
         try:

@@ -25,10 +25,9 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any
@@ -42,7 +41,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError, unknown
 from cirl_marl.learners.recipe import OPTIONS, Group, Recipe, Settings
 from cirl_marl.network import Network
-from cirl_marl.records.files import sync, write_atomically, write_json
+from cirl_marl.records.files import refuse_links, sync, write_atomically, write_json
 from cirl_marl.records.machine import versions
 
 STATES = ("running", "complete", "interrupted", "failed")
@@ -145,7 +144,7 @@ class RunDirectory:
         """Return whether the directory is what a crash left when it was made: parts of a run, no description."""
         if self.path.is_symlink() or not self.path.is_dir():
             return False
-        names = {each.name for each in self.path.iterdir()}
+        names = {entry.name for entry in self.path.iterdir()}
         return "versions.json" in names and names <= FILES_BEFORE_CONFIG
 
     @contextmanager
@@ -164,8 +163,7 @@ class RunDirectory:
     @property
     def config(self) -> RunConfig:
         """The resolved configuration; a ``RunError`` if there is none, or a link that could lead out of the run."""
-        for link in _links(self.path):
-            raise RunError(f"{link}: is a link; nothing outside of a run is read or written, so put a copy there")
+        refuse_links(self.path)
         plain = self._json("config.json")
         try:
             return RunConfig.model_validate(plain)
@@ -213,9 +211,15 @@ class RunDirectory:
 
     def stop(self, state: str, reason: str) -> None:
         """Say that the run ended early, with what was saved last."""
-        shutil.rmtree(self.path / "checkpoints" / PARTIAL, ignore_errors=True)
-        status = self.status
-        self.set_status(state, status["joint_steps"], status["checkpoint"], status["best"], reason)
+        shutil.rmtree(self._folder / PARTIAL, ignore_errors=True)
+        self._update_status(state=state, reason=reason)
+
+    def _update_status(self, **changes: Any) -> None:
+        write_json(self.path / "status.json", {**self.status, **changes})
+
+    @property
+    def _folder(self) -> Path:
+        return self.path / "checkpoints"
 
     @property
     def checkpoint(self) -> Path:
@@ -236,19 +240,18 @@ class RunDirectory:
         if newest is None:
             return []
         _check_name(newest, self.path)
-        older = [each for each in self._checkpoints() if each.name < newest and not _acts_only(each)]
-        return [self.path / "checkpoints" / newest, *reversed(older)]
+        older = [path for path in self._checkpoints() if path.name < newest and not _acts_only(path)]
+        return [self._folder / newest, *reversed(older)]
 
     def _checkpoints(self) -> list[Path]:
         """Return the folders of checkpoints in the order of their steps; strangers among them are left alone."""
-        folder = self.path / "checkpoints"
-        return sorted(each for each in folder.glob("*") if CHECKPOINT.fullmatch(each.name) and each.is_dir())
+        return sorted(path for path in self._folder.glob("*") if CHECKPOINT.fullmatch(path.name) and path.is_dir())
 
     def _checkpoint(self, name: str | None) -> Path:
         if name is None:
             raise RunError(f"{self.path}: nothing was saved in this run yet (state: {self.status['state']})")
         _check_name(name, self.path)
-        folder: Path = self.path / "checkpoints" / name
+        folder: Path = self._folder / name
         absentees = [group.name for group in self.groups() if not (folder / f"{group.name}.json").is_file()]
         if absentees:
             raise RunError(f"{folder}: the checkpoint lacks the policies of {', '.join(absentees)}")
@@ -289,33 +292,30 @@ class RunDirectory:
         options = config.options if uncertain is None else {**config.options, "uncertain": uncertain}
         return MultiAgentVectorEnv(self.network(), num_envs=num_envs, agents=config.agents, **options)
 
-    def begin_checkpoint(self) -> Path:
+    def begin_checkpoint(self, name: str = PARTIAL) -> Path:
         """Return an empty folder for a checkpoint, which counts when ``end_checkpoint`` is called."""
-        partial = self.path / "checkpoints" / PARTIAL
+        partial = self._folder / name
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         return partial
 
-    def end_checkpoint(self, partial: Path, joint_steps: int, state: str, reason: str = "") -> None:
+    def end_checkpoint(self, partial: Path, joint_steps: int, state: str) -> None:
         """Let the checkpoint in the folder ``partial`` be the newest, and drop those that nobody needs any more."""
         name = f"{joint_steps:09d}-{state}"
         self._publish(partial, name)
-        self.set_status("running" if state == "start" else state, joint_steps, name, self.status["best"], reason)
+        state = "running" if state == "start" else state
+        self._update_status(state=state, joint_steps=joint_steps, checkpoint=name, reason="")
         self._drop()
 
     def save_best(self, joint_steps: int, write: Callable[[Path], None], figures: dict[str, float]) -> None:
         """Let ``write`` fill the checkpoint that acts from now on, and note the ``figures`` that it was chosen by."""
         name = self.save_policies(f"{joint_steps:09d}-best", write)
-        status = self.status
-        best = {"checkpoint": name, "joint_steps": joint_steps, "figures": figures}
-        self.set_status(status["state"], status["joint_steps"], status["checkpoint"], best, status.get("reason", ""))
+        self._update_status(best={"checkpoint": name, "joint_steps": joint_steps, "figures": figures})
         self._drop()
 
     def save_policies(self, name: str, write: Callable[[Path], None]) -> str:
         """Let ``write`` fill a checkpoint that acts, and from which no training goes on."""
-        partial = self.path / "checkpoints" / f"{name}.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+        partial = self.begin_checkpoint(f"{name}.partial")
         write(partial)
         self._publish(partial, name)
         return name
@@ -332,19 +332,15 @@ class RunDirectory:
     def _drop(self) -> None:
         """Remove all checkpoints but the newest few, and the best ones to which they would go back."""
         status = self.status
-        newest, checkpoints = status["checkpoint"], self._checkpoints()
-        resumable = [
-            each for each in checkpoints if newest is not None and each.name <= newest and not _acts_only(each)
-        ]
+        newest, checkpoints = status["checkpoint"] or "", self._checkpoints()
+        resumable = [path for path in checkpoints if path.name <= newest and not _acts_only(path)]
         resumable = resumable[-1 if status["state"] == "complete" else -CHECKPOINTS_TO_KEEP :]
-        needed = {each.name for each in resumable} | {newest, (status["best"] or {}).get("checkpoint")}
-        needed |= {(_best_at(each) or {}).get("checkpoint") for each in resumable}
-        for each in checkpoints:
-            if each.name not in needed:
-                shutil.rmtree(each)
-        for each in (self.path / "checkpoints").glob("*.partial"):
-            if CHECKPOINT.fullmatch(each.stem):  # a crash left it
-                shutil.rmtree(each)
+        to_keep = {path.name for path in resumable} | {newest, (status["best"] or {}).get("checkpoint")}
+        to_keep |= {(_best_at(path) or {}).get("checkpoint") for path in resumable}
+        after_crash = (path for path in self._folder.glob("*.partial") if CHECKPOINT.fullmatch(path.stem))
+        for path in (*checkpoints, *after_crash):
+            if path.name not in to_keep:
+                shutil.rmtree(path)
 
     def metrics(self) -> dict[str, list[float]]:
         """Return the columns of ``metrics.csv``."""
@@ -414,12 +410,6 @@ def _check_name(name: str, run: Path) -> None:
         raise RunError(f"{run / 'status.json'}: {name!r} is no name of a checkpoint, such as 000000100-running")
 
 
-def _links(folder: Path) -> Iterator[Path]:
-    """Yield what is a link in a folder or below, which is never followed."""
-    for folder_path, folders, files in os.walk(folder):
-        yield from (Path(folder_path) / name for name in (*folders, *files) if (Path(folder_path) / name).is_symlink())
-
-
 def _acts_only(checkpoint: Path) -> bool:
     return checkpoint.name.endswith(("-best", "-failed"))
 
@@ -432,49 +422,25 @@ def _is_best(best: object) -> bool:
     return fits and isinstance(best["checkpoint"], str) and isinstance(best["figures"], dict)  # type: ignore[index]
 
 
-class MetricsFile:
-    """Appends a row per joint episode to ``metrics.csv``; ``seconds`` is the training time of rows that were there."""
+class TableFile:
+    """A CSV file to which a training appends rows, the first column the joint step.
 
-    def __init__(self, path: Path, agents: Sequence[str], done: int) -> None:
+    Attributes:
+        last: the last row that was there at the beginning, by column; empty if there was none.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], done: int) -> None:
         """Open the file; rows past joint step ``done``, which a resumed run will repeat, are dropped."""
-        columns = ["joint_step", "env_steps", "seconds", "circularity", "service_level"]
-        rows = [columns + [f"return:{agent}" for agent in agents]]
-        self.seconds = 0.0
-        if path.is_file():
-            try:
-                rows += [row for row in _complete_rows(path)[1:] if float(row[0]) <= done]
-                self.seconds = float(rows[-1][2]) if len(rows) > 1 else 0.0
-            except (ValueError, IndexError) as error:
-                raise RunError(f"{path}: cannot be read: {error}") from error
-        text = "".join(",".join(row) + "\n" for row in rows)
+        try:
+            rows = [row for row in _complete_rows(path)[1:] if float(row[0]) <= done] if path.is_file() else []
+            self.last = dict(zip(columns, map(float, rows[-1]), strict=True)) if rows else {}
+        except (ValueError, IndexError) as error:
+            raise RunError(f"{path}: cannot be read: {error}") from error
+        text = "".join(",".join(row) + "\n" for row in (columns, *rows))
         write_atomically(path, lambda temporary: temporary.write_text(text))
         self._path = path
 
-    def append(self, row: Sequence[float]) -> None:
+    def append(self, row: Iterable[float]) -> None:
         """Write a row."""
         with self._path.open("a", newline="") as file:
             file.write(",".join(f"{value:.10g}" for value in row) + "\n")
-
-
-class EvaluationsFile:
-    """Appends a row per evaluation to ``evaluations.csv``."""
-
-    COLUMNS = ("joint_step", "env_steps", "circularity", "service", "assured", "paid", "circularity_weight", "best")
-
-    def __init__(self, path: Path, done: int) -> None:
-        """Open the file; rows past joint step ``done``, which a resumed run will repeat, are dropped."""
-        rows = [list(self.COLUMNS)]
-        if path.is_file():
-            try:
-                rows += [row for row in _complete_rows(path)[1:] if float(row[0]) <= done]
-            except (ValueError, IndexError) as error:
-                raise RunError(f"{path}: cannot be read: {error}") from error
-        text = "".join(",".join(row) + "\n" for row in rows)
-        write_atomically(path, lambda temporary: temporary.write_text(text))
-        self._path = path
-
-    def append(self, joint_step: int, copies: int, figures: dict[str, float], best: bool) -> None:
-        """Write a row."""
-        cells = [joint_step, joint_step * copies, *(f"{figures[name]:.10g}" for name in self.COLUMNS[2:-1]), int(best)]
-        with self._path.open("a", newline="") as file:
-            file.write(",".join(map(str, cells)) + "\n")

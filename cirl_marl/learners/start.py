@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, unknown
@@ -47,17 +46,15 @@ def begin_from(start: Start, learner: Learner, env: MultiAgentVectorEnv, seed: i
 
 
 def _begin_from(run: RunDirectory, name: str, learner: Learner, env: MultiAgentVectorEnv) -> Origin:
-    groups = {group.name: group for group in run.groups()}
+    groups = {part.name: part for part in run.groups()}
     if name not in groups:
         raise RecipeError(f"{run.path}: {unknown('agent', name, groups)}")
-    there, source, folder = groups[name], run.make_env(1), run.acting_checkpoint
-    _refuse(f"{run.path}: '{name}'", [*_other_settings(there.spec, learner.spec)])
-    entries = [_entries(*pair, learner.spec) for pair in ((source, there.agents), (env, learner.agent_env.view.agents))]
-    _refuse(
-        f"{run.path}: '{name}'",
-        [*_other_entries(*entries), *_other_actions(there.view(source), learner.agent_env.view)],
-    )
-    source_learner = load_acting_learner(folder, there, source)
+    group, source, folder = groups[name], run.make_env(1), run.acting_checkpoint
+    view = learner.agent_env.view
+    _refuse(f"{run.path}: '{name}'", [*_other_settings(group.spec, learner.spec)])
+    entries = (_entries(source, group.agents, learner.spec), _entries(env, view.agents, learner.spec))
+    _refuse(f"{run.path}: '{name}'", [*_other_entries(*entries), *_other_actions(group.view(source), view)])
+    source_learner = load_acting_learner(folder, group, source)
     _refuse(f"{folder / name}.json:", [*_other_shapes(source_learner.model, learner.model)])
     _take_over(source_learner, learner)
     files = [folder / f"{name}.{kind}" for kind in ("json", "safetensors")]
@@ -79,14 +76,14 @@ def _refuse(subject: str, mistakes: Sequence[str]) -> None:
 
 def _take_over(source: Learner, learner: Learner) -> None:
     """Copy the policy, a learnt entropy coefficient and the statistics of observations."""
-    mine, source_model = learner.model, source.model
-    mine.policy.load_state_dict(source_model.policy.state_dict())
-    keep_parameters(mine)
-    source_variables = variables(source_model)
-    set_variables(mine, {name: source_variables.get(name, variable) for name, variable in variables(mine).items()})
-    if isinstance(source.env, VecNormalize) and isinstance(learner.env, VecNormalize) and learner.env.norm_obs:
-        learner.env.obs_rms = copy.deepcopy(source.env.obs_rms)
-        freeze_statistics(learner.env)
+    model = learner.model
+    model.policy.load_state_dict(source.model.policy.state_dict())
+    keep_parameters(model)
+    set_variables(model, variables(model) | variables(source.model))
+    normaliser = learner.normaliser
+    if source.normaliser is not None and normaliser is not None and normaliser.norm_obs:
+        normaliser.obs_rms = copy.deepcopy(source.normaliser.obs_rms)
+        freeze_statistics(normaliser)
 
 
 def _other_settings(source: LearnerSettings, target: LearnerSettings) -> Iterator[str]:

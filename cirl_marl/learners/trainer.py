@@ -17,17 +17,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
 
 from cirl_marl.environments.rewards import CIRCULARITY_REWARDS
 from cirl_marl.environments.vector import Infos, MultiAgentVectorEnv
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
-from cirl_marl.learners.learner import Learner, derived_seed
-from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, StopTraining, Streams, wait
+from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, TrainingStop, Streams, wait
 from cirl_marl.learners.policies import Policies
-from cirl_marl.learners.run_directory import EvaluationsFile, MetricsFile, RunConfig, RunDirectory, steps_of
+from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
 from cirl_marl.learners.stacked.conditions import first_obstacle, obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.start import begin_again, begin_from
@@ -39,6 +38,12 @@ CHECKPOINT_EVERY = 60.0
 """Seconds after which there is one more; a crash loses at most what came after the last."""
 STOPS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 """Signals at which a training is saved and stopped; some systems lack the last."""
+EPISODE_COLUMNS = ("joint_step", "env_steps", "seconds", "circularity", "service_level")
+"""Columns of ``metrics.csv``, before the returns."""
+EVALUATION_COLUMNS = (
+    "joint_step", "env_steps", "circularity", "service", "assured", "paid", "circularity_weight", "best",
+)  # fmt: skip
+"""Columns of ``evaluations.csv``."""
 COST = 0.02
 """Part of the time that checkpoints may take; they come less often if the last one took more."""
 
@@ -83,8 +88,8 @@ class Training:
         self.config = config
         self.env = env
         self.run: RunDirectory | None = None
-        self._metrics: MetricsFile | None = None
-        self._evaluations: EvaluationsFile | None = None
+        self._metrics: TableFile | None = None
+        self._evaluations: TableFile | None = None
         self._best: Score | None = None
         self._bring_up_to_date: Callable[[], None] = lambda: None
         self._saved_state = None
@@ -159,14 +164,16 @@ class Training:
     def keep_in(self, run: RunDirectory) -> None:
         """Keep metrics, logs, checkpoints and the best of them in ``run`` from now on."""
         self.run, self.config = run, run.config
-        self._metrics = MetricsFile(run.path / "metrics.csv", self.env.agents, self.done)
+        columns = (*EPISODE_COLUMNS, *(f"return:{agent}" for agent in self.env.agents))
+        self._metrics = TableFile(run.path / "metrics.csv", columns, self.done)
         self._saved_at = time.monotonic()
         for name, learner in self.learners.items():
             learner.barrier.write_with(partial(self._write_learner, learner))
-            learner.model.set_logger(configure(str(run.path / "tensorboard" / name), ["tensorboard"]))
+            if has_tensorboard():
+                learner.log_to_tensorboard(run.path / "tensorboard" / name)
         best = run.status["best"]
         self._best = Score.from_figures(best["figures"]) if best is not None else None
-        self._evaluations = EvaluationsFile(run.path / "evaluations.csv", self.done)
+        self._evaluations = TableFile(run.path / "evaluations.csv", EVALUATION_COLUMNS, self.done)
         if self.config.origins and self.joint_steps == 0:  # the run shall not need those from which it started
             folder = run.begin_checkpoint()
             self._write_policies(folder)
@@ -176,10 +183,10 @@ class Training:
         """Give learners that have demonstrations to come a controller to follow, learners of the same one together."""
         demonstrators: dict[str, Demonstrator] = {}
         for learner in self.learners.values():
-            asked = learner.spec.demonstrations
-            if asked is not None and learner.demonstrations:
-                seed = derived_seed(self.config.seed, "demonstrations", asked.controller, self.done)
-                leader = demonstrators.setdefault(asked.controller, Demonstrator(asked.controller, self.env, seed))
+            if learner.spec.demonstrations is not None and learner.demonstrations:
+                name = learner.spec.demonstrations.controller
+                seed = derived_seed(self.config.seed, "demonstrations", name, self.done)
+                leader = demonstrators.setdefault(name, Demonstrator(name, self.env, seed))
                 leader.check(learner.agent_env.view.agents, learner.agent_env.title)
                 learner.demonstrator = leader
 
@@ -230,14 +237,14 @@ class Training:
                 report(Progress((steps - self.done) * copies, total, seconds, circularity, service, has_ended))
             if has_ended and self._metrics is not None:
                 returns = [float(info["episode_return"][dones].mean()) for info in infos.values()]
-                total_seconds = self._metrics.seconds + seconds
+                total_seconds = seconds + self._metrics.last.get("seconds", 0.0)
                 self._metrics.append([steps, steps * copies, total_seconds, circularity, service, *returns])
-        planned = self.config.steps // copies
+        total_steps = self.config.steps // copies
         if self._evaluation is not None:
-            apart = max(self.env.network.episode.horizon, planned // self.config.recipe.run.evaluations)
-            if steps % apart == 0:
+            interval = max(self.env.network.episode.horizon, total_steps // self.config.recipe.run.evaluations)
+            if steps % interval == 0:
                 self._evaluate(self._evaluation)
-        if steps % max(1, planned // CHECKPOINTS) == 0:
+        if steps % max(1, total_steps // CHECKPOINTS) == 0:
             self._due = True
 
     def finish(self) -> None:
@@ -280,7 +287,7 @@ class Training:
             for learner in self.learners.values():
                 learner.barrier.folder = self._checkpoint_folder
 
-    def keep(self, state: str = "running", reason: str = "") -> None:
+    def keep(self, state: str) -> None:
         """Write the checkpoint for which every learner has written its state."""
         if self.run is None or self._checkpoint_folder is None:
             return
@@ -293,17 +300,17 @@ class Training:
             "training",
             {"begun": self.first_step, "world": self.world.state_dict(), "best": self._kept_best},
         )
-        self._end_checkpoint(self._checkpoint_folder, state, reason)
+        self._end_checkpoint(self._checkpoint_folder, state)
         self._checkpoint_folder, self._due, self._saved_at = None, False, time.monotonic()
         self._checkpoint_seconds += time.perf_counter() - began
         if self._checkpoint_interval is not None:
             self._checkpoint_interval = max(self._shortest_interval, self._checkpoint_seconds / COST)
 
-    def _end_checkpoint(self, folder: Path, state: str, reason: str = "") -> None:
+    def _end_checkpoint(self, folder: Path, state: str) -> None:
         assert self.run is not None
         if self._multiplier is not None:
             self._multiplier.save(folder)
-        self.run.end_checkpoint(folder, self.joint_steps, state, reason)
+        self.run.end_checkpoint(folder, self.joint_steps, state)
 
     def _write_learner(self, learner: Learner, folder: Path, more: dict[str, Any]) -> None:
         """Write the state of a learner, and note how long it took."""
@@ -323,8 +330,8 @@ class Training:
             if self.run is not None:
                 self.run.save_best(self.joint_steps, self._write_policies, score.figures())
         if self._evaluations is not None:
-            figures = score.figures() | {"circularity_weight": self.env.circularity_weight}
-            self._evaluations.append(self.joint_steps, self.config.envs, figures, better)
+            steps = (self.joint_steps, self.joint_steps * self.config.envs)
+            self._evaluations.append([*steps, *score.figures().values(), self.env.circularity_weight, better])
         if self._multiplier is not None and self.joint_steps * self.config.envs >= MULTIPLIER_FROM * self.config.steps:
             self._multiplier.update(score.service_bound)
 
@@ -374,16 +381,18 @@ def run_together(
         RecipeError: if the engine cannot stack a learner that it should.
     """
     callbacks = callbacks or {}
-    stacks_of_learners = stacks([each for training in trainings for each in training.stackable(callbacks)], device)
+    members = [learner for training in trainings for learner in training.stackable(callbacks)]
+    stacks_of_learners = stacks(members, device)
+    member_ids = {id(learner) for learner in members}
     began = time.perf_counter()
 
     def bring_up_to_date() -> None:
         for stack in stacks_of_learners:
             stack.give()
 
-    names = {id(each): each.name for stack in stacks_of_learners for each in stack.members}
     for training in trainings:
-        training.runs_stacked(bring_up_to_date, {each.name for each in training.learners.values() if id(each) in names})
+        names = {name for name, learner in training.learners.items() if id(learner) in member_ids}
+        training.runs_stacked(bring_up_to_date, names)
     reports: list[TrainingReport | None] = [report] + [None] * (len(trainings) - 1)
     try:
         with one_torch_thread(), _interruption() as stop_requested:
@@ -394,7 +403,7 @@ def run_together(
             lockstep.run(hooks, partial(_keep, trainings, lockstep, stop_requested))
             for training in trainings:
                 training.finish()
-    except StopTraining:
+    except TrainingStop:
         for training in trainings:
             training.stop("interrupted", "stopped by the user")
         raise KeyboardInterrupt from None
@@ -412,11 +421,11 @@ def _keep(trainings: Sequence[Training], lockstep: Lockstep, stop_requested: Cal
     """Ask for checkpoints when it is time, or when somebody wants to stop, and write those that are complete.
 
     Raises:
-        StopTraining: when everything is written, or if somebody who is shown what to do cannot be saved.
+        TrainingStop: when everything is written, or if somebody who is shown what to do cannot be saved.
     """
     stops = stop_requested()
     if stops and (lockstep.busy or all(training.run is None for training in trainings)):
-        raise StopTraining
+        raise TrainingStop
     if stops or (any(training.due for training in trainings) and not lockstep.busy):
         for training in trainings:
             training.ask()
@@ -424,7 +433,7 @@ def _keep(trainings: Sequence[Training], lockstep: Lockstep, stop_requested: Cal
         for training in trainings:
             training.keep("interrupted" if stops else "running")
         if stops:
-            raise StopTraining
+            raise TrainingStop
 
 
 def _participants(

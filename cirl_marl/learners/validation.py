@@ -65,7 +65,7 @@ class Score:
     @classmethod
     def from_figures(cls, figures: Mapping[str, float] | None) -> Score | None:
         """Return the score of figures that were written to a file; None if there is none."""
-        names = {written: name for name, written in cls.NAMES_IN_FILES.items()}
+        names = {key: name for name, key in cls.NAMES_IN_FILES.items()}
         return None if figures is None else cls(**{names.get(key, key): value for key, value in figures.items()})
 
 

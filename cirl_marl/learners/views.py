@@ -25,6 +25,18 @@ CENTRAL_CRITIC = "CentralCriticPolicy"
 """Name of the policy whose critic sees the whole state."""
 
 
+def by_part(function: Callable[[Any], Any], observation: Any) -> Any:
+    """Apply a function to an observation, or to every part of one that is a dict."""
+    if isinstance(observation, dict):
+        return {key: function(part) for key, part in observation.items()}
+    return function(observation)
+
+
+def rows_of(observation: Any, rows: Any) -> Any:
+    """Return some rows of an observation."""
+    return by_part(lambda part: part[rows], observation)
+
+
 class HasSpaces(Protocol):
     """Whatever has a space for the observation and one for the action of each agent."""
 

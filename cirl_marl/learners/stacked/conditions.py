@@ -78,15 +78,14 @@ def _on_policy_obstacle(model: PPO | A2C, policy_name: str) -> str | None:
         return f"parameters.policy_kwargs: actions are drawn from a {type(policy.action_dist).__name__}"
     if type(policy.optimizer) not in OPTIMISERS:
         return f"parameters.policy_kwargs: optimiser {type(policy.optimizer).__name__} is not element by element"
+    networks = (policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net)
     try:
-        kinds = {
-            linear_layers(network)[1] for network in (policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net)
-        }
+        kinds = {linear_layers(network)[1] for network in networks}
     except TypeError as error:
         return f"parameters.policy_kwargs: {error}"
     if len(kinds - {None}) > 1 or not kinds <= {None, *ACTIVATIONS}:
-        supported = " or ".join(network.__name__ for network in ACTIVATIONS)
-        return f"parameters.policy_kwargs: hidden layers are not linear with {supported} between them"
+        names = " or ".join(activation.__name__ for activation in ACTIVATIONS)
+        return f"parameters.policy_kwargs: hidden layers are not linear with {names} between them"
     return None
 
 

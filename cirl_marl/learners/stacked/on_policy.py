@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from stable_baselines3 import A2C, PPO
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import update_learning_rate
 from torch import Tensor
 
@@ -262,11 +261,11 @@ class RolloutStack(Stack):
         first = self._models[0]
         self._rows, self._steps = members[0].agent_env.num_envs, first.n_steps
         self._timesteps, self._updates = first.num_timesteps, first._n_updates
-        policies = [_policy(model) for model in self._models]
+        policies = [model.policy for model in self._models]
         self._weights = Weights(policies, self._inputs.actor_columns, self._inputs.critic_columns, self._device)
         self._acts = torch.zeros(len(members), 1, self._weights.log_std.shape[1], device=self._device)
-        for own, space in zip(self._acts, self._inputs.spaces, strict=True):
-            own[:, : space.shape[0]] = 1.0
+        for mask, space in zip(self._acts, self._inputs.spaces, strict=True):
+            mask[:, : space.shape[0]] = 1.0
         # Minibatches come from each learner's NumPy stream itself.
         self._shuffles = [np.random.RandomState(learner.streams.bit_generator) for learner in members]
         shape = (len(members), self._rows, self._steps)
@@ -341,10 +340,10 @@ class RolloutStack(Stack):
         """Return the critics' values, (learners, …), of what is seen, (learners, …, entries), a piece at a time."""
         critic, flat = self._weights.critic, observations.reshape(len(self.members), -1, self._inputs.entries)
         values = torch.empty(flat.shape[:2], device=self._device)
-        for some in pieces(len(self.members), min(AT_ONCE, flat.shape[1]) * critic.width, self._device):
+        for learners in pieces(len(self.members), min(AT_ONCE, flat.shape[1]) * critic.width, self._device):
             for first in range(0, flat.shape[1], AT_ONCE):
                 part = slice(first, first + AT_ONCE)
-                values[some, part] = critic.forward(flat[some, part], some)[-1][..., 0]
+                values[learners, part] = critic.forward(flat[learners, part], learners)[-1][..., 0]
         return values.view(observations.shape[:-1])
 
     def _log(self, update: Update) -> None:
@@ -362,7 +361,3 @@ class RolloutStack(Stack):
 def _stackable(learner: Learner) -> PPO | A2C:
     assert isinstance(learner.model, PPO | A2C)
     return learner.model
-
-
-def _policy(model: PPO | A2C) -> ActorCriticPolicy:
-    return model.policy

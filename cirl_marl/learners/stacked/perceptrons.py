@@ -212,17 +212,9 @@ class Weights:
         """
         self._policies, self._layout = policies, (layout := ParameterLayout(len(policies)))
         log_std = layout.field([p.log_std for p in policies], [np.arange(len(p.log_std)) for p in policies])
-        extractors = [policy.mlp_extractor for policy in policies]
-        heads = [(policy.action_net, policy.value_net) for policy in policies]
-        linear = [
-            (linear_layers(extractor.policy_net)[0], linear_layers(extractor.value_net)[0]) for extractor in extractors
-        ]
-        actor = layout.layers(
-            [[*hidden, head] for (hidden, _), (head, _) in zip(linear, heads, strict=True)], actor_columns
-        )
-        critic = layout.layers(
-            [[*hidden, head] for (_, hidden), (_, head) in zip(linear, heads, strict=True)], critic_columns
-        )
+        actors = [[*linear_layers(p.mlp_extractor.policy_net)[0], p.action_net] for p in policies]
+        critics = [[*linear_layers(p.mlp_extractor.value_net)[0], p.value_net] for p in policies]
+        actor, critic = layout.layers(actors, actor_columns), layout.layers(critics, critic_columns)
         self.matrix = nn.Parameter(torch.zeros(len(policies), layout.columns, device=device), requires_grad=False)
         self.gradient = torch.zeros_like(self.matrix)
         self.matrix.grad = self.gradient
@@ -231,7 +223,7 @@ class Weights:
         rate = first.optimizer.param_groups[0]["lr"]
         self.optimiser: torch.optim.Optimizer = kind([self.matrix], lr=rate, **first.optimizer_kwargs)
         self.log_std, self.log_std_gradient = log_std.of(self.matrix), log_std.of(self.gradient)
-        activation = ACTIVATIONS[linear_layers(extractors[0].policy_net)[1] or nn.Tanh]
+        activation = ACTIVATIONS[linear_layers(policies[0].mlp_extractor.policy_net)[1] or nn.Tanh]
         self.actor, self.critic = (
             Perceptrons(layers_of(fields, self.matrix), activation, layers_of(fields, self.gradient))
             for fields in (actor, critic)

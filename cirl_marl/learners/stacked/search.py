@@ -91,9 +91,9 @@ class SearchStack(Stack):
 
     def _give_models(self) -> None:
         for i, model in enumerate(self._models):
-            found = self._centre[i, self._columns[i]].cpu()
-            model.policy.load_from_vector(found.numpy())
-            model.weights = found  # type: ignore[assignment]
+            vector = self._centre[i, self._columns[i]].cpu()
+            model.policy.load_from_vector(vector.numpy())
+            model.weights = vector  # type: ignore[assignment]
             model.num_timesteps, model._n_updates = self._steps * self._rows**2, self._updates
 
     def _draw_directions(self) -> Tensor:
@@ -180,13 +180,13 @@ def copies_per_candidate(learner: Learner) -> int:
     """
     model, agent_env = _ars_model(learner), learner.agent_env
     agents = agent_env.num_envs // agent_env.copies
-    each, remainder = divmod(model.n_eval_episodes, agents)
-    if remainder or not each or agent_env.copies % each or model.pop_size % (agent_env.copies // each):
+    count, remainder = divmod(model.n_eval_episodes, agents)
+    if remainder or not count or agent_env.copies % count or model.pop_size % (agent_env.copies // count):
         raise ValueError(
             f"{model.pop_size} candidates (2 n_delta) of {model.n_eval_episodes} episodes each (n_eval_episodes) "
             f"do not fill {agent_env.copies} copies with {agents} rows evenly"
         )
-    return each
+    return count
 
 
 def _ars_model(learner: Learner) -> ARS:

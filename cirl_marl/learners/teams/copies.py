@@ -12,6 +12,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel
 
 from cirl_marl.errors import CirlError, LearnerError, unknown
+from cirl_marl.learners.views import by_part
 from cirl_marl.network import Floats
 
 MakeEnv = Callable[[], Any]
@@ -47,7 +48,7 @@ class Copies:
         action_spaces: of each agent.
         present: the copies in which each agent acts next, shape (B,).
         masks: of each agent that has such, which actions are legal, shape (B, actions).
-        begun: the copies whose episode has just begun, shape (B,).
+        new_episode: the copies whose episode has just begun, shape (B,).
     """
 
     def __init__(self, make_env: MakeEnv, num_envs: int) -> None:
@@ -96,7 +97,7 @@ class Copies:
         copy_infos: dict[str, list[dict[str, Any]]] = {name: [{} for _ in self.envs] for name in self.agents}
         before = self.present
         self._renew()
-        last = {name: _copy(rows) for name, rows in self._observations.items()}
+        last = {name: by_part(np.copy, rows) for name, rows in self._observations.items()}
         for i, env in enumerate(self.envs):
             actors = [name for name in self.agents if before[name][i]]
             observations, copy_rewards, terminations, truncations, infos = env.step(
@@ -117,7 +118,8 @@ class Copies:
             if not env.agents:
                 self._begin(i, None)
         joint_infos = {name: {"final_obs": last[name], "copies": copy_infos[name]} for name in self.agents}
-        by_agent = [dict(zip(self.agents, each, strict=True)) for each in (rewards, dones & ~truncated, truncated)]
+        outcomes = (rewards, dones & ~truncated, truncated)
+        by_agent = [dict(zip(self.agents, rows, strict=True)) for rows in outcomes]
         return dict(self._observations), *by_agent, joint_infos
 
     def state(self) -> Floats:
@@ -133,7 +135,7 @@ class Copies:
         """Begin new arrays of what changes in a step: learners may have kept those that there were."""
         self.present = {name: np.zeros(self.num_envs, dtype=bool) for name in self.agents}
         self.new_episode = np.zeros(self.num_envs, dtype=bool)
-        self._observations = {name: _copy(rows) for name, rows in self._observations.items()}
+        self._observations = {name: by_part(np.copy, rows) for name, rows in self._observations.items()}
 
     def _begin(self, i: int, seed: int | None) -> None:
         observations, infos = self.envs[i].reset(seed=seed)
@@ -224,10 +226,6 @@ def _check(agent: str, space: spaces.Space[Any]) -> None:
                 f"agent '{agent}': learners cannot take its observation{label}, which is {part}; wrap the environment "
                 f"so that it gives a Box, Discrete, MultiDiscrete, MultiBinary, or a Dict of these"
             )
-
-
-def _copy(rows: Observations) -> Observations:
-    return {key: part.copy() for key, part in rows.items()} if isinstance(rows, dict) else rows.copy()
 
 
 def _put(rows: Observations, i: int, observation: Any, space: spaces.Space[Any], place: str) -> None:

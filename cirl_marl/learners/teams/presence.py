@@ -24,8 +24,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from cirl_marl.controllers.basic import Arrays
 from cirl_marl.errors import LearnerError
 from cirl_marl.learners.agent_env import AgentVecEnv, JointStep
+from cirl_marl.learners.checkpoint import observation_statistics
 from cirl_marl.learners.teams.copies import AgentInCopy, Copies
-from cirl_marl.learners.views import OneAgent
+from cirl_marl.learners.views import OneAgent, rows_of
 from cirl_marl.network import Floats
 
 WHOLE = (ReplayBuffer, DictReplayBuffer)
@@ -33,16 +34,16 @@ WHOLE = (ReplayBuffer, DictReplayBuffer)
 
 
 class TeamVecEnv(AgentVecEnv):
-    """The seat of one agent of any environment, who may be absent in some copies or in all.
+    """The environment of one agent that may be absent in some copies or in all.
 
     Attributes:
         present: rows in which the agent acts next.
-        counted: rows in which it acted in the step that was handed over last.
+        acted_rows: rows in which it acted in the last step.
         missed_steps: joint steps in which it was not asked.
     """
 
     def __init__(self, copies: Copies, agent: str, wait: Callable[[], object]) -> None:
-        """Seat the learner of ``agent``."""
+        """Show the copies as ``agent``."""
         super().__init__(copies, agent, OneAgent(copies, agent), wait, AgentInCopy)
         self._joint = copies
         self.missed_steps = 0
@@ -55,18 +56,18 @@ class TeamVecEnv(AgentVecEnv):
         return not self.present.any()
 
     def receive_reset(self, observations: Arrays, state: Callable[[], Floats]) -> None:
-        """Show the first observation."""
+        """Take over the first observation."""
         super().receive_reset(observations, state)
         self._meet(self._joint.present[self.name])
 
     def receive_step(self, step: JointStep) -> None:
-        """Hand over what the joint step brought; what came while the agent was away belongs to the step before."""
-        acted, before, away = self.present, self.last_step, self.absent
+        """Take over the outcome of a joint step; what came while the agent was away belongs to the step before."""
+        rows, before, away = self.present, self.last_step, self.absent
         super().receive_step(step)
         if away:
             self.last_step = replace(before, observation=self.last_step.observation)
         else:
-            self.acted_rows = acted
+            self.acted_rows = rows
         self._meet(self._joint.present[self.name])
 
     def at_first_gap(self, leave_out: Callable[[], None]) -> None:
@@ -120,17 +121,9 @@ class _Replay(ReplayBuffer):
         is_present = self.agent_env.acted_rows
         rows = np.arange(self.n_envs)
         present = np.flatnonzero(is_present)
-        rows[~is_present] = np.resize(present, self.n_envs - len(present))
-        row_infos = [infos[row] for row in rows]
-        super().add(_rows_of(obs, rows), _rows_of(next_obs, rows), action[rows], reward[rows], done[rows], row_infos)
-
-
-def _rows_of(observations: Any, rows: NDArray[np.integer]) -> Any:
-    return (
-        {key: part[rows] for key, part in observations.items()}
-        if isinstance(observations, dict)
-        else observations[rows]
-    )
+        rows[~is_present] = np.resize(present, self.n_envs - len(present))  # transitions of others in their place
+        before, after = (rows_of(observation, rows) for observation in (obs, next_obs))
+        super().add(before, after, action[rows], reward[rows], done[rows], [infos[row] for row in rows])
 
 
 class _Moments(RunningMeanStd):
@@ -144,7 +137,7 @@ class _Moments(RunningMeanStd):
 
 
 def leave_out_absent(model: BaseAlgorithm, env: Any, agent_env: TeamVecEnv) -> None:
-    """Let a learner learn only from rows of its ``seat`` in which the agent is present.
+    """Let a learner learn only from rows of its ``agent_env`` in which the agent is present.
 
     Raises:
         LearnerError: for algorithms that learn from whole sequences of rows.
@@ -162,8 +155,8 @@ def leave_out_absent(model: BaseAlgorithm, env: Any, agent_env: TeamVecEnv) -> N
             f"leave those out; use num_envs=1, or another algorithm"
         )
     if isinstance(env, VecNormalize):
-        observation_moments = env.obs_rms.values() if isinstance(env.obs_rms, dict) else [env.obs_rms]
-        for rows, moments in (("counted", env.ret_rms), *(("present", part) for part in observation_moments)):
+        of_observations = (("present", part) for part in observation_statistics(env).values())
+        for rows, moments in (("acted_rows", env.ret_rms), *of_observations):
             _add_base(moments, _Moments, agent_env)
             moments.rows_attribute = rows  # type: ignore[attr-defined]
 

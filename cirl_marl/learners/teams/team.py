@@ -17,14 +17,12 @@ from rich.progress import Progress as Bar
 from sb3_contrib import ARS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecNormalize
 
 from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.algorithms import RESERVED_PARAMETERS, every_algorithm
 from cirl_marl.learners.checkpoint import read_tree, write_tree
-from cirl_marl.learners.learner import Learner, derived_seed, predict_action
+from cirl_marl.learners.learner import TENSORBOARD_ADVICE, Learner, derived_seed, has_tensorboard, predict_action
 from cirl_marl.learners.lockstep import Lockstep, Participant, Streams, World, global_streams_claimed, wait
 from cirl_marl.learners.recipe import LearnerSettings, Normalisation
 from cirl_marl.learners.teams.copies import Copies, MakeEnv
@@ -81,7 +79,7 @@ class Team:
 
     Attributes:
         agents: their names.
-        world: the copies in which they learn, and their seats.
+        world: the copies in which they learn.
         learners: what each agent learns with.
     """
 
@@ -93,9 +91,11 @@ class Team:
         seed: int,
         tensorboard_log: str | Path | None = None,
     ) -> None:
-        """Seat a learner for each of ``settings`` in the copies; ``independent`` reads as one would write it."""
+        """Make a learner for each of ``settings``; ``independent`` is the way to write it."""
         self._make_env, self._settings, self.seed = make_env, dict(settings), seed
         self._copies, self._log = copies, tensorboard_log
+        if tensorboard_log is not None and not has_tensorboard():
+            raise CirlError(f"tensorboard_log={str(tensorboard_log)!r} needs TensorBoard: {TENSORBOARD_ADVICE}")
         self.agents = copies.agents
         agent_envs = {agent: TeamVecEnv(copies, agent, wait) for agent in copies.agents}
         seeds = [derived_seed(seed, "copies", i) for i in range(copies.num_envs)]
@@ -153,7 +153,7 @@ class Team:
         assert isinstance(agent_env, TeamVecEnv)
         missed_before = agent_env.missed_steps
         if self._log is not None:
-            learner.model.set_logger(configure(str(Path(self._log) / agent), ["tensorboard"]))
+            learner.log_to_tensorboard(Path(self._log) / agent)
 
         def budget() -> int:
             return joint if isinstance(learner.model, ARS) or agent_env.missed_steps > missed_before else 2**62
@@ -195,15 +195,11 @@ class Team:
             for agent, learner in self.learners.items():
                 if copies.present[agent].any():
                     rows: Any = observations[agent]
-                    if isinstance(learner.env, VecNormalize):
-                        rows = learner.env.normalize_obs(rows)
+                    if learner.normaliser is not None:
+                        rows = learner.normaliser.normalize_obs(rows)
+                    state = (memory[agent], starts[agent], agent_envs[agent])
                     actions[agent], memory[agent] = predict_action(
-                        learner.model,
-                        rows,
-                        memory[agent],
-                        starts[agent],
-                        agent_envs[agent],
-                        deterministic=deterministic,
+                        learner.model, rows, *state, deterministic=deterministic
                     )
             before = copies.present
             observations, rewards, terminations, truncations, _ = copies.step(actions)
@@ -252,11 +248,11 @@ class Team:
             RunError: if a file is missing, cannot be read, or is of another environment.
         """
         path = Path(folder)
-        saved = read_tree(path, "team")
+        state = read_tree(path, "team")
         try:
-            settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in saved["agents"].items()}
-            copies = Copies(make_env, saved["num_envs"])
-            seed = int(saved["seed"])
+            settings = {agent: LearnerSettings.model_validate(spec) for agent, spec in state["agents"].items()}
+            copies = Copies(make_env, state["num_envs"])
+            seed = int(state["seed"])
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise RunError(f"{path / 'team.json'}: is not what a team wrote: {error}") from error
         if set(settings) != set(copies.agents):
@@ -285,8 +281,8 @@ def _settings(agent: str, algorithm: Algorithm, space: spaces.Space[Any], normal
         raise RecipeError(
             f"agent '{agent}': {name}: give a policy by its name and parameters by theirs, got {policy_names}"
         )
-    if refused := sorted(set(parameters) & set(RESERVED_PARAMETERS)):
-        raise RecipeError(f"agent '{agent}': {name}: {', '.join(refused)}: the team sees to that")
+    if fixed_names := sorted(set(parameters) & set(RESERVED_PARAMETERS)):
+        raise RecipeError(f"agent '{agent}': {name}: {', '.join(fixed_names)}: the team sees to that")
     policy = policy_names[0] if policy_names else _policy_for(space, classes[name])
     normalisation = Normalisation(observation=normalise, reward=normalise)
     return LearnerSettings(algorithm=name, policy=policy, parameters=parameters, normalise=normalisation)
