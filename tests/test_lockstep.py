@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from cirl_marl import LearnerError, MultiAgentVectorEnv
 from cirl_marl.learners.agent_env import AgentVecEnv
-from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, TrainingStop, Streams
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop
 
 HORIZON = 5
 COPIES = 3

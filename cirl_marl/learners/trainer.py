@@ -24,7 +24,7 @@ from cirl_marl.errors import CirlError, RecipeError, RunError, unknown
 from cirl_marl.learners.checkpoint import read_tree, write_tree
 from cirl_marl.learners.demonstrations import Demonstrator
 from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
-from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, TrainingStop, Streams, wait
+from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop, wait
 from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
 from cirl_marl.learners.stacked.conditions import first_obstacle, obstacle, stacks
