@@ -48,6 +48,16 @@ def test_run_directory_holds_what_is_needed(tmp_path: Path, ppo_recipe: Recipe) 
     assert all(list((run.path / "tensorboard" / agent).glob("events*")) for agent in env.agents)
 
 
+def test_without_tensorboard_a_run_has_no_curves(
+    tmp_path: Path, ppo_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is an extra; all else is kept."""
+    monkeypatch.setattr("cirl_marl.learners.learner.find_spec", lambda name: None)
+    train("carbo_net", ppo_recipe, directory=tmp_path / "run", horizon=5)
+    assert not (tmp_path / "run" / "tensorboard").exists()
+    assert RunDirectory(tmp_path / "run").metrics()["env_steps"][-1] == 80
+
+
 def test_network_built_in_python_can_be_kept(tmp_path: Path, ppo_recipe: Recipe) -> None:
     """A run of a network without a file holds a definition that reads back as the same network."""
     network = replace(cirl_marl.load_network("copper_net"), source=None)

@@ -433,6 +433,17 @@ def test_curves_and_callbacks_are_of_each(tmp_path: Path) -> None:
         team.learn(10, callbacks={"erly": Keeps()})
 
 
+def test_without_tensorboard_who_asks_for_curves_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is an extra: what to install is said before anything is learnt."""
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    monkeypatch.setattr("cirl_marl.learners.learner.find_spec", lambda name: None)
+    with pytest.raises(
+        CirlError, match=r"tensorboard_log='.*' needs TensorBoard: pip install 'cirl-marl\[tensorboard\]'"
+    ):
+        cirl_marl.independent(lambda: Shifts(PAIR, 7), partial(PPO, **SMALL), tensorboard_log=tmp_path / "curves")
+    assert not (tmp_path / "curves").exists()
+
+
 class Breaks(Shifts):
     """Tells something else than it promised, after two steps."""
 
