@@ -22,10 +22,10 @@ from cirl_marl import CirlError, MultiAgentVectorEnv, RunError, load_network, si
 from cirl_marl.cli import main
 from cirl_marl.definitions.catalogue import folder
 from cirl_marl.definitions.reader import write_network
+from cirl_marl.evaluation import assessment
 from cirl_marl.learners import Recipe, RunDirectory, resume, train
 from cirl_marl.learners.interface import Trained
 from cirl_marl.network.units import factor
-from cirl_marl.report import run as report_run
 
 pytestmark = pytest.mark.medium
 
@@ -54,7 +54,7 @@ def test_no_source_opens_what_can_run_code() -> None:
         for number, line in enumerate(path.read_text().splitlines(), 1)
         if OPENERS.search(line.split("#")[0]) and '"""' not in line
     ]
-    assert [line for line in said if not line.startswith("exporting.py")] == []
+    assert [line for line in said if not line.startswith("interface.py")] == []
 
 
 def metrics(run: Path) -> object:
@@ -303,7 +303,7 @@ def test_figures_are_shown_where_they_cannot_be_kept(
     def full(path: Path, value: object) -> None:
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(report_run, "write_json", full)
+    monkeypatch.setattr(assessment, "write_json", full)
     monkeypatch.setattr(sys, "argv", ["cirl", "evaluate", str(run), "--episodes", "2"])
     with pytest.raises(SystemExit) as ended:
         main()
