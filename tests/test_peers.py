@@ -16,7 +16,7 @@ from benchmarks.peers import run, work
 from benchmarks.peers.contenders import CONTENDERS
 from benchmarks.peers.gaps import Reference, Standing, reached
 from benchmarks.peers.installing import python_of
-from benchmarks.peers.problem import Acting, Copies, Lone, Scaling, by_agent, environment, padded
+from benchmarks.peers.problem import Acting, Lone, Scaling, by_agent, environment, padded
 from benchmarks.peers.settings import ENVIRONMENT, NETWORK, SERVICE, SETTINGS
 from benchmarks.peers.tables import gap_table, speed_table, verdict
 from benchmarks.peers.watch import Judged, Lap, Record, TimeIsUp, Watch
@@ -61,38 +61,20 @@ def test_peers_get_the_settings_that_our_learners_have() -> None:
         assert sum(isinstance(each, torch.nn.Tanh) for each in network) == len(layers)
 
 
-def test_scaled_copies_are_the_environment(scaling: Scaling) -> None:
-    """What peers see and are paid is ours, scaled; the last observation is that of the episode that ended."""
-    copies, env = Copies(2, 5, scaling), environment(2)
-    seen = env.reset(seed=5)
+def test_one_copy_is_the_first_of_the_batch(scaling: Scaling) -> None:
+    """Libraries that step PettingZoo environments have the same problem, scaled; its end is a termination."""
+    lone, batch = Lone(scaling), environment(1)
+    seen, observations = lone.reset(seed=7)[0], batch.reset(seed=7)
     random = np.random.default_rng(0)
     for step in range(1, SETTINGS.steps + 1):
-        assert np.array_equal(copies.observation, scaling.seen(padded(env, seen)))
-        actions = random.normal(size=(2, len(env.agents), 1))
-        last, paid, over = copies.step(actions)
-        seen, rewards, _, _, infos = env.step(by_agent(env, actions))
-        assert paid == pytest.approx(np.stack([rewards[a] for a in env.agents], axis=1) / scaling.paid, rel=1e-6)
-        assert over == (step == SETTINGS.steps)
-    final = padded(env, {agent: infos[agent]["final_obs"] for agent in env.agents})
-    assert np.array_equal(last, scaling.seen(final))
-    assert not np.array_equal(last, copies.observation)
-
-
-def test_one_copy_is_the_first_of_the_batch(scaling: Scaling) -> None:
-    """Libraries that step PettingZoo environments have the same problem; its end is a termination."""
-    lone, copies = Lone(scaling), Copies(1, 7, scaling)
-    seen, _ = lone.reset(seed=7)
-    random = np.random.default_rng(0)
-    ended = False
-    while not ended:
         stacked = np.stack([seen[agent] for agent in lone.possible_agents])
-        assert stacked == pytest.approx(copies.observation[0], abs=1e-5)
+        assert stacked == pytest.approx(scaling.seen(padded(batch, observations))[0], abs=1e-5)
         actions = random.normal(size=(1, len(lone.possible_agents), 1))
-        _, paid, over = copies.step(actions)
-        seen, rewards, terminated, truncated, _ = lone.step(dict(zip(lone.possible_agents, actions[0], strict=True)))
-        assert list(rewards.values()) == pytest.approx(paid[0].tolist(), rel=1e-5)
-        ended = all(terminated.values())
-        assert ended == over and not any(truncated.values())
+        observations, rewards, *_ = batch.step(by_agent(batch, actions))
+        seen, paid, terminated, truncated, _ = lone.step(dict(zip(lone.possible_agents, actions[0], strict=True)))
+        expected = scaling.reward(np.array([rewards[agent][0] for agent in lone.possible_agents]))
+        assert list(paid.values()) == pytest.approx(expected.tolist(), rel=1e-5)
+        assert all(terminated.values()) == (step == SETTINGS.steps) and not any(truncated.values())
     assert lone.agents == []
 
 

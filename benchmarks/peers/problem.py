@@ -83,35 +83,6 @@ def by_agent(env: MultiAgentVectorEnv, actions: NDArray[np.floating]) -> dict[st
     return {agent: np.clip(actions[:, place], -1.0, 1.0) for place, agent in enumerate(env.agents)}
 
 
-class Copies:
-    """Our batched environment with padded and scaled arrays; all copies end together, and begin anew within the step.
-
-    Attributes:
-        env: the environment itself.
-        shape: copies, agents and entries of an observation.
-    """
-
-    def __init__(self, copies: int, seed: int, scaling: Scaling) -> None:
-        """Begin ``copies`` episodes, that of copy i by ``seed + i``."""
-        self.env, self._scaling = environment(copies), scaling
-        self.observation = scaling.seen(padded(self.env, self.env.reset(seed=seed)))
-        self.shape = self.observation.shape
-
-    def step(self, actions: NDArray[np.floating]) -> tuple[Array, Array, bool]:
-        """Act; return the last observation, rewards, (copies, agents), and whether the episodes are over.
-
-        ``observation`` is then that of the next episodes.
-        """
-        observations, rewards, _, truncated, infos = self.env.step(by_agent(self.env, actions))
-        over = bool(truncated[self.env.agents[0]].all())
-        self.observation = self._scaling.seen(padded(self.env, observations))
-        last = self.observation
-        if over:
-            last = self._scaling.seen(padded(self.env, {a: infos[a]["final_obs"] for a in self.env.agents}))
-        paid = np.stack([rewards[agent] for agent in self.env.agents], axis=1)
-        return last, self._scaling.reward(paid), over
-
-
 class Acting(Controller):
     """A policy of a peer as one of our controllers."""
 

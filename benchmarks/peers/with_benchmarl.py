@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
 import torch
 from benchmarl.algorithms import IppoConfig
-from benchmarl.environments import TaskClass
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
 from tensordict import TensorDict
@@ -18,66 +18,26 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from benchmarks.peers.problem import Acting, Array, Scaling
-from benchmarks.peers.settings import NETWORK, SETTINGS
-from benchmarks.peers.torchrl_env import GROUP, CopiesEnv
+from benchmarks.peers.settings import ENVIRONMENT, NETWORK, SETTINGS
+from benchmarks.peers.torchrl_env import ScaledEnv
 from benchmarks.peers.watch import TimeIsUp, Watch
+from cirl_marl.adapters.benchmarl import NetworkTask
+from cirl_marl.adapters.torchrl import GROUP
 
 
-class CopperTask(TaskClass):  # type: ignore[misc]
-    """All agents in one group, with policies and critics of their own."""
+class ScaledTask(NetworkTask):
+    """Our network, scaled."""
 
     def __init__(self, scaling: Scaling) -> None:
         """Make environments that scale by ``scaling``."""
-        super().__init__(NETWORK, {})
+        super().__init__(NETWORK, **ENVIRONMENT)
         self._scaling = scaling
 
     def get_env_fun(
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
-    ) -> Callable[[], CopiesEnv]:
+    ) -> Callable[[], ScaledEnv]:
         """Return what makes a batched environment."""
-        return lambda: CopiesEnv(num_envs, seed or 0, self._scaling)
-
-    def supports_continuous_actions(self) -> bool:
-        """Actions are valves."""
-        return True
-
-    def supports_discrete_actions(self) -> bool:
-        """Actions are not discrete."""
-        return False
-
-    def max_steps(self, env: Any) -> int:
-        """Return the steps of an episode."""
-        return SETTINGS.steps
-
-    def has_render(self, env: Any) -> bool:
-        """Nothing is drawn."""
-        return False
-
-    def group_map(self, env: Any) -> dict[str, list[str]]:
-        """Return the one group."""
-        return {GROUP: [f"agent_{i}" for i in range(env.observation_spec[GROUP, "observation"].shape[1])]}
-
-    def observation_spec(self, env: Any) -> Any:
-        """Return the specification of what one copy shows."""
-        return env.full_observation_spec_unbatched
-
-    def action_spec(self, env: Any) -> Any:
-        """Return the specification of what is done in one copy."""
-        return env.full_action_spec_unbatched
-
-    def info_spec(self, env: Any) -> None:
-        """No infos."""
-
-    def state_spec(self, env: Any) -> None:
-        """No common state."""
-
-    def action_mask_spec(self, env: Any) -> None:
-        """No masks."""
-
-    @staticmethod
-    def env_name() -> str:
-        """Return where the task is from."""
-        return "cirl"
+        return partial(ScaledEnv, num_envs, seed or 0, self._scaling)
 
 
 class Laps(Callback):  # type: ignore[misc]
@@ -111,7 +71,7 @@ def run(watch: Watch, seed: int, scaling: Scaling, envs: int, threads: int) -> N
     watch.record.setup = {"envs": envs, "threads": threads, **versions}
     with tempfile.TemporaryDirectory() as folder:
         experiment = Experiment(
-            task=CopperTask(scaling),
+            task=ScaledTask(scaling),
             algorithm_config=_algorithm(),
             model_config=MlpConfig(num_cells=list(SETTINGS.layers), layer_class=nn.Linear, activation_class=nn.Tanh),
             seed=seed,

@@ -12,13 +12,20 @@ from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPP
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
-from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
-from ray.tune.registry import register_env
 from torch import nn
 
 from benchmarks.peers.problem import Acting, Array, Lone, Scaling
-from benchmarks.peers.settings import NETWORK, SETTINGS
+from benchmarks.peers.settings import SETTINGS
 from benchmarks.peers.watch import TimeIsUp, Watch
+from cirl_marl.adapters.rllib import RLlibEnv
+
+
+class LoneEnv(RLlibEnv):
+    """Our network, scaled."""
+
+    @staticmethod
+    def _make_env(**config: Any) -> Lone:
+        return Lone(**config)
 
 
 class Module(DefaultPPOTorchRLModule):  # type: ignore[misc]
@@ -35,14 +42,14 @@ def run(watch: Watch, seed: int, scaling: Scaling, envs: int, threads: int) -> N
     runners = 0 if threads == 1 else threads
     watch.record.setup = {"envs": envs, "env runners": runners, "ray": version("ray"), "torch": version("torch")}
     ray.init(num_cpus=threads + 1, include_dashboard=False, log_to_driver=False)
-    register_env(NETWORK, lambda _: ParallelPettingZooEnv(Lone(scaling)))
-    algorithm = _config(Lone(scaling).possible_agents, seed, envs, runners).build_algo()
-    modules = [algorithm.get_module(agent) for agent in Lone(scaling).possible_agents]
+    agents = list(Lone(scaling).possible_agents)
+    algorithm = _config(scaling, agents, seed, envs, runners).build_algo()
+    modules = [algorithm.get_module(agent) for agent in agents]
 
     def act(seen: Array) -> Any:
         with torch.no_grad():
-            found = [m.forward_inference({"obs": torch.as_tensor(seen[:, i])}) for i, m in enumerate(modules)]
-        return torch.stack([each["action_dist_inputs"][:, :1] for each in found], dim=1).numpy()
+            outputs = [m.forward_inference({"obs": torch.as_tensor(seen[:, i])}) for i, m in enumerate(modules)]
+        return torch.stack([output["action_dist_inputs"][:, :1] for output in outputs], dim=1).numpy()
 
     watch.begin()
     try:
@@ -54,20 +61,26 @@ def run(watch: Watch, seed: int, scaling: Scaling, envs: int, threads: int) -> N
         ray.shutdown()
 
 
-def _config(agents: list[str], seed: int, envs: int, runners: int) -> Any:
+def _config(scaling: Scaling, agents: list[str], seed: int, envs: int, runners: int) -> Any:
     layers = {"fcnet_hiddens": list(SETTINGS.layers), "fcnet_activation": "tanh", "vf_share_layers": False}
     model = DefaultModelConfig(**layers, free_log_std=True, head_fcnet_hiddens=[])
     spec = RLModuleSpec(module_class=Module, model_config=model)
     rate = [[0, SETTINGS.learning_rate], [SETTINGS.schedule, SETTINGS.last_rate]]
     return (
         PPOConfig()
-        .environment(NETWORK, clip_actions=True, normalize_actions=False, disable_env_checking=True)
+        .environment(
+            LoneEnv,
+            env_config={"scaling": scaling},
+            clip_actions=True,
+            normalize_actions=False,
+            disable_env_checking=True,
+        )
         .env_runners(
             num_env_runners=runners,
             num_envs_per_env_runner=envs // max(1, runners),
             sample_timeout_s=600.0,  # of a minute, the default, a rollout on a busy machine may take more
         )
-        .multi_agent(policies=set(agents), policy_mapping_fn=lambda agent, *_, **__: agent)
+        .multi_agent(policies=agents, policy_mapping_fn=lambda agent, *_, **__: agent)
         .rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs=dict.fromkeys(agents, spec)))
         .debugging(seed=seed, log_level="ERROR")
         .training(

@@ -17,15 +17,16 @@ from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
 from benchmarks.peers.problem import Acting, Array, Lone, Scaling
 from benchmarks.peers.settings import SETTINGS
-from benchmarks.peers.torchrl_env import GROUP, CopiesEnv
+from benchmarks.peers.torchrl_env import ScaledEnv
 from benchmarks.peers.watch import TimeIsUp, Watch
+from cirl_marl.adapters.torchrl import GROUP
 
 SEEN, LOCATION, SCALE = (GROUP, "observation"), (GROUP, "loc"), (GROUP, "scale")
 
 
 def batched(watch: Watch, seed: int, scaling: Scaling, envs: int, threads: int) -> None:
     """Train in our batched environment."""
-    _train(watch, CopiesEnv(envs, seed, scaling), seed, scaling, envs, threads)
+    _train(watch, ScaledEnv(envs, seed, scaling), seed, scaling, envs, threads)
 
 
 def lone(watch: Watch, seed: int, scaling: Scaling, envs: int, threads: int) -> None:

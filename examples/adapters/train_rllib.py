@@ -11,7 +11,7 @@ config = (
     PPOConfig()
     .environment(RLlibEnv, env_config=options, clip_actions=True)
     .env_runners(num_env_runners=0, num_envs_per_env_runner=2)
-    .multi_agent(policies=set(agents), policy_mapping_fn=lambda agent, *_, **__: agent)
+    .multi_agent(policies=agents, policy_mapping_fn=lambda agent, *_, **__: agent)
     .training(train_batch_size_per_learner=160, minibatch_size=80, num_epochs=2)
     .debugging(seed=0)
 )

@@ -10,12 +10,16 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.envs.utils import RandomPolicy, check_env_specs, step_mdp
 
+from benchmarks.peers.problem import Scaling, by_agent, environment, padded
+from benchmarks.peers.settings import SETTINGS
+from benchmarks.peers.torchrl_env import ScaledEnv
 from cirl_marl import CirlError, ControlError, MultiAgentVectorEnv
 from cirl_marl.adapters.torchrl import GROUP, TorchRLEnv
 
 CASES: dict[str, dict[str, Any]] = {"copper_net": {"reward": "team"}, "solids_net": {}}
 """Networks whose agents have observations of several lengths, and, the second, actions of several lengths."""
 HORIZON = 4
+FINAL = "final_obs"
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -43,7 +47,7 @@ def test_what_is_seen_and_paid_is_ours(name: str) -> None:
         assert np.array_equal(told["truncated"][:, 0].numpy(), truncated[ours.agents[0]])
         assert not told["terminated"].any() and bool(told["done"].all()) == (step % HORIZON == 0)
         if step % HORIZON == 0:
-            assert_padded(told[GROUP, "observation"], {a: infos[a]["final_observation"] for a in ours.agents})
+            assert_padded(told[GROUP, "observation"], {a: infos[a][FINAL] for a in ours.agents})
             told = env.reset()
     assert step == 2 * HORIZON
 
@@ -78,6 +82,24 @@ def test_a_collector_goes_on_from_episode_to_episode() -> None:
     assert ends.sum(dim=1).tolist() == [3, 3] and ends[:, HORIZON - 1].all()
     starts = observation[:, ::HORIZON]
     assert len(torch.unique(starts.flatten(0, 1), dim=0)) == 6
+
+
+def test_scaled_copies_are_the_environment() -> None:
+    """What peers of the benchmarks see and are paid is ours, scaled; the last observation is that of the episode."""
+    scaling, env = Scaling.measured(environment(4)), environment(2)
+    scaled = ScaledEnv(2, 5, scaling)
+    observations, random, told = env.reset(seed=5), np.random.default_rng(0), scaled.reset()
+    for step in range(1, SETTINGS.steps + 1):
+        assert np.array_equal(told[GROUP, "observation"].numpy(), scaling.seen(padded(env, observations)))
+        actions = random.normal(size=(2, len(env.agents), 1)).astype(np.float32)
+        told = scaled.step(told.set((GROUP, "action"), torch.from_numpy(actions)))["next"]
+        observations, rewards, _, _, infos = env.step(by_agent(env, actions))
+        paid = scaling.reward(np.stack([rewards[agent] for agent in env.agents], axis=1))
+        assert told[GROUP, "reward"][..., 0].numpy() == pytest.approx(paid, rel=1e-6)
+        assert bool(told["terminated"].all()) == (step == SETTINGS.steps)
+    final = padded(env, {agent: infos[agent][FINAL] for agent in env.agents})
+    assert np.array_equal(told[GROUP, "observation"].numpy(), scaling.seen(final))
+    assert not np.array_equal(final, padded(env, observations))
 
 
 def test_without_a_value_after_it_the_end_is_a_termination() -> None:
