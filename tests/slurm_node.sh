@@ -44,7 +44,8 @@ SelectTypeParameters=CR_CPU
 JobAcctGatherType=jobacct_gather/none
 $( [ "$what" = accounting ] && echo "AccountingStorageType=accounting_storage/slurmdbd
 AccountingStorageHost=127.0.0.1
-AccountingStoragePort=16819" || echo "AccountingStorageType=accounting_storage/none" )
+AccountingStoragePort=16819
+AccountingStoragePass=$folder/munge/socket" || echo "AccountingStorageType=accounting_storage/none" )
 NodeName=$host NodeAddr=127.0.0.1 CPUs=$(nproc) RealMemory=1000 State=UNKNOWN
 PartitionName=all Nodes=$host Default=YES MaxTime=INFINITE State=UP OverSubscribe=FORCE:4
 CONF

@@ -212,7 +212,7 @@ def test_a_real_slurm(node: str, tmp_path: Path) -> None:
     assert "FAILED by signal 9" in said["a"] and said["a"].endswith(": the pen breaks")
     settings = {"timeout_min": "5", "slurm_partition": "all"}
     assert run_jobs(written(tmp_path), tmp_path / "jobs", on="slurm", settings=settings) == []
-    with pytest.raises(CirlError, match=r"--slurm partition=long: Slurm says: .*Invalid partition"):
+    with pytest.raises(CirlError, match=r"--slurm partition=long: Slurm says: .*[Ii]nvalid partition"):
         run_jobs(written(tmp_path), tmp_path / "jobs", on="slurm", settings={"partition": "long"})
 
 
