@@ -21,7 +21,7 @@ STEP = 1e-4
 MARGIN = 1e-6
 """Kept from the highest service that can be had, where the solver's tolerance would call the program infeasible."""
 SOLVES = 2
-"""Programs of each row; docs/bound.md shows what more would change."""
+"""Programs of each row; docs/plans.md shows what more would change."""
 FRONT = 41
 """Service levels at which the front is drawn."""
 

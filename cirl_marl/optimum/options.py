@@ -15,7 +15,7 @@ from cirl_marl.network.initial_ages import age_shares
 from cirl_marl.optimum.vintages import Lifetimes
 
 DEGREE = 2
-"""Degree of the test polynomials; docs/bound.md has the gap against it."""
+"""Degree of the test polynomials; docs/plans.md has the gap against it."""
 
 
 def starting_stocks(lifetimes: Lifetimes, initial: Mapping[str, float] | ArrayLike | None) -> Floats:
