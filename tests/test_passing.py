@@ -171,7 +171,7 @@ def test_passes_are_the_most_there_can_be(seed: int, count: int) -> None:
             for row, k in enumerate(split.controlled_arcs):
                 kept[int(split.donor[1:]), int(network.arcs[k].recipient[1:])] = split.bounds[next(ends), row, 0]
         most = np.maximum(most, np.linalg.solve(np.eye(count) - kept, np.ones(count)))
-    np.testing.assert_allclose(VisitBounds(network).total(0), most, rtol=1e-7)
+    np.testing.assert_allclose(VisitBounds(network, splits(network)).total(0), most, rtol=1e-7)
 
 
 def test_a_source_without_a_known_reserve_starts_with_what_may_be_asked() -> None:
@@ -335,11 +335,11 @@ def test_loops_in_loops_have_a_bound_or_a_message() -> None:
         return markets(depth + 1, [*arcs, *back, share(f"m{depth}", "m0")])
 
     network = nested(1)
-    total = VisitBounds(network).total(0)
-    assert (total >= 1.0 + VisitBounds(network).best(total[:, None], 0)[:, 0]).all()
+    total = VisitBounds(network, splits(network)).total(0)
+    assert (total >= 1.0 + VisitBounds(network, splits(network)).best(total[:, None], 0)[:, 0]).all()
     np.testing.assert_allclose(total[0], 2e6, rtol=1e-3)
     with pytest.raises(NetworkError, match="pass mass round so often that it cannot be told"):
-        VisitBounds(nested(5)).total(0)
+        VisitBounds(nested(5), splits(nested(5))).total(0)
 
 
 def test_a_control_that_sets_a_flow_is_no_valve_on_the_others() -> None:

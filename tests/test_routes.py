@@ -46,7 +46,7 @@ def test_routes_bound_what_passes(seed: int) -> None:
     """Throughputs and arrivals under random shares lie within their bounds."""
     network = yearly_network(seed)
     admissible, laws, stores = Admissible.of(network), FlowLaws(network), len(network.stores)
-    routes = RouteBounds(admissible.ranges[0], VisitBounds(network), 0)
+    routes = RouteBounds(admissible.ranges[0], VisitBounds(network, admissible.splits), 0)
     low, _, high = network.control_bounds[:, :, 0]
     rng = np.random.default_rng(seed)
     for _ in range(50):

@@ -22,6 +22,7 @@ from cirl_marl.dynamics.static_elimination import SparseRow, StaticElimination, 
 from cirl_marl.dynamics.visit_bounds import VisitBounds
 from cirl_marl.network import Floats, Integers, Network, RowSum
 from cirl_marl.network.declarations import with_field_docs
+from cirl_marl.network.split_fractions import splits
 
 
 @with_field_docs
@@ -160,7 +161,7 @@ class Routing:
         Whatever the shares, what enters node j passes through nodes without stock at most v_j times in all
         (``passes``): no node sees more than that.
         """
-        passes = VisitBounds(self._network)
+        passes = VisitBounds(self._network, splits(self._network))
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
         entering = self._entering(flow[:, None])[self.places, 0]
         return np.full(self.nodes, float(entering @ total))

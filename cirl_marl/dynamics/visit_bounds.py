@@ -18,7 +18,7 @@ from scipy.sparse.linalg import splu
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.network.declarations import with_field_docs
-from cirl_marl.network.split_fractions import Split, splits
+from cirl_marl.network.split_fractions import Split
 
 MOST_ROUNDS = 100
 """Policies that are tried; a handful is enough."""
@@ -77,11 +77,11 @@ class VisitBounds:
         kinds: intervals of which one stands for all in which shares have the same ranges.
     """
 
-    def __init__(self, network: Network) -> None:
-        """Compile the splits of ``network``."""
+    def __init__(self, network: Network, network_splits: Sequence[Split]) -> None:
+        """Compile the splits of ``network`` (``split_fractions.splits``)."""
         stores, self._network = len(network.stores), network
         self._nodes = len(network.nodes) - stores
-        found = [(network.node_index[split.donor] - stores, split) for split in splits(network)]
+        found = [(network.node_index[split.donor] - stores, split) for split in network_splits]
         alike: dict[tuple[int, int], list[tuple[int, Split, Integers]]] = {}
         for i, split in found:
             if i >= 0:

@@ -45,11 +45,11 @@ class FreeSplit:
     @classmethod
     def of(cls, split: Split, donor: int, step: int) -> FreeSplit:
         """Read it off a split in one interval."""
-        proportions, others = split.proportions[:, step], np.array(split.other_arcs, dtype=np.intp)
+        proportions, free_arcs = split.proportions[:, step], np.array(split.other_arcs, dtype=np.intp)
         first = int(proportions.argmax())
         rest = np.arange(len(proportions)) != first
         arcs = np.array([*split.controlled_arcs, *split.other_arcs])
-        return cls(donor, arcs, split.other_arcs[first], others[rest], proportions[rest] / proportions[first])
+        return cls(donor, arcs, split.other_arcs[first], free_arcs[rest], proportions[rest] / proportions[first])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

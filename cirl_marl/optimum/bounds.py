@@ -1,4 +1,4 @@
-"""What is proved about the best circularity, for one start or for many, and the plan that suggests itself."""
+"""Upper bounds of the circularity that any actions can reach in an episode, for one start or many, and their plans."""
 
 from __future__ import annotations
 
@@ -292,9 +292,9 @@ def highest_service(network: Network) -> float:
 
 
 def _episode_network(network: str | Path | Network, scenario: str | None, horizon: int | None) -> Network:
-    loaded = load_network(network) if isinstance(network, str | Path) else network
-    loaded = loaded.scenario(scenario)
-    return loaded if horizon is None else loaded.with_options(episode={"horizon": horizon})
+    definition = load_network(network) if isinstance(network, str | Path) else network
+    definition = definition.scenario(scenario)
+    return definition if horizon is None else definition.with_options(episode={"horizon": horizon})
 
 
 def _solve_bound(

@@ -216,7 +216,7 @@ def idle_supplies(admissible: Admissible, reach: Reach, intervals: range, rows: 
     starts = [layout.flow[piece * (layout.degree + 1)] for piece in range(layout.pieces)]
     starts += [layout.end_flow[piece] for piece in range(layout.pieces)] if layout.has_end_flows else []
     low, high = admissible.setting[:, period]
-    undelivered = np.where(reach.uncut, 0.0, high)
+    shortage = np.where(reach.uncut, 0.0, high)
     t = np.arange(len(intervals))[:, None]
     for arcs, weight in _idle_groups(admissible):
         room = np.where(weight > 0, (high - low)[:, arcs], 0.0)  # of weight 0 never more than the least
@@ -230,7 +230,7 @@ def idle_supplies(admissible: Admissible, reach: Reach, intervals: range, rows: 
                 row = rows.add(1, t, arcs, at, side)
                 rows.put(row, t * layout.size + start + arcs, sign)
                 rows.put(row, t * layout.size + start + last, -sign * slope)
-                allowance = slope * undelivered[t, last] if side == 0 else undelivered[:, arcs]
+                allowance = slope * shortage[t, last] if side == 0 else shortage[:, arcs]
                 rows.limit(row, sign * (low[:, arcs] - slope * low[t, last]) + allowance)
 
 

@@ -10,6 +10,8 @@ the search goes on: the best constants are found soon, and are a good start for 
 candidates. It stays in the loop while the search goes on, so that what it balances by feedback does not fall over at
 the first deviation; the plan is the sequence of actions that the best copy took, open loop. As θ = 0 is π itself, no
 plan found is worse than a candidate.
+
+References: Rubinstein 1999; Pinneri et al. 2020 (elites kept from one iteration to the next).
 """
 
 from __future__ import annotations
@@ -199,9 +201,9 @@ def search_each(
     for count in knot_counts(knots, iterations):
         gaussians.refine(count)
         controller = np.repeat(origin[:, None], population, axis=1)
-        tried = copies.run(controllers, controller, gaussians.draw(), report(population))
-        gaussians.learn(merit.of(tried), tried.deviation)
-        best = best.or_better(_Best.among(tried, merit.of(tried)))
+        trial = copies.run(controllers, controller, gaussians.draw(), report(population))
+        gaussians.learn(merit.of(trial), trial.deviation)
+        best = best.or_better(_Best.among(trial, merit.of(trial)))
         episodes_done, highest = episodes_done + population, best.merit
     progress(1.0, best.merit)
     return [

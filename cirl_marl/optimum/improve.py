@@ -3,6 +3,9 @@
 The relaxed flows of a bound are not quite what constant controls can do. Around an episode of the simulator every
 interval is linear to first order, δx' = J_x δx + J_a δa, and so are mean flows; the best step within a trust region is
 a linear program. Steps are accepted by simulation alone, so the result is an episode that exists.
+
+Of a large network those Jacobians, dense in its stocks and actions, would take gigabytes. ``refine`` solves the program
+of the bound again instead, with controls held and what was lacking on top.
 """
 
 from __future__ import annotations
@@ -33,12 +36,12 @@ MOST_SLOPES = 50_000_000
 TRUST, SMALLEST = 0.25, 1e-5
 """First and smallest half-width of the trust region, in normalised actions."""
 PENALTY = 3.0
-"""Price of what a service lacks in the merit, times the price that the bound puts on it."""
-ROUNDS = 2
+"""What is charged for what a service lacks, times the price that the bound puts on it."""
+REFINEMENT_ROUNDS = 2
 """Most programs that are solved."""
-DEGREE = 1
+REFINEMENT_DEGREE = 1
 """Degree of these programs, whatever that of the bound: they are solved several times."""
-TOLERANCE = 1e-4
+TOLERATED_SHORTFALL = 1e-4
 """What a service may lack of its demand without a further round."""
 
 
@@ -51,10 +54,10 @@ def improved(
 ) -> Bound:
     """Return ``bound`` with actions that do better in the simulator; the bound and its certificate stay.
 
-    The merit is the objective of the bound; what each service lacks of ``min_service`` is charged PENALTY times what
-    the bound says it costs to provide. Local optimality is all that is sought; ``bound.gap`` says how much better any
-    plan could be. Of a network so large that its Jacobians would have more than MOST_SLOPES entries the plan is made by
-    ``replanned``, whatever ``rounds`` is.
+    Plans are compared by the objective of the bound; what each service lacks of ``min_service`` is charged PENALTY
+    times what the bound says it costs to provide. Local optimality is all that is sought; ``bound.gap`` says how much
+    better any plan could be. Of a network so large that its Jacobians would have more than MOST_SLOPES entries the plan
+    is made by ``refine``, whatever ``rounds`` is.
 
     Args:
         bound: with the actions to start from.
@@ -235,7 +238,7 @@ def _cost(bound: Bound, size: int, level: int, nodes: int) -> Floats:
 
 
 def prices(bound: Bound) -> Floats:
-    """Return what the merit charges for a unit that each service lacks, which covers what the certificate asks for it.
+    """Return what is charged for a unit that each service lacks, which covers what the certificate asks for it.
 
     Shape (services,); 0 if nothing is demanded.
     """
@@ -263,7 +266,7 @@ def demand(bound: Bound) -> Floats:
 def refine(
     bound: Bound,
     *,
-    rounds: int = ROUNDS,
+    rounds: int = REFINEMENT_ROUNDS,
     enough: Callable[[Rollout], bool] = lambda run: False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Bound:
@@ -275,8 +278,8 @@ def refine(
 
         l·(1 + Σ max(0, promised level − delivered level)),
 
-    summed over the episodes so far, that of the bound's plan being the first. The best episode counts, by the merit of
-    ``improved``; rounds end when no service lacks more than KEPT.
+    summed over the episodes so far, that of the bound's plan being the first. The best episode counts, by the penalised
+    objective; rounds end when no service lacks more than TOLERATED_SHORTFALL.
 
     Args:
         bound: with the actions to start from.
@@ -291,21 +294,22 @@ def refine(
     for done in range(rounds):
         if enough(run):
             break
-        demanding = replace(admissible, service_low=admissible.service_low * factor)
-        programs = Programs(demanding, DEGREE, bound.service_weight, hold_controls=True)
+        demand_ranges = replace(admissible, service_low=admissible.service_low * factor)
+        programs = Programs(demand_ranges, REFINEMENT_DEGREE, bound.service_weight, hold_controls=True)
         try:
             problem = programs.program(bound.initial, bound.min_service)
-            planned = solve(problem, label="the program of a better plan", certify=False).plan
+            variables = solve(problem, label="the program of a better plan", certify=False).plan
         except (Infeasible, SolverFailure):  # more than can be had: what was found so far is the plan
             break
         layout = programs.layout
-        candidate = replace(bound, actions=normalised_actions(demanding, layout, planned.reshape(-1, layout.size)))
+        actions = normalised_actions(demand_ranges, layout, variables.reshape(-1, layout.size))
+        candidate = replace(bound, actions=actions)
         trial = achieved(candidate)
         progress((done + 1) / rounds)
         if (worth := penalised_objective(bound, trial, price)) > value:
             best, run, value = candidate, trial, worth
-        shortfall = _shortfall(layout, planned, trial, factor)
-        if shortfall.mean(axis=0).max(initial=0.0) <= TOLERANCE:
+        shortfall = _shortfall(layout, variables, trial, factor)
+        if shortfall.mean(axis=0).max(initial=0.0) <= TOLERATED_SHORTFALL:
             break
         factor += shortfall
     progress(1.0)
@@ -315,7 +319,7 @@ def refine(
 def _shortfall(layout: Layout, plan: Floats, run: Rollout, factor: float | Floats) -> Floats:
     """Return what an episode lacks of the levels that its program promised, shape (steps, services).
 
-    The program's levels are of bands that were ``factor``.
+    The program's levels are of bands that were raised by ``factor``.
     """
     levels = plan.reshape(-1, layout.size)[:, layout.level : layout.imbalance]
     shortfall: Floats = np.maximum(np.minimum(levels * factor, 1.0) - run.levels[0].T, 0.0)

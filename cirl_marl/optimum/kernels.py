@@ -96,14 +96,14 @@ class _Motion:
         self.outflow = turnover * means[:, -1]
         self.later = _Smooth(matrix, inflow_shares[:, None], degree)
         # y' = A y + E ψ_0, ψ_l' = ψ_(l+1): with ψ_0 the polynomial, read from the end of the piece
-        augmented = np.zeros((stages + degree + 1,) * 2)
-        augmented[:stages, :stages], augmented[:stages, stages] = matrix, inflow_shares
-        augmented[stages:, stages:] = np.eye(degree + 1, k=1)
+        block_matrix = np.zeros((stages + degree + 1,) * 2)
+        block_matrix[:stages, :stages], block_matrix[:stages, stages] = matrix, inflow_shares
+        block_matrix[stages:, stages:] = np.eye(degree + 1, k=1)
         start = np.zeros((stages + degree + 1, degree + 1))
         start[stages:] = np.stack([_derivatives(degree, degree - i) for i in range(degree + 1)], axis=1)
         last = np.zeros((1, stages + degree + 1))
         last[0, stages - 1] = turnover
-        low, high = _Smooth(augmented, start, degree).bounds(last)
+        low, high = _Smooth(block_matrix, start, degree).bounds(last)
         self.own_bounds = low, high
 
 

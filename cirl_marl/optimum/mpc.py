@@ -1,4 +1,4 @@
-"""Model predictive control over the convex program of the bound.
+"""Controllers that plan with the program of the bound: again and again (MPC), or once for the episode (Optimum).
 
 Every ``replan`` decisions each copy solves the linear program of ``cirl_marl.optimum`` from its true current stocks and
 carries out the first planned actions; what the program promised and the simulator did not do is made up for by the
@@ -201,7 +201,7 @@ class MPC(Planner):
         if last is None:
             self._outlooks.pop(copy, None)
         if copy not in self._outlooks:
-            self._outlooks[copy] = self._plan(copy, rest, deficit, None, certified=True)  # its multipliers are prices
+            self._outlooks[copy] = self._plan(copy, rest, deficit, None, as_outlook=True)  # its multipliers are prices
         outlook = self._outlooks[copy]
         after = window.stop - outlook.intervals.start
         if deficit is not None:
@@ -213,8 +213,8 @@ class MPC(Planner):
         is_running = last is not None and window.start in last.intervals
         if is_running and last is not None and last.problem is not None and last.solution is not None:
             done = window.start - last.intervals.start + self._replan
-            planned = last.solution.plan.reshape(len(last.intervals), -1)[:done]
-            return replace(last, actions=self._actions(last.problem, last.intervals, planned))
+            variables = last.solution.plan.reshape(len(last.intervals), -1)[:done]
+            return replace(last, actions=self._actions(last.problem, last.intervals, variables))
         neutral = np.concatenate([action[copy] for action in self._env.neutral_action.values()])
         return _Plan(int(self._env.episodes[copy]), window, None, None, np.tile(neutral, (self._replan, 1)), 1.0)
 
@@ -229,7 +229,7 @@ class MPC(Planner):
         deficit: Floats | None,
         basis: Basis | None,
         prices: Floats | None = None,
-        certified: bool = False,
+        as_outlook: bool = False,
     ) -> _Plan:
         """Plan some intervals.
 
@@ -240,24 +240,24 @@ class MPC(Planner):
                 demanded.
             basis: from which the solver starts.
             prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
-            certified: whether the multipliers must be good.
+            as_outlook: whether the multipliers must be good.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
         demand = None if deficit is None else np.maximum(0.0, deficit / len(intervals))
         unit = 1.0
-        what = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
+        task = f"the program of MPC for decisions {intervals.start} to {intervals.stop - 1}"
         try:
             problem = self._with_prices(self._programs, stock, intervals, demand, prices)
-            solution = solve(problem, basis, label=what, certify=certified)
+            solution = solve(problem, basis, label=task, certify=as_outlook)
         except Infeasible:
             if demand is None:
                 raise
             unit = self._env.network.objective.circularity_scale
             prices = None if prices is None else prices / unit
             problem = _without_demand(self._with_prices(self._urgent, stock, intervals, demand, prices))
-            solution = solve(problem, basis, label=what, certify=certified)
-        planned = solution.plan.reshape(len(intervals), -1)[: self._replan]
-        actions = self._actions(problem, intervals, planned)
+            solution = solve(problem, basis, label=task, certify=as_outlook)
+        variables = solution.plan.reshape(len(intervals), -1)[: self._replan]
+        actions = self._actions(problem, intervals, variables)
         return _Plan(int(self._env.episodes[copy]), intervals, problem, solution, actions, unit)
 
     def _with_prices(

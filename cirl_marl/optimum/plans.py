@@ -1,4 +1,4 @@
-"""The controller that carries out plans, and what those of bounds achieve in the simulator."""
+"""Plans in the simulator: the controller that carries them out, what those of bounds achieve, many side by side."""
 
 from __future__ import annotations
 
@@ -75,12 +75,13 @@ class Plan(Controller):
         return dict(self._env.unstack(actions))
 
     def _check(self, plan: HasPlan, env: MultiAgentVectorEnv, start: Floats, copy: int) -> None:
-        ours, env_network = plan.network, env.network
-        if (ours.nodes, ours.arcs, ours.episode) != (env_network.nodes, env_network.arcs, env_network.episode):
-            raise ControlError(
-                f"plan: it is for network '{ours.name}', scenario '{ours.scenario_name}', {ours.episode.horizon} steps,"
-                f" not for '{env_network.name}', '{env_network.scenario_name}', {env_network.episode.horizon} steps"
+        parts = [(network.nodes, network.arcs, network.episode) for network in (plan.network, env.network)]
+        if parts[0] != parts[1]:
+            plan_text, env_text = (
+                f"'{network.name}', scenario '{network.scenario_name}', {network.episode.horizon} steps"
+                for network in (plan.network, env.network)
             )
+            raise ControlError(f"plan: it is for network {plan_text}, not for {env_text}")
         if plan.agents != env.agents:
             raise ControlError(f"plan: it is for agents {list(plan.agents)}, not {list(env.agents)}")
         size = np.abs(plan.initial)  # a stock is near where it should be, measured by all the mass there is
@@ -154,7 +155,7 @@ class Population:
     def run(
         self,
         controllers: Sequence[Controller],
-        which: Integers,
+        choices: Integers,
         deviation: Floats,
         progress: Callable[[float], None] = lambda share: None,
     ) -> Episodes:
@@ -162,19 +163,19 @@ class Population:
 
         Args:
             controllers: each has to act for all copies.
-            which: whose actions each copy takes, shape (starts, copies).
+            choices: whose actions each copy takes, shape (starts, copies).
             deviation: what is added to them between knots, shape (starts, copies, knots, entries).
             progress: called with the share of the episode that is done.
         """
         env, shape = self._env, self._shape
         observations = env.restore(self._start)
-        choice = which.ravel()
+        choice = choices.ravel()
         chosen_controllers = {int(i): controllers[i] for i in np.unique(choice)}
         for controller in chosen_controllers.values():
             controller.start(env, EVALUATION_SEEDS)
         steps, knots = env.network.episode.horizon, deviation.shape[2]
         added_deviation = np.ascontiguousarray(np.moveaxis(deviation.reshape(len(choice), knots, -1), 0, 2))
-        applied, counts = (
+        deviation_sum, counts = (
             np.zeros_like(added_deviation),
             np.bincount(np.arange(steps) * knots // steps, minlength=knots),
         )
@@ -185,11 +186,11 @@ class Population:
                 np.copyto(action, env.stack(controller.act(observations)), where=choice == i)
             knot = t * knots // steps
             bounded_action = np.clip(action + added_deviation[knot], -1.0, 1.0)
-            applied[knot] += bounded_action - action
+            deviation_sum[knot] += bounded_action - action
             actions[t] = bounded_action
             observations = env.by_agent(env.advance(bounded_action).observation)
             progress((t + 1) / steps)
-        applied /= counts[:, None, None]
+        deviation_sum /= counts[:, None, None]
         state = env.physical
         levels = state.service / steps
         return Episodes(
@@ -197,7 +198,7 @@ class Population:
             env.scoring.service_level(levels).reshape(shape),
             levels.reshape(-1, *shape),
             actions.reshape(*actions.shape[:2], *shape),
-            np.moveaxis(applied, 2, 0).reshape(deviation.shape),
+            np.moveaxis(deviation_sum, 2, 0).reshape(deviation.shape),
         )
 
 

@@ -201,7 +201,7 @@ class ComparisonSystem:
         self.admissible, self.network = admissible, admissible.network
         self.substeps = ArcRates(admissible.network).solver_steps()
         self.substep = self.network.episode.control_interval / self.substeps
-        self._visit_bounds = VisitBounds(admissible.network)
+        self._visit_bounds = VisitBounds(admissible.network, admissible.splits)
         self._routes: dict[bytes, RouteBounds] = {}
         # shares of what leaves a node that stores nothing; where their ranges are widest the others begin
         self._share_rates = {

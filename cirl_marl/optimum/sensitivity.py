@@ -113,8 +113,8 @@ def of_stocks(bound: Bound, programs: Programs) -> Floats:
     """
     problem, lifetimes = bound.problem, programs.admissible.lifetimes
     y, mu = bound.certificate.equal, np.minimum(bound.certificate.under, 0.0)
-    planned, steps = problem.layout.network, programs.admissible.network.episode.horizon
-    worth, tops = np.empty((steps, len(planned.stores))), [0, 0]
+    plan_network, steps = problem.layout.network, programs.admissible.network.episode.horizon
+    worth, tops = np.empty((steps, len(plan_network.stores))), [0, 0]
     for step in range(steps):
         # a stock s at the start stands on the left as B s, so a unit more lowers the right-hand side by B
         blocks = programs.rows_at_start(step)
@@ -123,18 +123,18 @@ def of_stocks(bound: Bound, programs: Programs) -> Floats:
             for block, multipliers, top in zip(blocks, (y, mu), tops, strict=True)
         )
         tops = [top + block.shape[0] for top, block in zip(tops, blocks, strict=True)]
-    last = len(mu) - (0 if bound.min_service is None else len(planned.services))
-    for each in reversed(lifetimes.passive):
-        out = lifetimes.of_new(each, problem.layout)
+    last = len(mu) - (0 if bound.min_service is None else len(plan_network.services))
+    for passive in reversed(lifetimes.passive):
+        out = lifetimes.of_new(passive, problem.layout)
         rows = out.shape[1]
         above, below = mu[last - 2 * rows : last - rows], mu[last - rows : last]
-        worth[:, planned.node_index[each.node.id]] -= out @ (above - below)
+        worth[:, plan_network.node_index[passive.node.id]] -= out @ (above - below)
         last -= 2 * rows
     of_nodes = worth[:, : len(lifetimes.network.stores)].copy()
-    stages = getattr(planned, "stages", {})
+    stages = getattr(plan_network, "stages", {})
     for i, node in enumerate(lifetimes.network.stores):
         if len(stages.get(node.id, ())) > 1 and node.lifetime is not None and node.lifetime.chain is not None:
-            entering = node.lifetime.chain.inflow_shares
-            columns = [planned.node_index[stage] for stage in stages[node.id]]
-            of_nodes[:, i] = worth[:, columns] @ (entering / entering.sum())
+            shares = node.lifetime.chain.inflow_shares
+            columns = [plan_network.node_index[stage] for stage in stages[node.id]]
+            of_nodes[:, i] = worth[:, columns] @ (shares / shares.sum())
     return of_nodes

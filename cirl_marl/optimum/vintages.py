@@ -100,9 +100,9 @@ class Lifetimes:
         if not nodes:
             return
         whole = [node for node in nodes if not (node.id in agents and node.control is not None)]
-        fixed = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
+        fixed_nodes = [node.id for node in whole if node.lifetime is not None and node.lifetime.chain is None]
         plan_network = self.plan_network = staged_network(network, {node.id for node in whole})
-        reach_network = self.reach_network = staged_network(network, fixed)
+        reach_network = self.reach_network = staged_network(network, fixed_nodes)
         neutral = network.control_bounds[1]
         for node in whole:
             assert node.lifetime is not None
