@@ -13,11 +13,13 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cirl_marl.network import Floats, Integers
+from cirl_marl.network.declarations import with_field_docs
 
 SWEEPS = 24
 """How often the layers are put in order and moved towards what they are connected with."""
@@ -46,21 +48,15 @@ class RibbonRoute:
     back: bool = False
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class LayeredLayout:
-    """Where everything of a flow diagram goes; across is measured from the first lane on.
+    """Where everything of a flow diagram goes; across is measured from the first lane on."""
 
-    Attributes:
-        layers: layer of each node, shape (nodes,).
-        middles: centre of each node, across, shape (nodes,).
-        routes: one for each flow.
-        breadth: of all, across.
-    """
-
-    layers: Integers
-    middles: Floats
-    routes: tuple[RibbonRoute, ...]
-    breadth: float
+    layers: Annotated[Integers, "layer of each node, shape (nodes,)"]
+    middles: Annotated[Floats, "centre of each node, across, shape (nodes,)"]
+    routes: Annotated[tuple[RibbonRoute, ...], "one for each flow"]
+    breadth: Annotated[float, "of all, across"]
 
 
 def layered_layout(

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
 from cirl_marl.network import Floats
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.reasons.extras import captum
 from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution, play_episodes
 from cirl_marl.reasons.observations import Signal, observation_entries, policy_columns, signal_of
@@ -32,45 +33,36 @@ POINTS = 32
 """Points of the Gauss-Legendre rule between the mean and what was seen."""
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairedDifference:
-    """How episodes differ from those of the policies from the same starts: means with 95 % intervals over episodes.
+    """How episodes differ from those of the policies from the same starts: means with 95 % intervals over episodes."""
 
-    Attributes:
-        circularity: of λ̄, mass.
-        service: of the mean service level.
-        usual: mean λ̄ of the policies, mass.
-    """
-
-    circularity: Aggregate
-    service: Aggregate
-    usual: float
+    circularity: Annotated[Aggregate, "of λ̄, mass"]
+    service: Annotated[Aggregate, "of the mean service level"]
+    usual: Annotated[float, "mean λ̄ of the policies, mass"]
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentInputs:
-    """What one agent looks at, first what counts most.
+    """What one agent looks at, first what counts most."""
 
-    Attributes:
-        agent: whose action it is.
-        signals: what it sees, each once.
-        share: mean size of each input's attribution, as part of all, shape (signals,).
-        slope: change of the action, [−1, 1], with the input, per unit of the input in its observation, by least
-            squares of attributions on distances from the mean, shape (entries, signals).
-        residual: mean distance of Σ IG from F(x) − F(x'), as part of the mean size of the latter.
-        top: how many of the first inputs were held.
-        top_held: what changed when those were held at their means.
-        least_held: what changed when as many of the last inputs were; None where there are no others.
-    """
-
-    agent: str
-    signals: tuple[Signal, ...]
-    share: Floats
-    slope: Floats
-    residual: float
-    top: int
-    top_held: PairedDifference
-    least_held: PairedDifference | None
+    agent: Annotated[str, "whose action it is"]
+    signals: Annotated[tuple[Signal, ...], "what it sees, each once"]
+    share: Annotated[Floats, "mean size of each input's attribution, as part of all, shape (signals,)"]
+    slope: Annotated[
+        Floats,
+        "change of the action, [−1, 1], with the input, per unit of the input in its observation, by least squares of "
+        "attributions on distances from the mean, shape (entries, signals)",
+    ]
+    residual: Annotated[float, "mean distance of Σ IG from F(x) − F(x'), as part of the mean size of the latter"]
+    top: Annotated[int, "how many of the first inputs were held"]
+    top_held: Annotated[PairedDifference, "what changed when those were held at their means"]
+    least_held: Annotated[
+        PairedDifference | None,
+        "what changed when as many of the last inputs were; None where there are no others",
+    ]
 
 
 def paired_difference(episodes: Rollout, usual: Rollout) -> PairedDifference:

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from cirl_marl.evaluation.baselines import levels_to_demand
 from cirl_marl.evaluation.comparison import part_of, starting_stocks
 from cirl_marl.learners.run_directory import RunDirectory
 from cirl_marl.network import Network
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum import NoCertificate
 from cirl_marl.reasons import extras
 from cirl_marl.reasons.attribution import AgentInputs, attribute_inputs
@@ -28,29 +30,19 @@ PARTS = ("prices", "inputs", "rules")
 TOP = 3
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explanation:
-    """Reasons; what was not asked for, or cannot be had, is None.
+    """Reasons; what was not asked for, or cannot be had, is None."""
 
-    Attributes:
-        network: under its scenario.
-        about: a run's directory, or the network's name.
-        checkpoint: of the run that acts; empty for a network.
-        episodes: in which policies were watched; 0 for a network.
-        prices: shadow prices.
-        no_prices: why there are none; empty if there are, or nobody asked.
-        inputs: what each agent looks at; empty if nobody asked.
-        rules: what each agent does, in rules.
-    """
-
-    network: Network
-    about: str
-    checkpoint: str = ""
-    episodes: int = 0
-    prices: ShadowPrices | None = None
-    no_prices: str = ""
-    inputs: tuple[AgentInputs, ...] = ()
-    rules: TeamRules | None = None
+    network: Annotated[Network, "under its scenario"]
+    about: Annotated[str, "a run's directory, or the network's name"]
+    checkpoint: Annotated[str, "of the run that acts; empty for a network"] = ""
+    episodes: Annotated[int, "in which policies were watched; 0 for a network"] = 0
+    prices: Annotated[ShadowPrices | None, "shadow prices"] = None
+    no_prices: Annotated[str, "why there are none; empty if there are, or nobody asked"] = ""
+    inputs: Annotated[tuple[AgentInputs, ...], "what each agent looks at; empty if nobody asked"] = ()
+    rules: Annotated[TeamRules | None, "what each agent does, in rules"] = None
 
 
 def explain(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -13,25 +13,23 @@ from cirl_marl.controllers.rollout import Rollout, rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import RunError
 from cirl_marl.network import Floats, Integers
+from cirl_marl.network.declarations import with_field_docs
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class RecordedEpisodes:
-    """What agents saw, and what the expert did there.
+    """What agents saw, and what the expert did there."""
 
-    Attributes:
-        observations: by agent, shape (steps, B, k).
-        actions: of the expert, by agent, shape (steps, B, entries).
-        memories: what each policy remembered before it acted, by name, as its algorithm has it, one a step; zeros at
-            first.
-    """
-
-    observations: Mapping[str, Floats]
-    actions: Mapping[str, Floats]
-    memories: Mapping[str, list[Any]]
+    observations: Annotated[Mapping[str, Floats], "by agent, shape (steps, B, k)"]
+    actions: Annotated[Mapping[str, Floats], "of the expert, by agent, shape (steps, B, entries)"]
+    memories: Annotated[
+        Mapping[str, list[Any]],
+        "what each policy remembered before it acted, by name, as its algorithm has it, one a step; zeros at first",
+    ]
 
 
 @dataclass

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +25,7 @@ from scipy.optimize import linprog
 from cirl_marl.definitions.catalogue import load_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.optimum.admissible import Admissible
 from cirl_marl.optimum.certificate import verify
 from cirl_marl.optimum.options import DEGREE
@@ -42,40 +44,33 @@ NARROW = 0.1
 TINY = 1e-9
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectiveWeights:
     """The weights under which plans are within a distance of the best.
 
     Weights are shares u_j = w_j S_j, Σ u = 1, S_j being how much of a term there is to be had: from the least to the
     most of it in the plans and in what is best for single terms.
-
-    Attributes:
-        network: the network.
-        plans: names of the plans.
-        terms: what may be aimed at.
-        spread: S_j, shape (terms,); 0 for a term that nothing changes, of which no plan can tell the weight.
-        low: least share of each that fits, shape (terms,).
-        high: greatest share.
-        centre: the mean of the ends, a share of each that fits.
-        best: the shares under which the plans are closest to the best.
-        distance: by how much they fall short of it under these, as share of what there is to be had; proved.
-        within: distance up to which weights fit.
-        cuts: the inequalities that were found, Σ u_j cut_j ≤ distance, shape (cuts, terms).
-        programs: how many programs were solved.
     """
 
-    network: Network
-    plans: tuple[str, ...]
-    terms: tuple[ObjectiveTerm, ...]
-    spread: Floats
-    low: Floats
-    high: Floats
-    centre: Floats
-    best: Floats
-    distance: float
-    within: float
-    cuts: Floats
-    programs: int
+    network: Annotated[Network, "the network"]
+    plans: Annotated[tuple[str, ...], "names of the plans"]
+    terms: Annotated[tuple[ObjectiveTerm, ...], "what may be aimed at"]
+    spread: Annotated[
+        Floats,
+        "S_j, shape (terms,); 0 for a term that nothing changes, of which no plan can tell the weight",
+    ]
+    low: Annotated[Floats, "least share of each that fits, shape (terms,)"]
+    high: Annotated[Floats, "greatest share"]
+    centre: Annotated[Floats, "the mean of the ends, a share of each that fits"]
+    best: Annotated[Floats, "the shares under which the plans are closest to the best"]
+    distance: Annotated[
+        float,
+        "by how much they fall short of it under these, as share of what there is to be had; proved",
+    ]
+    within: Annotated[float, "distance up to which weights fit"]
+    cuts: Annotated[Floats, "the inequalities that were found, Σ u_j cut_j ≤ distance, shape (cuts, terms)"]
+    programs: Annotated[int, "how many programs were solved"]
 
     def fits(self, weights: ArrayLike) -> bool:
         """Whether weights w_j ≥ 0 of the terms, in their own units, break none of the inequalities."""

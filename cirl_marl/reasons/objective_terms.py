@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.drawing.style import readable
 from cirl_marl.errors import CirlError, unknown
 from cirl_marl.network import Floats, Network
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Arc, Node, Role
 from cirl_marl.optimum.matrices import Layout
 from cirl_marl.optimum.vintages import Lifetimes
@@ -29,40 +31,30 @@ CIRCULARITY_PARTS = {
 """Parts of λ, by the role of a node at one end of an arc that counts."""
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class PlannedEpisode:
-    """What became of a network in one episode.
+    """What became of a network in one episode."""
 
-    Attributes:
-        name: of the file or run that it is from.
-        initial: stocks at the start as the simulator has them, mass.
-        stock: at the end of each interval, shape (steps, stores), mass.
-        flow: means over the intervals, shape (steps, arcs), mass/time.
-    """
-
-    name: str
-    initial: Floats
-    stock: Floats
-    flow: Floats
+    name: Annotated[str, "of the file or run that it is from"]
+    initial: Annotated[Floats, "stocks at the start as the simulator has them, mass"]
+    stock: Annotated[Floats, "at the end of each interval, shape (steps, stores), mass"]
+    flow: Annotated[Floats, "means over the intervals, shape (steps, arcs), mass/time"]
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class LinearFunctional:
-    """Weights of what is measured in an episode; None where nothing of a kind counts.
+    """Weights of what is measured in an episode; None where nothing of a kind counts."""
 
-    Attributes:
-        flow: of mean flows, shape (steps, arcs).
-        stock: of stocks at the ends, shape (steps, stores).
-        through: of what passes through nodes that store nothing, shape (steps, nodes − stores).
-        level: of the levels of services, shape (steps, services).
-        imbalance: of |net flow through the environment|·Δ, shape (steps,).
-    """
-
-    flow: Floats | None = None
-    stock: Floats | None = None
-    through: Floats | None = None
-    level: Floats | None = None
-    imbalance: Floats | None = None
+    flow: Annotated[Floats | None, "of mean flows, shape (steps, arcs)"] = None
+    stock: Annotated[Floats | None, "of stocks at the ends, shape (steps, stores)"] = None
+    through: Annotated[
+        Floats | None,
+        "of what passes through nodes that store nothing, shape (steps, nodes − stores)",
+    ] = None
+    level: Annotated[Floats | None, "of the levels of services, shape (steps, services)"] = None
+    imbalance: Annotated[Floats | None, "of |net flow through the environment|·Δ, shape (steps,)"] = None
 
     def of(self, network: Network, episode: PlannedEpisode) -> float:
         """Return what it is in an episode."""
@@ -95,23 +87,19 @@ class LinearFunctional:
         return weights.ravel()
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class ObjectiveTerm:
-    """One thing that a plan may be meant to do.
+    """One thing that a plan may be meant to do."""
 
-    Attributes:
-        name: what it is called.
-        kind: one of KINDS.
-        unit: of the term itself.
-        about: of a service or set-point, whose.
-        roles: of a part of λ, the arcs that count in it, shape (arcs,).
-    """
-
-    name: str
-    kind: str
-    unit: str
-    about: str = ""
-    roles: Floats = field(default_factory=lambda: np.zeros(0))
+    name: Annotated[str, "what it is called"]
+    kind: Annotated[str, "one of KINDS"]
+    unit: Annotated[str, "of the term itself"]
+    about: Annotated[str, "of a service or set-point, whose"] = ""
+    roles: Annotated[
+        Floats,
+        "of a part of λ, the arcs that count in it, shape (arcs,)",
+    ] = field(default_factory=lambda: np.zeros(0))
 
     def tangent(self, network: Network, episode: PlannedEpisode) -> LinearFunctional:
         """Return the term, or its tangent at an episode."""

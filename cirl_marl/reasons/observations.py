@@ -4,32 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.learners.views import View
 from cirl_marl.network import Integers, Network
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Arc, Law, Node
 
 TIME = "time"
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """An entry of observations.
+    """An entry of observations."""
 
-    Attributes:
-        name: as ``MultiAgentVectorEnv.observation_names`` has it.
-        about: the compartment that it is about; empty for time, services and what models show.
-        scale: what it is multiplied by to be in its unit.
-        unit: of what it stands for.
-    """
-
-    name: str
-    about: str
-    scale: float
-    unit: str
+    name: Annotated[str, "as ``MultiAgentVectorEnv.observation_names`` has it"]
+    about: Annotated[str, "the compartment that it is about; empty for time, services and what models show"]
+    scale: Annotated[float, "what it is multiplied by to be in its unit"]
+    unit: Annotated[str, "of what it stands for"]
 
 
 def signal_of(network: Network, name: str) -> Signal:
@@ -51,21 +47,18 @@ def signal_of(network: Network, name: str) -> Signal:
     return Signal(name, about, scale, network.mass_unit if stores or is_batch else rate)
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class PolicyColumns:
-    """What stands in the row that a policy sees when it acts for one agent.
+    """What stands in the row that a policy sees when it acts for one agent."""
 
-    Attributes:
-        names: of the signals that stand in it, each once.
-        places: for each of them the columns of the row.
-        sources: for each of them an agent, and an entry of its observation, where it is found first.
-        entries: columns of the policy's output that are the agent's action.
-    """
-
-    names: tuple[str, ...]
-    places: tuple[Integers, ...]
-    sources: tuple[tuple[str, int], ...]
-    entries: Integers
+    names: Annotated[tuple[str, ...], "of the signals that stand in it, each once"]
+    places: Annotated[tuple[Integers, ...], "for each of them the columns of the row"]
+    sources: Annotated[
+        tuple[tuple[str, int], ...],
+        "for each of them an agent, and an entry of its observation, where it is found first",
+    ]
+    entries: Annotated[Integers, "columns of the policy's output that are the agent's action"]
 
 
 def policy_columns(env: MultiAgentVectorEnv, view: View, agent: str) -> PolicyColumns:

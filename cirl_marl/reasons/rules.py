@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from cirl_marl.controllers.basic import Arrays, Controller
 from cirl_marl.controllers.rollout import Rollout
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats, Integers
+from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.reasons.attribution import PairedDifference, paired_difference
 from cirl_marl.reasons.extras import trees
 from cirl_marl.reasons.interventions import RecordedEpisodes, Recorder, Substitution, play_episodes
@@ -45,21 +46,15 @@ class Condition:
     high: float
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """What an agent does under some conditions.
+    """What an agent does under some conditions."""
 
-    Attributes:
-        conditions: all of them, one for each signal that is asked for.
-        action: normalised, shape (entries,).
-        control: mean of what that is in the physical control, shape (entries,).
-        share: part of the decisions that it stands for.
-    """
-
-    conditions: tuple[Condition, ...]
-    action: Floats
-    control: Floats
-    share: float
+    conditions: Annotated[tuple[Condition, ...], "all of them, one for each signal that is asked for"]
+    action: Annotated[Floats, "normalised, shape (entries,)"]
+    control: Annotated[Floats, "mean of what that is in the physical control, shape (entries,)"]
+    share: Annotated[float, "part of the decisions that it stands for"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,17 +74,13 @@ class Rule:
     cost: PairedDifference
 
 
+@with_field_docs
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TeamRules:
-    """The rules of all agents.
+    """The rules of all agents."""
 
-    Attributes:
-        rules: agent by agent.
-        together: what changed in episodes in which all agents acted by their rules.
-    """
-
-    rules: tuple[Rule, ...]
-    together: PairedDifference
+    rules: Annotated[tuple[Rule, ...], "agent by agent"]
+    together: Annotated[PairedDifference, "what changed in episodes in which all agents acted by their rules"]
 
 
 class TreeController(Controller):
