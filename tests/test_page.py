@@ -19,7 +19,7 @@ from pages import HOSTILE, bottles_at, shown, world
 from cirl_marl import CirlError, Network, load_network
 from cirl_marl.definitions.catalogue import families
 from cirl_marl.definitions.sources import stated_numbers
-from cirl_marl.drawing.grouping import flow_diagrams, groups
+from cirl_marl.drawing.flow_diagram import flow_diagrams, groups
 from cirl_marl.drawing.layered import NARROW, layered_layout
 from cirl_marl.errors import DefinitionError
 from cirl_marl.evaluation import compare

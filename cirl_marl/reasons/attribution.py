@@ -20,7 +20,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.evaluation.statistics import Aggregate, over_episodes
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import with_field_docs
-from cirl_marl.reasons.extras import captum
+from cirl_marl.reasons.extras import module_for
 from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution, play_episodes
 from cirl_marl.reasons.observations import Signal, observation_entries, policy_columns, signal_of
 
@@ -154,7 +154,7 @@ def _integrated_gradients(
         memory = tuple(torch.as_tensor(state[sample]) for state in states)
     mean = rows.mean(axis=0, keepdims=True)
     inputs, baseline = torch.as_tensor(rows[sample]), torch.as_tensor(np.repeat(mean, len(sample), axis=0))
-    method = captum().IntegratedGradients(function)
+    method = module_for("inputs").IntegratedGradients(function)
     distance = (rows[sample] - mean)[:, [places[0] for places in columns.places]].astype(float)
     squares = (distance**2).sum(axis=0)
     sizes, slopes, residuals = np.zeros(len(columns.names)), [], []

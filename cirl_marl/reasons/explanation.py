@@ -99,9 +99,9 @@ def explain(
     if top < 1 or leaves < 2:
         raise CirlError(f"top must be at least 1 and leaves at least 2, got {top} and {leaves}")
     parts = possible if parts is None else tuple(parts)
-    for part, extra in (("inputs", extras.captum), ("rules", extras.trees)):
+    for part in extras.MODULES:
         if part in parts:
-            extra()
+            extras.module_for(part)
     return _explain_run(run, parts, min_service, episodes, first_seed(seed), top, leaves, progress)
 
 

@@ -7,21 +7,15 @@ from typing import Any
 
 from cirl_marl.errors import CirlError
 
-ADVICE = 'explanations of policies need {}: python -m pip install "cirl-marl[explain]"'
+MODULES = {"inputs": ("captum.attr", "captum"), "rules": ("sklearn.tree", "scikit-learn")}
+"""By part of an explanation the module that it needs, and the distribution that has it."""
 
 
-def captum() -> Any:
-    """Return ``captum.attr``; a ``CirlError`` says what to install."""
-    return _module("captum.attr", "captum")
-
-
-def trees() -> Any:
-    """Return ``sklearn.tree``; a ``CirlError`` says what to install."""
-    return _module("sklearn.tree", "scikit-learn")
-
-
-def _module(name: str, distribution: str) -> Any:
+def module_for(part: str) -> Any:
+    """Return the module that a part of an explanation needs; a ``CirlError`` says what to install."""
+    name, distribution = MODULES[part]
     try:
         return import_module(name)
     except ImportError as missing:
-        raise CirlError(ADVICE.format(distribution)) from missing
+        advice = f'explanations of policies need {distribution}: python -m pip install "cirl-marl[explain]"'
+        raise CirlError(advice) from missing

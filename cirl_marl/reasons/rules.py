@@ -21,7 +21,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.reasons.attribution import PairedDifference, paired_difference
-from cirl_marl.reasons.extras import trees
+from cirl_marl.reasons.extras import module_for
 from cirl_marl.reasons.interventions import RecordedEpisodes, Recorder, Substitution, play_episodes
 from cirl_marl.reasons.observations import PolicyColumns, Signal, policy_columns, signal_of
 
@@ -86,9 +86,9 @@ class TeamRules:
 class TreeController(Controller):
     """Acts for some agents by their trees; where it has none it does nothing."""
 
-    def __init__(self, trees_: Mapping[str, Any], columns: Mapping[str, PolicyColumns]) -> None:
+    def __init__(self, trees: Mapping[str, Any], columns: Mapping[str, PolicyColumns]) -> None:
         """Take a fitted tree for each agent, and where in the observations its features are."""
-        self._trees, self._columns = trees_, columns
+        self._trees, self._columns = trees, columns
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Get ready: there is nothing to remember."""
@@ -182,7 +182,7 @@ def distil_rules(
 
 def _fit(lesson: _Lessons, leaves: int) -> Any:
     variance, actions = float(lesson.actions.var(axis=0).mean()), lesson.actions
-    tree = trees().DecisionTreeRegressor(
+    tree = module_for("rules").DecisionTreeRegressor(
         max_leaf_nodes=max(2, leaves),
         min_samples_leaf=max(1, int(LEAF_SHARE * len(lesson.features))),
         min_impurity_decrease=max(RELATIVE_GAIN * variance, ABSOLUTE_GAIN),

@@ -11,8 +11,7 @@ import numpy as np
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.definitions.sources import StatedNumber, stated_numbers
 from cirl_marl.definitions.writer import fingerprint
-from cirl_marl.drawing.flow_diagram import FlowDiagram, lines
-from cirl_marl.drawing.grouping import flow_diagrams
+from cirl_marl.drawing.flow_diagram import FlowDiagram, flow_diagrams, lines
 from cirl_marl.drawing.layered import RibbonRoute
 from cirl_marl.errors import CirlError
 from cirl_marl.evaluation.statistics import Aggregate
