@@ -175,7 +175,12 @@ def staged(found: list[Stages], time: Floats, interval: float) -> Floats:
     for batch in found:
         trucked, used = (k * interval if k >= 0 else np.inf for k in (batch.trucked, batch.used))
         total += staged_circularity(
-            time, mass=BATCH_KG, success=batch.success, left=batch.left * interval, trucked=trucked, used=used
+            time,
+            mass=BATCH_KG,
+            success=batch.success,
+            departure=batch.left * interval,
+            truck_arrival=trucked,
+            use_end=used,
         )
     return total
 
@@ -475,7 +480,7 @@ def test_summary_reports_the_time_window(controller: Controller, sorted_items: i
         [0.1],
         success=success,
         use=use * interval,
-        sorting=(empty - entered) * interval,
+        sorting_time=(empty - entered) * interval,
         truck=(trucked - empty) * interval,
         incineration=after * interval,
     )

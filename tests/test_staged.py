@@ -18,7 +18,7 @@ from cirl_marl.network.batch_circularity import staged_circularity, time_window_
 def test_time_window_circularity_of_ciro(masses: tuple[float, ...], success: float, published: float) -> None:
     """The published figures, with a sorting time of a day, to the digits that are known."""
     found = time_window_circularity(
-        masses, (0.1, 0.95), success=success, use=2_592_000, sorting=86_400, truck=3_600, incineration=86_400
+        masses, (0.1, 0.95), success=success, use=2_592_000, sorting_time=86_400, truck=3_600, incineration=86_400
     )
     digits = len(str(published).split(".")[1])
     assert round(found, digits) == published
@@ -34,7 +34,8 @@ def test_time_window_is_twice_the_mean_of_the_stages() -> None:
         edges = np.array([0.0, trucked, used, used + incineration])
         at = (edges[1:] + edges[:-1]) / 2  # one point within each stage
         mean = np.dot(
-            staged_circularity(at, mass=7.0, success=success, left=0.0, trucked=trucked, used=used), np.diff(edges)
+            staged_circularity(at, mass=7.0, success=success, departure=0.0, truck_arrival=trucked, use_end=used),
+            np.diff(edges),
         )
         times = {"use": use, "sorting": sorting, "truck": truck, "incineration": incineration}
         expected = 2.0 * 0.3 * mean / edges[-1]
@@ -64,4 +65,4 @@ def test_times_without_meaning_are_refused(changes: dict[str, Any], message: str
         time_window_circularity(**(usual | changes))
     if "success" in changes:
         with pytest.raises(CirlError, match=message):
-            staged_circularity([1.0], mass=7.0, left=0.0, trucked=3.0, used=6.0, **changes)
+            staged_circularity([1.0], mass=7.0, departure=0.0, truck_arrival=3.0, use_end=6.0, **changes)

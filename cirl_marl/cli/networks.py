@@ -191,12 +191,11 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
 def _check_network(source: str, progress: Callable[[float], None]) -> None:
     from cirl_marl.controllers.lint import lint_warnings
     from cirl_marl.definitions.catalogue import load_network
-    from cirl_marl.definitions.reader import Definition
     from cirl_marl.environments.vector import MultiAgentVectorEnv
 
     network = load_network(source)
     assert network.source is not None
-    Definition(network.source).check(network.region)
+    definition(network.source).check(network.region)
     for i, each in enumerate((network, *network.scenarios.values()), start=1):
         try:
             MultiAgentVectorEnv(

@@ -20,13 +20,13 @@ CHECKOUT = Path(__file__).parent.parent.parent
 
 def folder(kind: str) -> Path:
     """Return the folder of definitions ``envs`` or ``agents``, of the installed package or of a checkout."""
-    packaged = IN_PACKAGE / kind
-    if packaged.is_dir():
-        return packaged
+    installed = IN_PACKAGE / kind
+    if installed.is_dir():
+        return installed
     beside = CHECKOUT / kind
     if beside.is_dir() and (CHECKOUT / "cirl_marl" / "definitions" / "catalogue.py").samefile(__file__):
         return beside
-    raise CirlError(f"the catalogue folder '{kind}' is missing: looked in {packaged} and {beside}")
+    raise CirlError(f"the catalogue folder '{kind}' is missing: looked in {installed} and {beside}")
 
 
 def networks() -> list[str]:
@@ -91,27 +91,27 @@ def recipe_path(name: str | Path) -> Path:
 
 def _in_catalogue(name: str) -> tuple[Path, str]:
     """Return file and region of a network; only files with whose names it begins are read, the longest name first."""
-    for path in sorted(folder("envs").glob("*.toml"), key=lambda each: -len(each.stem)):
-        if name.startswith(path.stem) and name in (found := _regions(path)):
-            return path, found[name]
-    known = networks()
-    regions = [each for each in known if each.startswith(f"{name}_")]
-    raise CirlError(f"{unknown('network', name, regions or known)} A file of your own must end in .toml.")
+    for path in sorted(folder("envs").glob("*.toml"), key=lambda path_: -len(path_.stem)):
+        if name.startswith(path.stem) and name in (regions_ := _regions(path)):
+            return path, regions_[name]
+    names = networks()
+    regions = [path_ for path_ in names if path_.startswith(f"{name}_")]
+    raise CirlError(f"{unknown('network', name, regions or names)} A file of your own must end in .toml.")
 
 
 def _regions(path: Path) -> dict[str, str]:
     """Return the regions of a definition by the names of their networks; the empty one if it has none."""
-    return {f"{path.stem}_{region}": region for region in _definition(path).regions} or {path.stem: ""}
+    return {f"{path.stem}_{region}": region for region in definition(path).regions} or {path.stem: ""}
 
 
-def _definition(path: Path) -> Definition:
+def definition(path: Path) -> Definition:
     """Return a definition, as it was read before if neither it nor its data files have been edited since."""
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
-    found = _read(path.resolve(), stamp)
-    if found.files.has_changed:
+    latest = _read(path.resolve(), stamp)
+    if latest.files.has_changed:
         _read.cache_clear()
-        found = _read(path.resolve(), stamp)
-    return found
+        latest = _read(path.resolve(), stamp)
+    return latest
 
 
 @lru_cache(maxsize=64)

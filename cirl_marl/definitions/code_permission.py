@@ -7,28 +7,28 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-_ALLOWED = ContextVar("_ALLOWED", default=False)
+_PERMISSION = ContextVar("_ALLOWED", default=False)
 
 
 @contextmanager
-def code_allowed(allowed: bool = True) -> Iterator[None]:
-    """Let definitions that are read in the block import the models that they name, if ``allowed``."""
-    token = _ALLOWED.set(allowed or _ALLOWED.get())
+def code_allowed(permission: bool = True) -> Iterator[None]:
+    """Let definitions that are read in the block import the models that they name, if ``permission``."""
+    token = _PERMISSION.set(permission or _PERMISSION.get())
     try:
         yield
     finally:
-        _ALLOWED.reset(token)
+        _PERMISSION.reset(token)
 
 
 def is_code_allowed() -> bool:
     """Return whether definitions may import the models that they name; other processes have to be told."""
-    return _ALLOWED.get()
+    return _PERMISSION.get()
 
 
 def refusal(kind: str) -> str | None:
     """Return why the model of that kind may not be imported; None if it may, or need not be."""
     module = kind.partition(":")[0]
-    if ":" not in kind or _ALLOWED.get() or module in sys.modules:
+    if ":" not in kind or _PERMISSION.get() or module in sys.modules:
         return None
     return (
         f"kind '{kind}' would import '{module}', and run what it says; if you trust it, say so: "

@@ -46,7 +46,7 @@ class Converter:
         self.mistakes: list[str] = []
         self.data_files: set[str] = set()
         self.uncertain: dict[str, Spread] = {}
-        self._reported: set[str] = set()
+        self._file_errors: set[str] = set()
         mass, time = table.units.mass, table.units.time
         self.targets = {"mass": mass, "time": time, "rate": f"1/({time})", "flow": f"({mass})/({time})", "steps": "1"}
         self.factors: dict[tuple[str, str], float] = {}
@@ -54,8 +54,8 @@ class Converter:
         episode: Any = table.episode
         self.clock = Clock(episode.start, time)
 
-    def network(self, **known: Any) -> Network:
-        """Return the network with fields that are ``known`` besides.
+    def network(self, **fields: Any) -> Network:
+        """Return the network with fields that are ``fields`` besides.
 
         Raises:
             NetworkError: with every inconsistent unit and unusable column, or else every fault of the network.
@@ -74,7 +74,9 @@ class Converter:
         parts: dict[str, Any] = {
             "nodes": tuple(self._compartment(Node, id_, node, f"nodes.{id_}") for id_, node in table.nodes.items()),
             "arcs": tuple(self._compartment(Arc, id_, arc, f"arcs.{id_}") for id_, arc in table.arcs.items()),
-            "services": tuple(self._part(elements.Service, each, f"services.{id_}", id=id_) for id_, each in services),
+            "services": tuple(
+                self._part(elements.Service, service, f"services.{id_}", id=id_) for id_, service in services
+            ),
             "episode": self._part(elements.Episode, table.episode, "episode"),
             "objective": self._part(elements.Objective, table.objective, "objective"),
             "observation": self._part(elements.Observation, table.observation, "observation"),
@@ -94,205 +96,207 @@ class Converter:
             default_agents=tuple(table.agents),
             uncertain=self.uncertain,
             **parts,
-            **known,
+            **fields,
         )
 
-    def _part(self, made: type[Any], table: Any, where: str, **known: Any) -> Any:
-        """Return a part of the network: ``known`` fields, those that its table gives, and defaults for the others."""
-        for name, declared in declarations(made).items():
-            given = getattr(table, name, None)
-            if name not in known and given is not None:
-                known[name] = self._read(declared, given, table, f"{where}.{declared.key or name}")
+    def _part(self, record: type[Any], table: Any, path: str, **fields: Any) -> Any:
+        """Return a part of the network: ``fields`` fields, those that its table gives, and defaults for the others."""
+        for name, declaration in declarations(record).items():
+            entry = getattr(table, name, None)
+            if name not in fields and entry is not None:
+                fields[name] = self._read(declaration, entry, table, f"{path}.{declaration.key or name}")
         try:
-            return made(**known)
+            return record(**fields)
         except NetworkError as error:
-            raise NetworkError(self.table.name, [f"{where}: {problem}" for problem in error.problems]) from None
+            raise NetworkError(self.table.name, [f"{path}: {problem}" for problem in error.problems]) from None
 
-    def _read(self, declared: Declaration, given: Any, table: Any, where: str) -> Any:
+    def _read(self, declaration: Declaration, entry: Any, table: Any, path: str) -> Any:
         """Return what a declared field is in Python."""
-        if isinstance(declared, Quantity):
-            kind = declared.kind(table)
-            if declared.unit_of_table:
-                return given * self._factor(table.unit, kind, where)
-            value: Any = None if given == declared.none_word else self._value(given, kind, where)
-            if isinstance(value, Series) and not declared.varies:
-                self.mistakes.append(f"{where}: {CONSTANT}")
+        if isinstance(declaration, Quantity):
+            kind = declaration.kind(table)
+            if declaration.unit_of_table:
+                return entry * self._factor(table.unit, kind, path)
+            value: Any = None if entry == declaration.none_word else self._value(entry, kind, path)
+            if isinstance(value, Series) and not declaration.varies:
+                self.mistakes.append(f"{path}: {CONSTANT}")
                 return 1
             if kind != "steps":
                 return value
             if value != int(value):
-                self.mistakes.append(f"{where}: {value} must be a whole number of control intervals")
+                self.mistakes.append(f"{path}: {value} must be a whole number of control intervals")
             return int(value)
-        if isinstance(declared, Subtable) and declared.of == "lifetime":
-            return self._part(elements.Lifetime, given, where)
-        if isinstance(given, Range):
-            assert isinstance(declared, Numbers)
-            scale = self._factor(given.unit, declared.of, where)
-            return given.low * scale, given.high * scale
-        if isinstance(declared, Numbers) and declared.table_form == "range":
-            stock = self._number(given, declared.of, where)
+        if isinstance(declaration, Subtable) and declaration.of == "lifetime":
+            return self._part(elements.Lifetime, entry, path)
+        if isinstance(entry, Range):
+            assert isinstance(declaration, Numbers)
+            scale = self._factor(entry.unit, declaration.of, path)
+            return entry.low * scale, entry.high * scale
+        if isinstance(declaration, Numbers) and declaration.table_form == "range":
+            stock = self._number(entry, declaration.of, path)
             return stock, stock
-        if isinstance(given, Batches):
-            return self._batches(given, where)
-        return tuple(given) if isinstance(given, list) else given
+        if isinstance(entry, Batches):
+            return self._batches(entry, path)
+        return tuple(entry) if isinstance(entry, list) else entry
 
-    def _compartment(self, made: type[Node] | type[Arc], id_: str, table: Any, where: str) -> Any:
+    def _compartment(self, record: type[Node] | type[Arc], id_: str, table: Any, path: str) -> Any:
         """Return a node or an arc, whose control depends on its model, with the scale of all that state none."""
-        known = {"id": id_, **self._model(table.model, f"{where}.model")}
-        known |= {"model": known.get("model"), "control": self._control(table.control, known.get("model"), where)}
-        if made is Arc:
-            self._check_law(table, where)
+        fields = {"id": id_, **self._model(table.model, f"{path}.model")}
+        fields |= {"model": fields.get("model"), "control": self._control(table.control, fields.get("model"), path)}
+        if record is Arc:
+            self._check_law(table, path)
         if table.scale is None:
-            scale = declarations(made)["scale"]
+            scale = declarations(record)["scale"]
             assert isinstance(scale, Quantity)
-            known["scale"] = self.scales[scale.kind(table)]
-        return self._part(made, table, where, **known)
+            fields["scale"] = self.scales[scale.kind(table)]
+        return self._part(record, table, path, **fields)
 
-    def _check_law(self, arc: Any, where: str) -> None:
+    def _check_law(self, arc: Any, path: str) -> None:
         """Note an arc that lacks what its law needs, or gives what only others take."""
-        given = [key for key in FLOW_KEYS if getattr(arc, key) is not None]
-        needed = [key for key in FLOW_KEYS if key in LAW_FIELDS[Law(arc.law)]]
-        if len(given) != min(1, len(needed)) or not set(given) <= set(needed):
-            asked = " or ".join(needed) or f"none of {', '.join(FLOW_KEYS)}"
-            self.mistakes.append(f"{where}: law '{arc.law}' needs {asked}, got {given or 'none'}")
+        keys = [key for key in FLOW_KEYS if getattr(arc, key) is not None]
+        options = [key for key in FLOW_KEYS if key in LAW_FIELDS[Law(arc.law)]]
+        if len(keys) != min(1, len(options)) or not set(keys) <= set(options):
+            demand = " or ".join(options) or f"none of {', '.join(FLOW_KEYS)}"
+            self.mistakes.append(f"{path}: law '{arc.law}' needs {demand}, got {keys or 'none'}")
         if arc.share is not None and Law(arc.law) is not Law.SHARE:
-            self.mistakes.append(f"{where}.share: law '{arc.law}' takes none; shares need law = \"share\"")
+            self.mistakes.append(f"{path}.share: law '{arc.law}' takes none; shares need law = \"share\"")
 
-    def _batches(self, table: Batches, where: str) -> tuple[tuple[float, float], ...]:
+    def _batches(self, table: Batches, path: str) -> tuple[tuple[float, float], ...]:
         if len(table.times) != len(table.masses):
-            self.mistakes.append(f"{where}: {len(table.times)} times and {len(table.masses)} masses")
+            self.mistakes.append(f"{path}: {len(table.times)} times and {len(table.masses)} masses")
             return ()
-        clock = self._factor(table.time_unit, "time", f"{where}.time_unit")
-        unit = self._factor(table.unit, "mass", f"{where}.unit")
+        clock = self._factor(table.time_unit, "time", f"{path}.time_unit")
+        unit = self._factor(table.unit, "mass", f"{path}.unit")
         return tuple((time * clock, mass * unit) for time, mass in zip(table.times, table.masses, strict=True))
 
-    def _model(self, table: ModelTable | None, where: str) -> dict[str, Any]:
+    def _model(self, table: ModelTable | None, path: str) -> dict[str, Any]:
         """Return the model of a compartment and the initial ranges of its inner states, as keywords."""
         if table is None:
             return {}
         form = {} if table.form is None else {"form": table.form}
-        if (why := refusal(table.kind)) is not None:
-            self.mistakes.append(f"{where}: {why}")
+        if (refusal_ := refusal(table.kind)) is not None:
+            self.mistakes.append(f"{path}: {refusal_}")
             return {}
         try:
             kind = model_class(table.kind)
             if mistakes := list(parameter_mistakes(kind, table.parameters, form)):
-                self.mistakes += (f"{where}: {mistake}" for mistake in mistakes)
+                self.mistakes += (f"{path}: {mistake}" for mistake in mistakes)
                 return {}
             model = kind(**table.parameters | form)
         except CirlError as error:
-            self.mistakes.append(f"{where}: {error}")
+            self.mistakes.append(f"{path}: {error}")
             return {}
         except (ArithmeticError, TypeError, ValueError) as error:
-            self.mistakes.append(f"{where}: '{table.kind}' refuses its parameters: {type(error).__name__}: {error}")
+            self.mistakes.append(f"{path}: '{table.kind}' refuses its parameters: {type(error).__name__}: {error}")
             return {}
-        ranged = model.ranged_states
-        for name in (*table.initial, *ranged):
-            if name not in ranged or name not in table.initial:
-                missing = [state for state in ranged if state not in table.initial]
-                told = f"'{name}' is missing" if name in ranged else unknown("inner state", name, missing)
-                self.mistakes.append(f"{where}.initial: {told}")
-        ranges = [table.initial[name] for name in ranged if name in table.initial]
+        with_range = model.ranged_states
+        for name in (*table.initial, *with_range):
+            if name not in with_range or name not in table.initial:
+                without_range = [state for state in with_range if state not in table.initial]
+                faults = f"'{name}' is missing" if name in with_range else unknown("inner state", name, without_range)
+                self.mistakes.append(f"{path}.initial: {faults}")
+        ranges = [table.initial[name] for name in with_range if name in table.initial]
         scale = table.reward_scale
         return {
             "model": model,
             "inner": tuple((span.low, span.high) for span in ranges),
-            "reward_scale": 1.0 if scale is None else self._value(scale, "1", f"{where}.reward_scale"),
+            "reward_scale": 1.0 if scale is None else self._value(scale, "1", f"{path}.reward_scale"),
         }
 
-    def _control(self, control: Any, model: CompartmentModel | None, where: str) -> Control | None:
-        where = f"{where}.control"
+    def _control(self, control: Any, model: CompartmentModel | None, path: str) -> Control | None:
+        path = f"{path}.control"
         if control is None:
             return None
-        taken = control.unit if model is None else model.input_unit
-        target = {ControlKind.FLOW: "flow", ControlKind.INPUT: taken}.get(control.kind, "1")
+        native_unit = control.unit if model is None else model.input_unit
+        target = {ControlKind.FLOW: "flow", ControlKind.INPUT: native_unit}.get(control.kind, "1")
         if target is None and model is not None and control.unit != "1":
             remedy = "give its class one, or write unit = '1' and the numbers as the model takes them"
-            stated = f"unit '{control.unit}': model '{model.kind}' states no input_unit to convert to"
-            self.mistakes.append(f"{where}: {stated}; {remedy}")
+            fault = f"unit '{control.unit}': model '{model.kind}' states no input_unit to convert to"
+            self.mistakes.append(f"{path}: {fault}; {remedy}")
             return None
-        unit = self._factor(control.unit, target or "1", where)
+        unit = self._factor(control.unit, target or "1", path)
         sides = {
-            side: self._in_time(getattr(control, side), unit, f"{where}.{side}") for side in ("low", "neutral", "high")
+            side: self._in_time(getattr(control, side), unit, f"{path}.{side}") for side in ("low", "neutral", "high")
         }
         return Control(kind=control.kind, **sides)
 
-    def _number(self, quantity: Any, kind: str, where: str) -> float:
+    def _number(self, quantity: Any, kind: str, path: str) -> float:
         """Return a quantity that does not change in time."""
-        value = self._value(quantity, kind, where)
+        value = self._value(quantity, kind, path)
         if isinstance(value, Series):
-            self.mistakes.append(f"{where}: {CONSTANT}")
+            self.mistakes.append(f"{path}: {CONSTANT}")
             return 1.0
         return value
 
-    def _value(self, quantity: Any, kind: str, where: str) -> Value:
-        other, name = quantity.multiplied_by, quantity.unit
-        if other is not None:
-            name = f"({name})*({other.unit})"
-            if other.multiplied_by is not None:
+    def _value(self, quantity: Any, kind: str, path: str) -> Value:
+        multiplier, name = quantity.multiplied_by, quantity.unit
+        if multiplier is not None:
+            name = f"({name})*({multiplier.unit})"
+            if multiplier.multiplied_by is not None:
                 self.mistakes.append(
-                    f"{where}.multiplied_by.multiplied_by: a quantity has one factor; multiply the others"
+                    f"{path}.multiplied_by.multiplied_by: a quantity has one factor; multiply the others"
                 )
-        unit = self._factor(name, kind, where)
-        value = self._in_time(quantity.value if isinstance(quantity, QuantityTable) else quantity, unit, where)
-        self._spread(quantity, value, unit, where)
-        if other is None:
+        unit = self._factor(name, kind, path)
+        value = self._in_time(quantity.value if isinstance(quantity, QuantityTable) else quantity, unit, path)
+        self._spread(quantity, value, unit, path)
+        if multiplier is None:
             return value
-        where = f"{where}.multiplied_by"
-        return product(value, self._in_time(other.value if isinstance(other, QuantityTable) else other, 1.0, where))
+        path = f"{path}.multiplied_by"
+        return product(
+            value, self._in_time(multiplier.value if isinstance(multiplier, QuantityTable) else multiplier, 1.0, path)
+        )
 
-    def _spread(self, quantity: Any, value: Value, unit: float, where: str) -> None:
+    def _spread(self, quantity: Any, value: Value, unit: float, path: str) -> None:
         """Note how a quantity spreads, if it does."""
         deviation, span = quantity.deviation, quantity.range
         relative = float(Decimal(deviation.rstrip("% ")) / 100) if isinstance(deviation, str) else None
         if deviation is None and span is None:
             if quantity.distribution is not None:
-                self.mistakes.append(f"{where}.distribution: '{quantity.distribution}' needs a deviation or a range")
+                self.mistakes.append(f"{path}.distribution: '{quantity.distribution}' needs a deviation or a range")
             return
         middle = float(np.mean(value.values)) if isinstance(value, Series) else float(value)
         if deviation is not None and relative is None:
             relative = deviation * unit / middle if middle > 0 else 0.0
         if middle <= 0 or (relative is not None and relative <= 0):
-            told = f"deviation {deviation}" if middle > 0 else f"the number is {middle / unit:g}"
-            self.mistakes.append(f"{where}: {told}: what spreads, and its deviation, must be positive")
+            fault = f"deviation {deviation}" if middle > 0 else f"the number is {middle / unit:g}"
+            self.mistakes.append(f"{path}: {fault}: what spreads, and its deviation, must be positive")
             return
         low, high = (0.0, math.inf) if span is None else (float(end * unit / middle) for end in span)
         if low >= high or not low <= 1 <= high:
-            wanted = "contain the number" if low < high else "have its lower end first"
-            self.mistakes.append(f"{where}.range: {list(span or ())} must {wanted}, {middle / unit:g}")
+            demand = "contain the number" if low < high else "have its lower end first"
+            self.mistakes.append(f"{path}.range: {list(span or ())} must {demand}, {middle / unit:g}")
             return
         kind = quantity.distribution or ("uniform" if deviation is None else "normal")
-        self.uncertain[where] = Spread(deviation=relative, low=low, high=high, distribution=kind)
+        self.uncertain[path] = Spread(deviation=relative, low=low, high=high, distribution=kind)
 
-    def _in_time(self, given: float | AmountSeries | AmountColumn, unit: float, where: str) -> Value:
+    def _in_time(self, entry: float | AmountSeries | AmountColumn, unit: float, path: str) -> Value:
         """Return a number, or one that changes in time, in the network's units, of which its own is ``unit``."""
-        if not isinstance(given, AmountSeries | AmountColumn):
-            return given * unit
+        if not isinstance(entry, AmountSeries | AmountColumn):
+            return entry * unit
         try:
-            if isinstance(given, AmountSeries):
-                return inline_series(given, unit, self.clock)
-            texts = {key: self._with_region(text, f"{where}.where.{key}") for key, text in given.where.items()}
-            found = column_value(given, texts, self.files, unit, self.clock)
+            if isinstance(entry, AmountSeries):
+                return inline_series(entry, unit, self.clock)
+            texts = {key: self._with_region(text, f"{path}.where.{key}") for key, text in entry.where.items()}
+            column = column_value(entry, texts, self.files, unit, self.clock)
         except CirlError as error:
-            if str(error) not in self._reported or isinstance(given, AmountSeries):
-                self.mistakes.append(f"{where}: {error}")
-            self._reported.add(str(error))  # a file that cannot be read is told once, not for each of its columns
+            if str(error) not in self._file_errors or isinstance(entry, AmountSeries):
+                self.mistakes.append(f"{path}: {error}")
+            self._file_errors.add(str(error))  # a file that cannot be read is told once, not for each of its columns
             return 0.0
-        self.data_files.add(given.file)
-        return found
+        self.data_files.add(entry.file)
+        return column
 
-    def _with_region(self, text: str, where: str) -> str:
+    def _with_region(self, text: str, path: str) -> str:
         """Return a text of the file with that of the region in its place."""
         if REGION in text and not self.region:
-            self.mistakes.append(f"{where}: '{text}': a definition without [regions] has no {REGION}")
+            self.mistakes.append(f"{path}: '{text}': a definition without [regions] has no {REGION}")
         return text.replace(REGION, self.table.regions.get(self.region, ""))
 
-    def _factor(self, unit: str, kind: str, where: str) -> float:
+    def _factor(self, unit: str, kind: str, path: str) -> float:
         """Return what converts ``unit`` to the network's unit of a kind, or to the unit ``kind`` if it is none."""
         if (unit, kind) not in self.factors:
             try:
                 self.factors[unit, kind] = factor(unit, self.targets.get(kind, kind))
             except CirlError as error:
-                self.mistakes.append(f"{where}: {error}" + (f"; {HINTS[kind]}" if kind in HINTS else ""))
+                self.mistakes.append(f"{path}: {error}" + (f"; {HINTS[kind]}" if kind in HINTS else ""))
                 return 1.0
         return self.factors[unit, kind]

@@ -65,15 +65,16 @@ class DataFiles:
         self._plain_files[name] = hashlib.sha256(path.read_bytes()).hexdigest()
         return path
 
-    def column(self, name: str, column: str, where: Mapping[str, str], times: str | None) -> Column:
-        """Return the numbers of ``column`` in the rows whose columns have the texts of ``where``.
+    def column(self, name: str, column: str, conditions: Mapping[str, str], times: str | None) -> Column:
+        """Return the numbers of ``column`` in the rows whose columns have the texts of ``conditions``.
 
-        ``times`` is the column of their times; None: ``year``, if there is such a column and ``where`` leaves it free.
+        ``times`` is the column of their times; None: ``year``, if there is such a column and ``conditions`` leave it
+        free.
 
         Raises:
             CirlError: naming file, line, column and value, with what to do.
         """
-        return self._table(name).column(column, where, times)
+        return self._table(name).column(column, conditions, times)
 
     def _table(self, name: str) -> _Table:
         return self._with_file_errors(name, self._read)
@@ -93,16 +94,16 @@ class DataFiles:
 
     def _path_of(self, name: str) -> Path:
         """Return where a file is, which is not read again unless it is edited."""
-        path, told = self._folder / name, f"file '{name}'"
+        path, subject = self._folder / name, f"file '{name}'"
         if Path(name).is_absolute() or ".." in Path(name).parts or not path.resolve().is_relative_to(self._folder):
-            raise CirlError(f"{told}: must lie in {self._folder}, the folder of the definition, or below it")
+            raise CirlError(f"{subject}: must lie in {self._folder}, the folder of the definition, or below it")
         if not path.is_file():
             if path.exists() or path.is_symlink():
-                raise CirlError(f"{told}: is no file")
-            beside = sorted(each.name for each in path.parent.glob(f"*{path.suffix or '.csv'}"))
-            raise CirlError(f"{told}: is not there; {unknown(f'file in {path.parent}', path.name, beside)}")
+                raise CirlError(f"{subject}: is no file")
+            beside = sorted(file.name for file in path.parent.glob(f"*{path.suffix or '.csv'}"))
+            raise CirlError(f"{subject}: is not there; {unknown(f'file in {path.parent}', path.name, beside)}")
         if path.stat().st_size > LARGEST:
-            raise CirlError(f"{told}: is larger than {LARGEST // 10**6} MB; leave out rows that no 'where' chooses")
+            raise CirlError(f"{subject}: is larger than {LARGEST // 10**6} MB; leave out rows that no 'where' chooses")
         self._stamps[path] = path.stat().st_mtime_ns
         return path
 
@@ -115,12 +116,12 @@ class _Table:
         try:
             reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
             # csv counts the line on which a row ends
-            numbered = [(reader.line_num, row) for row in reader if row]
+            lines = [(reader.line_num, row) for row in reader if row]
         except (UnicodeDecodeError, csv.Error) as error:
             raise CirlError(f"file '{name}': is no CSV file in UTF-8: {error}") from error
-        if not numbered:
+        if not lines:
             raise CirlError(f"file '{name}': is empty; its first line names the columns")
-        (_, self.header), *self.rows = numbered
+        (_, self.header), *self.rows = lines
         self.place = {column: i for i, column in enumerate(self.header)}
         if len(self.place) != len(self.header):
             twice = next(each for each in self.header if self.header.count(each) > 1)
@@ -130,17 +131,17 @@ class _Table:
                 raise CirlError(f"file '{name}', line {line}: {len(row)} cells in {len(self.header)} columns")
         self._indices: dict[tuple[int, ...], dict[tuple[str, ...], list[int]]] = {}
 
-    def column(self, column: str, where: Mapping[str, str], times: str | None) -> Column:
-        if times is None and YEAR in self.place and YEAR not in where:
+    def column(self, column: str, conditions: Mapping[str, str], times: str | None) -> Column:
+        if times is None and YEAR in self.place and YEAR not in conditions:
             times = YEAR
-        for each in (column, *where, *([] if times is None else [times])):
-            if each not in self.place:
-                told = f"file '{self.name}': {unknown('column', each, self.header)}"
-                raise CirlError(told + ("" if len(self.header) > 1 else " Separate columns with commas."))
-        chosen = self._matching_rows(where)
+        for key in (column, *conditions, *([] if times is None else [times])):
+            if key not in self.place:
+                fault = f"file '{self.name}': {unknown('column', key, self.header)}"
+                raise CirlError(fault + ("" if len(self.header) > 1 else " Separate columns with commas."))
+        chosen = self._matching_rows(conditions)
         lines = [self.rows[i][0] for i in chosen]
         values = [self._number(*self.rows[i], column) for i in chosen]
-        origin = f"{self.name}, column '{column}'" + (f", where {_conditions(where)}" if where else "")
+        origin = f"{self.name}, column '{column}'" + (f", where {_conditions(conditions)}" if conditions else "")
         if times is not None:
             return Column(self._times(chosen, times), values, origin)
         if len(chosen) > 1:
@@ -148,26 +149,26 @@ class _Table:
             raise CirlError(f"{origin}: lines {lines[0]} and {lines[1]} both match; {remedy}")
         return Column(None, values, origin)
 
-    def _matching_rows(self, where: Mapping[str, str]) -> list[int]:
-        """Return the rows that match, by an index of the columns in ``where``: many series name the same ones."""
-        keys = tuple(self.place[each] for each in where)
+    def _matching_rows(self, conditions: Mapping[str, str]) -> list[int]:
+        """Return the rows that match, by an index of the columns in ``conditions``: many series name the same ones."""
+        keys = tuple(self.place[each] for each in conditions)
         if keys not in self._indices:
             index: dict[tuple[str, ...], list[int]] = {}
             for i, (_, row) in enumerate(self.rows):
                 index.setdefault(tuple(row[key] for key in keys), []).append(i)
             self._indices[keys] = index
-        chosen = self._indices[keys].get(tuple(where.values()))
+        chosen = self._indices[keys].get(tuple(conditions.values()))
         if not chosen:
-            raise CirlError(f"file '{self.name}': {self._mismatch(where)}")
+            raise CirlError(f"file '{self.name}': {self._mismatch(conditions)}")
         return chosen
 
-    def _mismatch(self, where: Mapping[str, str]) -> str:
-        """Say which entry of ``where`` leaves no row, with the nearest value that would leave one."""
+    def _mismatch(self, conditions: Mapping[str, str]) -> str:
+        """Say which entry of ``conditions`` leaves no row, with the nearest value that would leave one."""
         rows, before = [row for _, row in self.rows], ""
-        for key, value in where.items():
-            known = dict.fromkeys(row[self.place[key]] for row in rows)
-            if value not in known:
-                return f"no row matches 'where'{before}: {unknown(key, value, sorted(known))}"
+        for key, value in conditions.items():
+            options = dict.fromkeys(row[self.place[key]] for row in rows)
+            if value not in options:
+                return f"no row matches 'where'{before}: {unknown(key, value, sorted(options))}"
             rows = [row for row in rows if row[self.place[key]] == value]
             before += f"{' and' if before else ' with'} {key} = '{value}'"
         return "has no rows"
@@ -185,23 +186,23 @@ class _Table:
 
     def _times(self, chosen: Iterable[int], column: str) -> list[YearOrDate]:
         """Return the times of rows, which increase; all numbers or all dates, as the first is."""
-        dated = _date(self.rows[next(iter(chosen))][1][self.place[column]]) is not None
-        seen: dict[Any, int] = {}
+        has_dates = _date(self.rows[next(iter(chosen))][1][self.place[column]]) is not None
+        line_of: dict[Any, int] = {}
         latest: Any = None
         for i in chosen:
             line, row = self.rows[i]
-            told = f"file '{self.name}', line {line}, column '{column}'"
+            subject = f"file '{self.name}', line {line}, column '{column}'"
             text = row[self.place[column]]
-            time: Any = _date(text) if dated else self._number(line, row, column)
+            time: Any = _date(text) if has_dates else self._number(line, row, column)
             if time is None:
-                raise CirlError(f"{told}: '{text}' is no date such as 2020-03-01, as others are")
-            if time in seen:
+                raise CirlError(f"{subject}: '{text}' is no date such as 2020-03-01, as others are")
+            if time in line_of:
                 remedy = "fix more columns in 'where', or leave one row out"
-                raise CirlError(f"{told}: '{text}' stands in line {seen[time]} too; {remedy}")
-            if seen and time < latest:
-                raise CirlError(f"{told}: '{text}' comes after a later time; sort the rows by '{column}'")
-            seen[time], latest = line, time
-        return list(seen)
+                raise CirlError(f"{subject}: '{text}' stands in line {line_of[time]} too; {remedy}")
+            if line_of and time < latest:
+                raise CirlError(f"{subject}: '{text}' comes after a later time; sort the rows by '{column}'")
+            line_of[time], latest = line, time
+        return list(line_of)
 
 
 def _date(text: str) -> date | None:
@@ -211,5 +212,5 @@ def _date(text: str) -> date | None:
         return None
 
 
-def _conditions(where: Mapping[str, str]) -> str:
-    return " and ".join(f"{key} = '{value}'" for key, value in where.items())
+def _conditions(conditions: Mapping[str, str]) -> str:
+    return " and ".join(f"{key} = '{value}'" for key, value in conditions.items())

@@ -65,17 +65,17 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
     if item["type"] == "missing":
         return f"{path}: missing"
     if item["type"] in ("model_type", "model_attributes_type"):
-        wanted = _model_at(model, location)
-        keys = [f.alias or name for name, f in wanted.model_fields.items() if f.is_required()] if wanted else []
+        table = _model_at(model, location)
+        keys = [f.alias or name for name, f in table.model_fields.items() if f.is_required()] if table else []
         return f"{path}: must be a table {{ {', '.join(f'{key} = …' for key in keys)} }}, got {item['input']!r}"
     if item["type"] == "string_pattern_mismatch":
         return f"{path}: begins with a letter and has lower-case letters, digits and _ only, got {item['input']!r}"
     return f"{path}: {item['msg']}, got {item['input']!r}"
 
 
-def choices(expected: str) -> list[str]:
+def choices(sentence: str) -> list[str]:
     """Return the valid values that pydantic lists in a message."""
-    return [part.strip(" '") for part in expected.replace(" or ", ", ").split(",")]
+    return [part.strip(" '") for part in sentence.replace(" or ", ", ").split(",")]
 
 
 def _model_at(model: type[BaseModel], location: list[str]) -> type[BaseModel] | None:

@@ -55,10 +55,10 @@ def _key(key: str, field: FieldInfo) -> str:
     """Return the line of a key: what it takes, if that is a table of its own, and what it means."""
     kinds = [*quantities.forms(field.annotation).values(), field.annotation]
     kinds += get_args(field.annotation)
-    taken = [name for name, (table, _) in PARTS.items() if {table, *table.__bases__} & set(kinds)]
-    needed = "required" if field.is_required() else "may be left out"
+    tables = [name for name, (table, _) in PARTS.items() if {table, *table.__bases__} & set(kinds)]
+    necessity = "required" if field.is_required() else "may be left out"
     about = f": {field.description.replace('``', '`')}" if field.description else ""
-    return _wrap(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in taken), needed])}){about}.")
+    return _wrap(f"- `{key}` ({', '.join([*(f'[{name}](#{name})' for name in tables), necessity])}){about}.")
 
 
 def _wrap(line: str, indent: int = 2) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -14,14 +13,14 @@ COMMON_KEYS = ("name", "regions", "scenarios")
 
 def overlay(base: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``base`` with the tables of ``override`` laid over it, key by key, where they do not take its place."""
-    merged = {key: value for key, value in base.items() if key != "scenarios"}
+    result = {key: value for key, value in base.items() if key != "scenarios"}
     for key, value in override.items():
-        old = merged.get(key)
+        old = result.get(key)
         if isinstance(old, Mapping) and isinstance(value, Mapping) and not _takes_its_place(value, old):
-            merged[key] = overlay(old, value)
+            result[key] = overlay(old, value)
         else:
-            merged[key] = value
-    return merged
+            result[key] = value
+    return result
 
 
 def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
@@ -34,33 +33,34 @@ def _takes_its_place(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
 
 def without_paths(document: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of ``document`` less the tables at the dotted paths in ``override["without"]``, which exist."""
-    kept = copy.deepcopy(dict(document))
+    remainder = dict(document)
     for path in override.get("without", []):
         *parents, last = path.split(".")
-        table = kept
+        table = remainder
         for key in parents:
+            table[key] = dict(table[key])
             table = table[key]
         del table[last]
-    return kept
+    return remainder
 
 
-def path_mistakes(document: Mapping[str, Any], paths: Any, where: str) -> Iterator[str]:
+def path_mistakes(document: Mapping[str, Any], paths: Any, prefix: str) -> Iterator[str]:
     """Yield what is wrong with the dotted paths of a scenario's ``without``."""
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-        yield f"{where}without: must be a list of dotted paths, such as ['nodes.digester.model']"
+        yield f"{prefix}without: must be a list of dotted paths, such as ['nodes.digester.model']"
         return
     if len(set(paths)) != len(paths):
-        yield f"{where}without: names a path twice"
+        yield f"{prefix}without: names a path twice"
     for path in paths:
         if path.partition(".")[0] in COMMON_KEYS:
-            yield f"{where}without: '{path}': a scenario cannot set it"
-        for other in paths:
-            if path.startswith(f"{other}."):
-                yield f"{where}without: '{path}' lies in '{other}', which goes as a whole"
+            yield f"{prefix}without: '{path}': a scenario cannot set it"
+        for parent in paths:
+            if path.startswith(f"{parent}."):
+                yield f"{prefix}without: '{path}' lies in '{parent}', which goes as a whole"
         table: Any = document
         for key in path.split("."):
             if not isinstance(table, Mapping) or key not in table:
-                known = list(table) if isinstance(table, Mapping) else []
-                yield f"{where}without: '{path}': {unknown('key', key, known)}"
+                options = list(table) if isinstance(table, Mapping) else []
+                yield f"{prefix}without: '{path}': {unknown('key', key, options)}"
                 break
             table = table[key]

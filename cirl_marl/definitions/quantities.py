@@ -17,11 +17,11 @@ Source = Annotated[str, Field(min_length=1, description="where the number comes 
 PERCENT = r"^\d+(\.\d+)? ?%$"
 
 
-def _deviation(given: object) -> object:
-    if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
-        return given
-    if isinstance(given, str) and re.match(PERCENT, given):
-        return given
+def _deviation(number: object) -> object:
+    if isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number):
+        return number
+    if isinstance(number, str) and re.match(PERCENT, number):
+        return number
     raise PydanticCustomError("deviation", "must be a number in the unit of the quantity, or relative, as '5 %'")
 
 
@@ -76,9 +76,9 @@ class Range(Table):
     source: Source
 
 
-def _moment(given: object) -> object:
-    if isinstance(given, int | float | date) and not isinstance(given, bool | datetime):
-        return given
+def _moment(moment: object) -> object:
+    if isinstance(moment, int | float | date) and not isinstance(moment, bool | datetime):
+        return moment
     raise PydanticCustomError("moment", "must be a number, such as the year 2000 or 2000.5, or a date, as 2020-03-01")
 
 
@@ -145,8 +145,8 @@ WORD, VALUE, SERIES, COLUMN = FORMS = ("<word>", "<value>", "<series>", "<column
 """Tags of the forms in which a number that may vary is given; in pydantic's mistakes they stand among the keys."""
 
 
-def _form(given: object) -> str:
-    keys = set(given) if isinstance(given, dict) else set()
+def _form(entry: object) -> str:
+    keys = set(entry) if isinstance(entry, dict) else set()
     return COLUMN if {"file", "column", "where"} & keys else SERIES if {"times", "values"} & keys else VALUE
 
 
@@ -155,27 +155,27 @@ def number_forms(value: Any, series: Any, column: Any, word: str = "") -> Any:
 
     Without ``value`` it has to change in time.
     """
-    given = [(value, VALUE), (series, SERIES), (column, COLUMN)]
-    forms = [Annotated[kind, Tag(tag)] for kind, tag in given if kind is not None]
+    kinds = [(value, VALUE), (series, SERIES), (column, COLUMN)]
+    forms = [Annotated[kind, Tag(tag)] for kind, tag in kinds if kind is not None]
     if not word:
         return Annotated[Union[*forms], Discriminator(_form)]
-    either = Discriminator(lambda given: WORD if isinstance(given, str) else _form(given))
-    return Annotated[Union[*forms, Annotated[Literal[word], Tag(WORD)]], either]
+    discriminator = Discriminator(lambda kinds: WORD if isinstance(kinds, str) else _form(kinds))
+    return Annotated[Union[*forms, Annotated[Literal[word], Tag(WORD)]], discriminator]
 
 
 if not TYPE_CHECKING:
     Factor = number_forms(QuantityTable, SeriesTable, ColumnTable) | None
-for _made in (StatedTable, QuantityTable, SeriesTable, ColumnTable):
-    _made.model_rebuild()
+for _table in (StatedTable, QuantityTable, SeriesTable, ColumnTable):
+    _table.model_rebuild()
 
 
 def forms(kind: Any) -> dict[str, Any]:
     """Return the forms of a number that may vary, by tag; none of other types."""
-    found: dict[str, Any] = {}
-    for each in get_args(kind):
-        tags = [told.tag for told in getattr(each, "__metadata__", ()) if isinstance(told, Tag)]
-        found |= {tags[0]: get_args(each)[0]} if tags else forms(each)
-    return found
+    by_tag: dict[str, Any] = {}
+    for alternative in get_args(kind):
+        tags = [note.tag for note in getattr(alternative, "__metadata__", ()) if isinstance(note, Tag)]
+        by_tag |= {tags[0]: get_args(alternative)[0]} if tags else forms(alternative)
+    return by_tag
 
 
 VaryingAmount = number_forms(Number, AmountSeries, AmountColumn)

@@ -51,7 +51,7 @@ class Definition:
         self._document = read_toml(path)
         self.sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         overrides = self._document.get("scenarios", {})
-        if not isinstance(overrides, dict) or not all(isinstance(each, dict) for each in overrides.values()):
+        if not isinstance(overrides, dict) or not all(isinstance(scenario, dict) for scenario in overrides.values()):
             raise DefinitionError(str(path), ["scenarios: must be tables, as in [scenarios.paper]"])
         if DEFAULT in overrides:
             raise DefinitionError(
@@ -73,17 +73,17 @@ class Definition:
         """
         if region not in (self.regions or [""]):
             example = f"as in {self.path.name}:{next(iter(self.regions), 'japan')}"
-            which = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
-            raise DefinitionError(str(self.path), [unknown("region", region, self.regions) if region else which])
+            question = f"which region? Known: {', '.join(self.regions)}. Write it after a colon, {example}"
+            raise DefinitionError(str(self.path), [unknown("region", region, self.regions) if region else question])
         if (name, region) not in self._networks and name != DEFAULT and not self._changes(name):
             like = self.network(DEFAULT, region)
             self._networks[name, region] = replace(
                 like, scenario_name=name, scenarios=_OtherScenarios(self, name, region)
             )
         if (name, region) not in self._networks:
-            override, where = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
+            override, prefix = self._overrides[name], "" if name == DEFAULT else f"scenarios.{name}."
             document, copies = self._whole(name)
-            mistakes = list(_strangers(document, override, where))
+            mistakes = list(_strangers(document, override, prefix))
             if mistakes:
                 raise DefinitionError(str(self.path), mistakes)
             try:
@@ -97,7 +97,7 @@ class Definition:
                     source_sha256=self.sha256,
                 )
             except NetworkError as error:
-                raise DefinitionError(str(self.path), [where + problem for problem in error.problems]) from None
+                raise DefinitionError(str(self.path), [prefix + problem for problem in error.problems]) from None
         return self._networks[name, region]
 
     def document(self, name: str = DEFAULT) -> dict[str, Any]:
@@ -107,8 +107,8 @@ class Definition:
     def _under(self, name: str, document: dict[str, Any]) -> dict[str, Any]:
         """Return a document with what a scenario leaves out and changes."""
         override = self._overrides[name]
-        told = {key: value for key, value in override.items() if key not in ("without", "copies")}
-        return overlay(without_paths(document, override), told)
+        changes = {key: value for key, value in override.items() if key not in ("without", "copies")}
+        return overlay(without_paths(document, override), changes)
 
     def _changes(self, name: str) -> bool:
         """Whether a scenario may differ from the default one."""
@@ -119,8 +119,8 @@ class Definition:
         if "copies" not in self._document:
             return self._document, {}
         try:
-            copied = read_toml(self.files.plain_file(copied_file(self._document)))
-            return compose_copies(self._document, copied, name)
+            pattern = read_toml(self.files.plain_file(copied_file(self._document)))
+            return compose_copies(self._document, pattern, name)
         except NetworkError as error:
             raise DefinitionError(str(self.path), error.problems) from None
         except CirlError as error:
@@ -147,8 +147,8 @@ class Definition:
 class _OtherScenarios(Mapping[str, Network]):
     """The scenarios of a definition but one, in a region."""
 
-    def __init__(self, definition: Definition, own: str, region: str) -> None:
-        self._definition, self._scenario, self._region = definition, own, region
+    def __init__(self, definition: Definition, scenario: str, region: str) -> None:
+        self._definition, self._scenario, self._region = definition, scenario, region
 
     def __getitem__(self, name: str) -> Network:
         if name not in set(self):
@@ -193,51 +193,51 @@ def read_toml(path: Path) -> dict[str, Any]:
     return document
 
 
-def _too_long(value: Any, where: str) -> Iterator[str]:
+def _too_long(value: Any, path: str) -> Iterator[str]:
     """Yield where integers are that no TOML file may hold."""
     if isinstance(value, dict | list):
-        for key, each in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _too_long(each, f"{where}.{key}".lstrip("."))
+        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _too_long(entry, f"{path}.{key}".lstrip("."))
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-        yield f"{where}: is an integer of {len(str(value))} digits; more than 18 are not possible"
+        yield f"{path}: is an integer of {len(str(value))} digits; more than 18 are not possible"
 
 
-def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], where: str) -> Iterator[str]:
+def _strangers(document: Mapping[str, Any], override: Mapping[str, Any], prefix: str) -> Iterator[str]:
     """Yield the compartments and services that a scenario names but the network does not have."""
-    yield from path_mistakes(document, override.get("without", []), where)
+    yield from path_mistakes(document, override.get("without", []), prefix)
     for table in ("nodes", "arcs", "services"):
-        known = document.get(table, {})
-        given = override.get(table, {})
-        if not isinstance(given, Mapping) or not isinstance(known, Mapping):
-            yield f"{where}{table}: must be a table"
+        names = document.get(table, {})
+        changes = override.get(table, {})
+        if not isinstance(changes, Mapping) or not isinstance(names, Mapping):
+            yield f"{prefix}{table}: must be a table"
             continue
-        for name in given:
-            if name not in known:
-                yield f"{where}{table}: {unknown(table[:-1], name, known)}"
+        for name in changes:
+            if name not in names:
+                yield f"{prefix}{table}: {unknown(table[:-1], name, names)}"
     for key in COMMON_KEYS:
         if key in override:
-            yield f"{where}{key}: a scenario cannot set it"
+            yield f"{prefix}{key}: a scenario cannot set it"
 
 
-def _build(document: Mapping[str, Any], beside: tuple[DataFiles, str], **known: Any) -> Network:
-    """Return the network of a document, of the files and the region ``beside`` it, and of fields ``known`` besides."""
+def _build(document: Mapping[str, Any], beside: tuple[DataFiles, str], **fields: Any) -> Network:
+    """Return the network of a document, of the files and the region ``beside`` it, and of fields ``fields`` besides."""
     name = str(document.get("name", "?"))
     try:
         table = NetworkTable.model_validate(document)
     except ValidationError as error:
         mistakes = validation_mistakes(error, NetworkTable)
-        raise NetworkError(name, [*mistakes, *_further_mistakes(document, error, beside, known)]) from None
-    return Converter(table, *beside).network(**known)
+        raise NetworkError(name, [*mistakes, *_further_mistakes(document, error, beside, fields)]) from None
+    return Converter(table, *beside).network(**fields)
 
 
 def _further_mistakes(
-    document: Mapping[str, Any], error: ValidationError, beside: tuple[DataFiles, str], known: Mapping[str, Any]
+    document: Mapping[str, Any], error: ValidationError, beside: tuple[DataFiles, str], fields: Mapping[str, Any]
 ) -> list[str]:
     """Look for mistakes behind the given ones, with misspelt values mended and unknown keys left out."""
-    mended = copy.deepcopy(dict(document))
+    corrected_document = copy.deepcopy(dict(document))
     for item in error.errors():
         *path, last = [part for part in item["loc"] if part not in ("[key]", *FORMS)]
-        table: Any = mended
+        table: Any = corrected_document
         for part in path:
             table = table[part]
         if item["type"] == "extra_forbidden" and last == "series":
@@ -250,7 +250,7 @@ def _further_mistakes(
         else:
             return []
     try:
-        _build(mended, beside, **known)
+        _build(corrected_document, beside, **fields)
     except NetworkError as further:
         return list(further.problems)
     return []

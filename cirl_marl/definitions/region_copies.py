@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -37,9 +36,9 @@ def copied_file(document: Document) -> str:
 
 
 def compose_copies(
-    document: Document, copied: Document, scenario: str
+    document: Document, original: Document, scenario: str
 ) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
-    """Return ``document`` under a scenario with the copies of ``copied`` in it, and the nodes of each by region.
+    """Return ``document`` under a scenario with the copies of ``original`` in it, and the nodes of each by region.
 
     A copy is what the copied file says, then what ``[copies]`` changes, then what the scenario of the same name changes
     in the copied file, then what ``[scenarios.….copies]`` changes. The scenario's other tables are left to the caller.
@@ -48,109 +47,115 @@ def compose_copies(
         NetworkError: naming the key of each mistake.
     """
     table = _table(document["copies"], "copies")
-    known = copied.get("regions")
-    if not isinstance(known, Mapping) or not known or "copies" in copied:
-        told = "has copies itself" if "copies" in copied else "has no [regions], and a copy is of a region"
-        raise NetworkError(table.of, [f"copies.of: '{table.of}' {told}"])
-    pattern = _pattern(document, copied, scenario)
-    merged = {key: copy.deepcopy(value) for key, value in document.items() if key != "scenarios"}
+    known = original.get("regions")
+    if not isinstance(known, Mapping) or not known or "copies" in original:
+        fault = "has copies itself" if "copies" in original else "has no [regions], and a copy is of a region"
+        raise NetworkError(table.of, [f"copies.of: '{table.of}' {fault}"])
+    pattern = _pattern(document, original, scenario)
+    document_ = {k: dict(v) if isinstance(v, Mapping) else v for k, v in document.items() if k != "scenarios"}
     mistakes = [f"copies.regions: {unknown('region', each, known)}" for each in table.regions if each not in known]
     nodes: dict[str, tuple[str, ...]] = {}
     for region in [] if mistakes else table.regions or known:
-        made = _copy(pattern, region, str(known[region]))
+        copy = _copy(pattern, region, str(known[region]))
         for part in NAME_KEYS:
-            own, more = merged.setdefault(part, {}), made.get(part, {})
-            mistakes += [f"{part}.{id_}: a copy of '{table.of}' has the same name" for id_ in more if id_ in own]
-            own.update(more)
-        merged["agents"] = [*merged.get("agents", []), *made["agents"]]
-        nodes[region] = tuple(made["nodes"])
+            entries, more = document_.setdefault(part, {}), copy.get(part, {})
+            mistakes += [f"{part}.{id_}: a copy of '{table.of}' has the same name" for id_ in more if id_ in entries]
+            entries.update(more)
+        document_["agents"] = [*document_.get("agents", []), *copy["agents"]]
+        nodes[region] = tuple(copy["nodes"])
     if mistakes:
         raise NetworkError(table.of, mistakes)
-    return merged, nodes
+    return document_, nodes
 
 
-def _table(given: Any, where: str) -> Any:
-    """Return the table at ``where``; that of a scenario has neither ``of`` nor ``regions``."""
+def _table(entries: Any, path: str) -> Any:
+    """Return the table at ``path``; that of a scenario has neither ``of`` nor ``regions``."""
     try:
-        return CopiesTable.model_validate(given)
+        return CopiesTable.model_validate(entries)
     except ValidationError as error:
-        raise NetworkError("copies", [f"{where}.{each}" for each in validation_mistakes(error, CopiesTable)]) from None
+        raise NetworkError(
+            "copies", [f"{path}.{mistake}" for mistake in validation_mistakes(error, CopiesTable)]
+        ) from None
 
 
-def _pattern(document: Document, copied: Document, scenario: str) -> dict[str, Any]:
+def _pattern(document: Document, original: Document, scenario: str) -> dict[str, Any]:
     """Return what is copied, under a scenario."""
     of = document["copies"]["of"]
     changes = [("copies.", {key: value for key, value in document["copies"].items() if key not in ("of", "regions")})]
-    changes.append((f"{of}: scenarios.{scenario}.", copied.get("scenarios", {}).get(scenario, {})))
-    own = document.get("scenarios", {}).get(scenario, {}).get("copies", {})
-    told = [f"scenarios.{scenario}.copies.{key}: a scenario cannot set it" for key in ("of", "regions") if key in own]
-    if told:
-        raise NetworkError(of, told)
-    _table({"of": of, **own}, f"scenarios.{scenario}.copies")
-    changes.append((f"scenarios.{scenario}.copies.", own))
-    pattern, gone = dict(copied), set[str]()
-    for where, change in changes:
-        still = {key: _still(value, key, gone) for key, value in change.items() if key != "without"}
-        paths = [path for path in change.get("without", []) if not _in(path, gone)]
-        mistakes = [*path_mistakes(pattern, paths, where), *_strangers(pattern, still, where)]
+    changes.append((f"{of}: scenarios.{scenario}.", original.get("scenarios", {}).get(scenario, {})))
+    changes_here = document.get("scenarios", {}).get(scenario, {}).get("copies", {})
+    faults = [
+        f"scenarios.{scenario}.copies.{key}: a scenario cannot set it"
+        for key in ("of", "regions")
+        if key in changes_here
+    ]
+    if faults:
+        raise NetworkError(of, faults)
+    _table({"of": of, **changes_here}, f"scenarios.{scenario}.copies")
+    changes.append((f"scenarios.{scenario}.copies.", changes_here))
+    pattern, removals = dict(original), set[str]()
+    for prefix, change in changes:
+        still = {key: _still(value, key, removals) for key, value in change.items() if key != "without"}
+        paths = [path for path in change.get("without", []) if not _in(path, removals)]
+        mistakes = [*path_mistakes(pattern, paths, prefix), *_strangers(pattern, still, prefix)]
         if mistakes:
             raise NetworkError(of, mistakes)
         pattern = overlay(without_paths(pattern, {"without": paths}), still)
-        gone |= set(paths)
+        removals |= set(paths)
     return pattern
 
 
-def _in(path: str, gone: set[str]) -> bool:
-    return any(path == each or path.startswith(f"{each}.") for each in gone)
+def _in(path: str, removals: set[str]) -> bool:
+    return any(path == removal or path.startswith(f"{removal}.") for removal in removals)
 
 
-def _still(value: Any, key: str, gone: set[str]) -> Any:
+def _still(value: Any, key: str, removals: set[str]) -> Any:
     """Return a table of changes less what has gone before."""
-    return {id_: each for id_, each in value.items() if f"{key}.{id_}" not in gone} if key in NAME_KEYS else value
+    return {id_: table for id_, table in value.items() if f"{key}.{id_}" not in removals} if key in NAME_KEYS else value
 
 
-def _strangers(pattern: Document, change: Document, where: str) -> Iterator[str]:
+def _strangers(pattern: Document, change: Document, prefix: str) -> Iterator[str]:
     for part in NAME_KEYS:
         for id_ in change.get(part, {}):
             if id_ not in pattern.get(part, {}):
-                yield f"{where}{part}: {unknown(part[:-1], id_, pattern.get(part, {}))}"
+                yield f"{prefix}{part}: {unknown(part[:-1], id_, pattern.get(part, {}))}"
 
 
 def _copy(pattern: Document, region: str, text: str) -> dict[str, Any]:
     """Return nodes, arcs, services and agents of a region's copy, whose names begin with the region."""
     ids = {id_ for part in NAME_KEYS for id_ in pattern.get(part, {})}
 
-    def named(value: Any) -> Any:
+    def rename(value: Any) -> Any:
         if isinstance(value, list):
-            return [named(each) for each in value]
+            return [rename(name) for name in value]
         return f"{region}_{value}" if value in ids else value
 
-    made: dict[str, Any] = {"agents": named(pattern.get("agents", []))}
+    copy: dict[str, Any] = {"agents": rename(pattern.get("agents", []))}
     for part, keys in NAME_KEYS.items():
-        made[part] = {}
+        copy[part] = {}
         for id_, table in pattern.get(part, {}).items():
-            own = _with_region(table, text)
-            own |= {key: named(own[key]) for key in keys if key in own}
-            own["title"] = f"{text}: {own.get('title', id_)}"
-            if part in COMPARTMENTS and "scale" not in own:
-                own["scale"] = _with_region(pattern["scales"][_scale(COMPARTMENTS[part], own)], text)
-            made[part][f"{region}_{id_}"] = own
-    return made
+            entries = _with_region(table, text)
+            entries |= {key: rename(entries[key]) for key in keys if key in entries}
+            entries["title"] = f"{text}: {entries.get('title', id_)}"
+            if part in COMPARTMENTS and "scale" not in entries:
+                entries["scale"] = _with_region(pattern["scales"][_scale(COMPARTMENTS[part], entries)], text)
+            copy[part][f"{region}_{id_}"] = entries
+    return copy
 
 
 def _with_region(value: Any, text: str) -> Any:
     """Return a copy of a table with the text of the region in its place."""
     if isinstance(value, Mapping):
-        return {key: _with_region(each, text) for key, each in value.items()}
+        return {key: _with_region(entry, text) for key, entry in value.items()}
     if isinstance(value, list):
-        return [_with_region(each, text) for each in value]
+        return [_with_region(entry, text) for entry in value]
     return value.replace(REGION, text) if isinstance(value, str) else value
 
 
-def _scale(made: type[Any], table: Document) -> str:
+def _scale(record: type[Any], table: Document) -> str:
     """Return which of ``[scales]`` holds for a compartment that states none: ``stock`` or ``flow``."""
-    declared = declarations(made)["scale"]
-    assert isinstance(declared, Quantity) and isinstance(declared.of, Kinds)
-    kinds = declared.of
-    default = made.__dataclass_fields__[kinds.by].default
+    declaration = declarations(record)["scale"]
+    assert isinstance(declaration, Quantity) and isinstance(declaration.of, Kinds)
+    kinds = declaration.of
+    default = record.__dataclass_fields__[kinds.by].default
     return "stock" if kinds.of.get(table.get(kinds.by, default), kinds.otherwise) == "mass" else "flow"

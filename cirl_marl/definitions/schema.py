@@ -85,50 +85,56 @@ class ModelTable(Table):
     )
 
 
-def table_of(made: type[Any], **more: Any) -> Any:
+def table_of(record: type[Any], **more: Any) -> Any:
     """Return the table of a part: a key for each declared field, with ``more`` that Python has otherwise."""
-    told, hints = declarations(made), get_type_hints(made)
-    unspelt = [n for n, each in told.items() if isinstance(each, Numbers) and not each.table_form and n not in IN_MODEL]
+    fields, hints = declarations(record), get_type_hints(record)
+    unspelt = [
+        n
+        for n, declaration in fields.items()
+        if isinstance(declaration, Numbers) and not declaration.table_form and n not in IN_MODEL
+    ]
     if unspelt:
-        raise TypeError(f"{made.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
-    spelled = {name: _field_type(each, hints[name]) for name, each in told.items() if name not in IN_MODEL}
-    keys = {name: _key(made, name, kind) for name, kind in spelled.items() if kind is not None}
-    of_table = any(isinstance(each, Quantity) and each.unit_of_table for each in told.values())
-    if of_table or VaryingAmount in spelled.values():
+        raise TypeError(f"{record.__name__}: numbers need a spelling in definition files: {', '.join(unspelt)}")
+    types = {
+        name: _field_type(declaration, hints[name]) for name, declaration in fields.items() if name not in IN_MODEL
+    }
+    keys = {name: _key(record, name, kind) for name, kind in types.items() if kind is not None}
+    of_table = any(isinstance(declaration, Quantity) and declaration.unit_of_table for declaration in fields.values())
+    if of_table or VaryingAmount in types.values():
         more |= {"unit": (str, ...), "source": (Source, ...)}
-    summary = str(made.__doc__).partition("\n")[0]
-    return create_model(f"{made.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
+    summary = str(record.__doc__).partition("\n")[0]
+    return create_model(f"{record.__name__}Table", __base__=Table, __doc__=summary, **{**keys, **more})
 
 
-def _key(made: type[Any], name: str, kind: Any) -> tuple[Any, Any]:
+def _key(record: type[Any], name: str, kind: Any) -> tuple[Any, Any]:
     """Return type and pydantic field of a declared field; what is left out is None, or its default if that is plain."""
-    declared, default = declarations(made)[name], default_of(made, name)
-    told: dict[str, Any] = {"description": declared.meaning, "alias": declared.key or None}
-    if is_required(made, name):
-        return kind, Field(**told)
-    if isinstance(declared, Quantity | Numbers | Subtable | CalendarTime):
-        return kind | None, Field(None, **told)
-    return kind, Field(list(default) if isinstance(default, tuple) else default, **told)
+    declaration, default = declarations(record)[name], default_of(record, name)
+    options: dict[str, Any] = {"description": declaration.meaning, "alias": declaration.key or None}
+    if is_required(record, name):
+        return kind, Field(**options)
+    if isinstance(declaration, Quantity | Numbers | Subtable | CalendarTime):
+        return kind | None, Field(None, **options)
+    return kind, Field(list(default) if isinstance(default, tuple) else default, **options)
 
 
-def _field_type(declared: Declaration, hint: Any) -> Any:
+def _field_type(declaration: Declaration, hint: Any) -> Any:
     """Return the type of a declared field in a file; None if it stands in the table of another."""
-    if isinstance(declared, Word):
-        return declared.of if isinstance(declared.of, type) else Literal[declared.of]
-    if isinstance(declared, Numbers):
+    if isinstance(declaration, Word):
+        return declaration.of if isinstance(declaration.of, type) else Literal[declaration.of]
+    if isinstance(declaration, Numbers):
         tables = {"range": number_forms(Range, None, ColumnTable), "batches": Batches, "amount": VaryingAmount}
-        return tables[declared.table_form] if declared.table_form else None
-    if isinstance(declared, Subtable):
-        return {"control": ControlTable, "lifetime": LifetimeTable, "model": ModelTable}[declared.of]
-    if isinstance(declared, CalendarTime):
+        return tables[declaration.table_form] if declaration.table_form else None
+    if isinstance(declaration, Subtable):
+        return {"control": ControlTable, "lifetime": LifetimeTable, "model": ModelTable}[declaration.of]
+    if isinstance(declaration, CalendarTime):
         return Time
-    if isinstance(declared, Quantity) and declared.unit_of_table:
+    if isinstance(declaration, Quantity) and declaration.unit_of_table:
         return Number
-    if isinstance(declared, Quantity) and declared.past:
+    if isinstance(declaration, Quantity) and declaration.past:
         return number_forms(None, SeriesTable, ColumnTable)
-    if isinstance(declared, Quantity) and declared.varies:
-        return number_forms(QuantityTable, SeriesTable, ColumnTable, declared.none_word)
-    if isinstance(declared, Quantity):
+    if isinstance(declaration, Quantity) and declaration.varies:
+        return number_forms(QuantityTable, SeriesTable, ColumnTable, declaration.none_word)
+    if isinstance(declaration, Quantity):
         return FixedQuantity
     return {bool: StrictBool, tuple[str, ...]: list[str]}.get(hint, hint)
 

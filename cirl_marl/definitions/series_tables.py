@@ -21,18 +21,18 @@ class Clock:
     start: YearOrDate | None
     unit: str
 
-    def times(self, given: Sequence[YearOrDate], time_unit: str | None) -> tuple[float, ...]:
+    def times(self, moments: Sequence[YearOrDate], time_unit: str | None) -> tuple[float, ...]:
         """Return times since the start; given as such in ``time_unit``, or without it as years or dates."""
         if time_unit is not None:
             tick = factor(time_unit, self.unit)
-            dates = [each for each in given if isinstance(each, date)]
+            dates = [moment for moment in moments if isinstance(moment, date)]
             if dates:
                 raise CirlError(f"{dates[0]} is a date, which takes no time_unit; leave it out")
-            return tuple(each * tick for each in given if not isinstance(each, date))
+            return tuple(moment * tick for moment in moments if not isinstance(moment, date))
         if self.start is None:
             remedy = "give a time_unit, in which times count from the start, or the start of the [episode]"
             raise CirlError(f"times are years or dates only if the episode has a start; {remedy}")
-        return tuple(elapsed_time(each, self.start, self.unit) for each in given)
+        return tuple(elapsed_time(moment, self.start, self.unit) for moment in moments)
 
 
 def inline_series(table: AmountSeries, unit: float, clock: Clock) -> Series:
@@ -45,12 +45,14 @@ def inline_series(table: AmountSeries, unit: float, clock: Clock) -> Series:
     )
 
 
-def column_value(table: AmountColumn, where: Mapping[str, str], files: DataFiles, unit: float, clock: Clock) -> Value:
-    """Return what a column of a file holds in the rows ``where`` its other columns have these texts.
+def column_value(
+    table: AmountColumn, conditions: Mapping[str, str], files: DataFiles, unit: float, clock: Clock
+) -> Value:
+    """Return what a column of a file holds in the rows ``conditions`` its other columns have these texts.
 
     The last of several steps is known as long as the one before it holds; a single one for a year or a ``time_unit``.
     """
-    column = files.column(table.file, table.column, where, table.times)
+    column = files.column(table.file, table.column, conditions, table.times)
     values = tuple(value * unit for value in column.values)
     if column.times is None:
         return values[0]
@@ -70,7 +72,7 @@ def product(value: Value, factor_: Value) -> Value:
     if isinstance(value, Series):
         if isinstance(factor_, Series):
             return replace(value, factor=factor_)
-        return replace(value, values=tuple(each * factor_ for each in value.values))
+        return replace(value, values=tuple(number * factor_ for number in value.values))
     if isinstance(factor_, Series):
-        return replace(factor_, values=tuple(value * each for each in factor_.values))
+        return replace(factor_, values=tuple(value * number for number in factor_.values))
     return value * factor_

@@ -37,14 +37,14 @@ def stated_numbers(network: Network) -> Mapping[str, Mapping[str, tuple[StatedNu
     """
     document = _document(network)
     return {
-        table: {id_: tuple(_numbers_in(each, "")) for id_, each in document.get(table, {}).items()} for table in TABLES
+        table: {id_: tuple(_numbers_in(part, "")) for id_, part in document.get(table, {}).items()} for table in TABLES
     }
 
 
 def stated_settings(network: Network) -> tuple[StatedNumber, ...]:
     """Return what the definition of ``network`` states of scales, episode and objective; see ``stated``."""
     document = _document(network)
-    return tuple(each for table in SETTINGS for each in _numbers_in(document.get(table), table))
+    return tuple(number for table in SETTINGS for number in _numbers_in(document.get(table), table))
 
 
 def _document(network: Network) -> Mapping[str, Any]:
@@ -61,22 +61,22 @@ def _numbers_in(value: Any, key: str) -> Iterator[StatedNumber]:
         return
     if isinstance(source := value.get("source"), str):
         yield StatedNumber(key, _in_words(value), source)
-    for name, each in value.items():
-        yield from _numbers_in(each, f"{key}.{name}".lstrip("."))
+    for name, entry in value.items():
+        yield from _numbers_in(entry, f"{key}.{name}".lstrip("."))
 
 
 def _in_words(value: Mapping[str, Any]) -> str:
     """Say a quantity, a range, the span of a control, a lifetime, a series, a column of a file, or a model."""
     ends = [value[name] for name in ENDS if name in value] or [value]
-    said = " – ".join(map(_end, ends))
+    words = " – ".join(map(_end, ends))
     if "mean" in value:
-        said = f"{value['distribution'].replace('_', ' ')} {value['mean']:g}"
+        words = f"{value['distribution'].replace('_', ' ')} {value['mean']:g}"
     unit = value.get("unit", "")
-    said += f" {unit}" if said and unit not in ("", "1") else ""
+    words += f" {unit}" if words and unit not in ("", "1") else ""
     if (spread := value.get("deviation")) is not None:
-        said += f" ± {spread if isinstance(spread, str) else f'{spread:g}'}"
-    times = [each["times"] for each in ends if isinstance(each, Mapping) and "times" in each]
-    return f"{said} ({times[-1][0]} to {times[-1][-1]})" if times else said
+        words += f" ± {spread if isinstance(spread, str) else f'{spread:g}'}"
+    times = [end["times"] for end in ends if isinstance(end, Mapping) and "times" in end]
+    return f"{words} ({times[-1][0]} to {times[-1][-1]})" if times else words
 
 
 def _end(value: Any) -> str:

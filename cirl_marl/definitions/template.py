@@ -78,9 +78,9 @@ def write_first(cycle: FirstCycle, path: Path) -> None:
         raise CirlError(f"{path}: is there already; choose another name")
     text = _text(cycle, path)
     with tempfile.TemporaryDirectory() as folder:
-        tried = Path(folder) / path.name
-        tried.write_text(text, encoding="utf-8")
-        load_network(tried)
+        trial = Path(folder) / path.name
+        trial.write_text(text, encoding="utf-8")
+        load_network(trial)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
@@ -89,8 +89,8 @@ def _text(cycle: FirstCycle, path: Path) -> str:
     end = cycle.start + cycle.years
     times = sorted({*range(cycle.start, end, 5), end})
     flow = cycle.in_use / cycle.lifetime
-    grown = (1 + cycle.growth / 100) ** 0.5  # a year's demand is met by what is in use when it ends
-    values = [cycle.in_use * grown * (1 + cycle.growth / 100) ** (year - cycle.start) for year in times]
+    half_year = (1 + cycle.growth / 100) ** 0.5  # a year's demand is met by what is in use when it ends
+    values = [cycle.in_use * half_year * (1 + cycle.growth / 100) ** (year - cycle.start) for year in times]
     return TEMPLATE.read_text(encoding="utf-8").format(
         title=f"{cycle.material[:1].upper()}{cycle.material[1:]}, {cycle.start} to {end}",
         file=path.name,

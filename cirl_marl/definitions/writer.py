@@ -55,15 +55,15 @@ def fingerprint(network: Network) -> str:
 
 def _toml_tables(document: dict[str, Any]) -> tomlkit.TOMLDocument:
     """Lay settings and compartments out as tables with a line for each key."""
-    laid = tomlkit.document()
+    layout = tomlkit.document()
     for key, value in document.items():
         if key in ("nodes", "arcs", "services") and value:
-            laid[key] = tomlkit.table(is_super_table=True)
+            layout[key] = tomlkit.table(is_super_table=True)
             for id_, part in value.items():
-                laid[key][id_] = _table(part)
+                layout[key][id_] = _table(part)
         else:
-            laid[key] = _table(value) if isinstance(value, dict) and value else value
-    return laid
+            layout[key] = _table(value) if isinstance(value, dict) and value else value
+    return layout
 
 
 def _table(part: dict[str, Any]) -> tomlkit.items.Table:
@@ -75,7 +75,7 @@ def _table(part: dict[str, Any]) -> tomlkit.items.Table:
 
 def _inline(value: dict[str, Any]) -> tomlkit.items.InlineTable:
     table = tomlkit.inline_table()
-    table.update({key: _inline(each) if isinstance(each, dict) else each for key, each in value.items()})
+    table.update({key: _inline(entry) if isinstance(entry, dict) else entry for key, entry in value.items()})
     return table
 
 
@@ -101,31 +101,31 @@ class _Writer:
             "objective": self._part(network.objective),
             "observation": self._part(network.observation),
             **{
-                key: {each.id: self._part(each, f"{key}.{each.id}") for each in getattr(network, key)}
+                key: {part.id: self._part(part, f"{key}.{part.id}") for part in getattr(network, key)}
                 for key in ("nodes", "arcs", "services")
             },
         }
 
-    def _part(self, part: Any, where: str = "") -> dict[str, Any]:
-        """Return the table of a part, without what is as it is by default; ``where`` is its path."""
+    def _part(self, part: Any, path: str = "") -> dict[str, Any]:
+        """Return the table of a part, without what is as it is by default; ``path`` is its path."""
         table: dict[str, Any] = {}
-        for name, declared in declarations(type(part)).items():
-            value, key = getattr(part, name), declared.key or name
-            needed = is_required(type(part), name) or name == _law_field(part)
-            needed = needed or f"{where}.{name}" in self._network.uncertain
-            if not needed and value == default_of(type(part), name):
+        for name, declaration in declarations(type(part)).items():
+            value, key = getattr(part, name), declaration.key or name
+            must_write = is_required(type(part), name) or name == _law_field(part)
+            must_write = must_write or f"{path}.{name}" in self._network.uncertain
+            if not must_write and value == default_of(type(part), name):
                 continue
-            if isinstance(declared, CalendarTime):
+            if isinstance(declaration, CalendarTime):
                 table[key] = value if isinstance(value, date) else float(value)
-            elif isinstance(declared, Quantity) and declared.unit_of_table:
-                table |= {key: float(value), "unit": self._units[declared.kind(part)], "source": SOURCE}
-            elif isinstance(declared, Quantity):
-                spread = self._network.uncertain.get(f"{where}.{name}")
-                table[key] = self._quantity(value, declared.kind(part)) | _spread_keys(spread, value)
-            elif isinstance(declared, Numbers):
-                table |= self._numbers(part, value, declared, key)
-            elif isinstance(declared, Subtable):
-                table[key] = self._subtable(part, value, declared)
+            elif isinstance(declaration, Quantity) and declaration.unit_of_table:
+                table |= {key: float(value), "unit": self._units[declaration.kind(part)], "source": SOURCE}
+            elif isinstance(declaration, Quantity):
+                spread = self._network.uncertain.get(f"{path}.{name}")
+                table[key] = self._quantity(value, declaration.kind(part)) | _spread_keys(spread, value)
+            elif isinstance(declaration, Numbers):
+                table |= self._numbers(part, value, declaration, key)
+            elif isinstance(declaration, Subtable):
+                table[key] = self._subtable(part, value, declaration)
             else:
                 table[key] = (
                     value if isinstance(value, bool) else list(value) if isinstance(value, tuple) else str(value)
@@ -133,18 +133,18 @@ class _Writer:
         table.pop("reward_scale", None)  # it stands in the table of the model
         return table
 
-    def _subtable(self, part: Any, value: Any, declared: Subtable) -> dict[str, Any]:
-        if declared.of == "lifetime":
+    def _subtable(self, part: Any, value: Any, declaration: Subtable) -> dict[str, Any]:
+        if declaration.of == "lifetime":
             return self._part(value)
-        return self._control(part) if declared.of == "control" else self._model(part)
+        return self._control(part) if declaration.of == "control" else self._model(part)
 
-    def _numbers(self, part: Any, value: Any, declared: Numbers, key: str) -> dict[str, Any]:
+    def _numbers(self, part: Any, value: Any, declaration: Numbers, key: str) -> dict[str, Any]:
         """Return the table, or tables, that definition files spell several numbers in."""
-        time, unit = self._units["time"], self._units.get(declared.of, "1")
-        if declared.table_form == "range":
+        time, unit = self._units["time"], self._units.get(declaration.of, "1")
+        if declaration.table_form == "range":
             low, high = map(float, value)
             return {key: {"low": low, "high": high, "unit": unit, "source": SOURCE}}
-        if declared.table_form == "batches":
+        if declaration.table_form == "batches":
             times, masses = ([float(pair[column]) for pair in value] for column in (0, 1))
             units = {"time_unit": time, "unit": unit, "source": SOURCE}
             return {key: {"times": times, "masses": masses, **units}}
@@ -163,16 +163,17 @@ class _Writer:
     def _model(self, part: Compartment) -> dict[str, Any]:
         model: Any = part.model
         table: dict[str, Any] = {"kind": kind_of(model), "source": SOURCE, "parameters": {}}
-        for each in dataclasses.fields(model):
-            value = getattr(model, each.name)
-            if each.name == "form":
+        for parameter in dataclasses.fields(model):
+            value = getattr(model, parameter.name)
+            if parameter.name == "form":
                 table["form"] = value
             elif isinstance(value, int | float):
-                table["parameters"][each.name] = value if isinstance(value, bool) else float(value)
-            elif value != (each.default if each.default_factory is dataclasses.MISSING else each.default_factory()):
-                problem = (
-                    f"parameter '{each.name}' of its model '{model.kind}' is no number, which a definition cannot say"
-                )
+                table["parameters"][parameter.name] = value if isinstance(value, bool) else float(value)
+            elif value != (
+                parameter.default if parameter.default_factory is dataclasses.MISSING else parameter.default_factory()
+            ):
+                fault = "is no number, which a definition cannot say"
+                problem = f"parameter '{parameter.name}' of its model '{model.kind}' {fault}"
                 raise NetworkError(f"compartment '{part.id}'", [problem])
         spans = zip(model.ranged_states, part.inner, strict=True)
         table["initial"] = {name: {"low": float(a), "high": float(b), "source": SOURCE} for name, (a, b) in spans}
@@ -184,14 +185,14 @@ class _Writer:
         return {**number, "unit": self._units.get(kind, "1"), "source": SOURCE}
 
     def _series(self, series: Series) -> dict[str, Any]:
-        told: dict[str, Any] = {name: list(map(float, getattr(series, name))) for name in ("times", "values")}
+        entries: dict[str, Any] = {name: list(map(float, getattr(series, name))) for name in ("times", "values")}
         if series.interpolation != "step":
-            told["interpolation"] = series.interpolation
+            entries["interpolation"] = series.interpolation
         if series.until is not None:
-            told["until"] = float(series.until)
+            entries["until"] = float(series.until)
         if series.factor is not None:
-            told["multiplied_by"] = {**self._series(series.factor), "unit": "1", "source": SOURCE}
-        return {**told, "time_unit": self._units["time"]}
+            entries["multiplied_by"] = {**self._series(series.factor), "unit": "1", "source": SOURCE}
+        return {**entries, "time_unit": self._units["time"]}
 
 
 def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
@@ -199,12 +200,12 @@ def _spread_keys(spread: Spread | None, value: Value) -> dict[str, Any]:
     if spread is None:
         return {}
     middle = float(np.mean(value.values)) if isinstance(value, Series) else value
-    told: dict[str, Any] = {"distribution": spread.distribution}
+    entries: dict[str, Any] = {"distribution": spread.distribution}
     if spread.deviation is not None:
-        told["deviation"] = _percent(spread.deviation)
+        entries["deviation"] = _percent(spread.deviation)
     if math.isfinite(spread.high):
-        told["range"] = [spread.low * middle, spread.high * middle]
-    return told
+        entries["range"] = [spread.low * middle, spread.high * middle]
+    return entries
 
 
 def _percent(part: float) -> str:
@@ -216,5 +217,5 @@ def _law_field(part: Any) -> str:
     """Return the field that the law of an arc needs even where it is as by default."""
     if not isinstance(part, Arc):
         return ""
-    scheduled = part.law is Law.BATCH and not part.by
-    return "flow" if part.law is Law.EXOGENOUS else "batches" if scheduled else ""
+    by_schedule = part.law is Law.BATCH and not part.by
+    return "flow" if part.law is Law.EXOGENOUS else "batches" if by_schedule else ""

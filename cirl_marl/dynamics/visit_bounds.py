@@ -13,7 +13,6 @@ from typing import Annotated
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from cirl_marl.errors import NetworkError
 from cirl_marl.network import Floats, Integers, Network
@@ -102,6 +101,8 @@ class VisitBounds:
 
     def total(self, step: int) -> Floats:
         """Return the most passes in all of mass that enters each node, in one interval, shape (nodes,)."""
+        from scipy.sparse.linalg import splu
+
         passes = np.ones(self._nodes)
         for _ in range(MOST_ROUNDS):
             kept = self._among(passes, step)

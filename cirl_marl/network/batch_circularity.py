@@ -15,7 +15,7 @@ CIRO_FACTOR = 2.0
 
 
 def staged_circularity(
-    time: ArrayLike, *, mass: float, success: float, left: float, trucked: float, used: float
+    time: ArrayLike, *, mass: float, success: float, departure: float, truck_arrival: float, use_end: float
 ) -> Floats:
     """Return λ(t) of one batch of the solids network N_s, whatever else may be under way.
 
@@ -26,9 +26,9 @@ def staged_circularity(
         time: t, any shape, time.
         mass: m, mass.
         success: s, share of the batch that was sorted, in percent.
-        left: when the batch left the reservoir.
-        trucked: when m_u arrived at the incinerator, t_in + T_s + T_truck.
-        used: when the sorted part did, t_in + T_s + T_second-use.
+        departure: when the batch left the reservoir.
+        truck_arrival: when m_u arrived at the incinerator, t_in + T_s + T_truck.
+        use_end: when the sorted part did, t_in + T_s + T_second-use.
 
     Raises:
         CirlError: if s is no percentage.
@@ -40,9 +40,9 @@ def staged_circularity(
     """
     _check_percentage(success)
     at = np.asarray(time, dtype=float)
-    unsorted = mass * (1.0 - success / 100.0)
-    lost: Floats = mass * (at > left) + unsorted * (at >= trucked) + (mass - unsorted) * (at >= used)
-    return -lost
+    rejects = mass * (1.0 - success / 100.0)
+    loss: Floats = mass * (at > departure) + rejects * (at >= truck_arrival) + (mass - rejects) * (at >= use_end)
+    return -loss
 
 
 def time_window_circularity(
@@ -51,7 +51,7 @@ def time_window_circularity(
     *,
     success: float,
     use: float,
-    sorting: float,
+    sorting_time: float,
     truck: float,
     incineration: float,
 ) -> float:
@@ -68,7 +68,7 @@ def time_window_circularity(
         criticality: c_i of each material, dimensionless.
         success: s of the sorter, in percent.
         use: T_r of first and of second use, time.
-        sorting: T_d, time.
+        sorting_time: T_d, time.
         truck: T_t, time.
         incineration: T_i that the window goes on after the last arrival, time.
 
@@ -85,13 +85,13 @@ def time_window_circularity(
     if len(masses) != len(criticality):
         raise CirlError(f"{len(masses)} masses, but {len(criticality)} criticalities")
     _check_percentage(success)
-    finite = all(0.0 <= time < np.inf for time in (use, sorting, truck, incineration))
+    finite = all(0.0 <= time < np.inf for time in (use, sorting_time, truck, incineration))
     if not finite or truck > use or use == 0.0:
-        raise CirlError(f"times use {use!r}, sorting {sorting!r}, truck {truck!r}, incineration {incineration!r}")
-    weighted = float(np.dot(masses, criticality))
-    window = use + sorting + use + incineration
-    stages = (use + sorting + truck) + (2.0 - success / 100.0) * (use - truck) + 2.0 * incineration
-    return -CIRO_FACTOR * weighted * stages / window
+        raise CirlError(f"times use {use!r}, sorting {sorting_time!r}, truck {truck!r}, incineration {incineration!r}")
+    critical_mass = float(np.dot(masses, criticality))
+    window = use + sorting_time + use + incineration
+    stages = (use + sorting_time + truck) + (2.0 - success / 100.0) * (use - truck) + 2.0 * incineration
+    return -CIRO_FACTOR * critical_mass * stages / window
 
 
 def _check_percentage(success: float) -> None:

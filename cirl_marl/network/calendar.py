@@ -54,8 +54,8 @@ def years(network: Specification, time: ArrayLike) -> Floats:
     """Return times since the start of an episode as calendar years; the network must have a start."""
     start = network.episode.start
     assert start is not None
-    found: Floats = year(start) + np.asarray(time, dtype=np.float64) * factor(network.time_unit, "year")
-    return found
+    calendar_years: Floats = year(start) + np.asarray(time, dtype=np.float64) * factor(network.time_unit, "year")
+    return calendar_years
 
 
 def labels(network: Specification, time: ArrayLike) -> tuple[list[str], list[list[str]]]:
@@ -64,11 +64,11 @@ def labels(network: Specification, time: ArrayLike) -> tuple[list[str], list[lis
     if start is None:
         return [], []
     if in_years(network.time_unit):
-        return ["year"], [[f"{each:.10g}" for each in np.atleast_1d(years(network, time)).tolist()]]
+        return ["year"], [[f"{moment:.10g}" for moment in np.atleast_1d(years(network, time)).tolist()]]
     seconds = np.atleast_1d(time) * factor(network.time_unit, "s")
-    dates = [_clock(start) + timedelta(seconds=round(each)) for each in seconds.tolist()]
-    whole = all(each.time() == each.min.time() for each in dates)
-    return ["date"], [[each.isoformat(" ", "minutes")[: 10 if whole else None] for each in dates]]
+    dates = [_clock(start) + timedelta(seconds=round(moment)) for moment in seconds.tolist()]
+    whole = all(moment.time() == moment.min.time() for moment in dates)
+    return ["date"], [[moment.isoformat(" ", "minutes")[: 10 if whole else None] for moment in dates]]
 
 
 def _clock(moment: YearOrDate) -> datetime:

@@ -28,7 +28,7 @@ Form = Annotated[Literal["published", "sound"], Word("``published`` or ``sound``
 Bools = NDArray[np.bool_]
 
 
-STATED: Any = abstractmethod(lambda: None)
+REQUIRED: Any = abstractmethod(lambda: None)
 """Stands for an attribute that the class of a model has to state: Python takes it for abstract."""
 
 
@@ -47,17 +47,17 @@ class CompartmentModel(ABC):
     """
 
     __slots__ = ()
-    kind: ClassVar[str] = STATED
-    time_unit: ClassVar[str] = STATED
-    reward_state: ClassVar[RewardState] = STATED
+    kind: ClassVar[str] = REQUIRED
+    time_unit: ClassVar[str] = REQUIRED
+    reward_state: ClassVar[RewardState] = REQUIRED
     input_unit: ClassVar[str | None] = None
     context_names: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         """Refuse parameters of another kind, or out of other bounds, than declared; a ``NetworkError`` names all."""
         check_types(self.kind, self)
-        if found := list(bound_problems(self)):
-            raise NetworkError(self.kind, found)
+        if faults := list(bound_problems(self)):
+            raise NetworkError(self.kind, faults)
 
     @property
     @abstractmethod
@@ -159,7 +159,7 @@ class MeasuringModel(CompartmentModel):
     """A model of which services and observers may read more than states: ``measure_names``, with units, in order."""
 
     __slots__ = ()
-    measure_names: ClassVar[tuple[str, ...]] = STATED
+    measure_names: ClassVar[tuple[str, ...]] = REQUIRED
 
     @abstractmethod
     def measures(self, state: Floats, inputs: Floats) -> Floats:
@@ -180,12 +180,12 @@ class GoalTask(Task):
     """A task with goals, for ``GoalEnv``: names of observed states besides the goal, of it as it is and should be."""
 
     __slots__ = ()
-    observation_names: ClassVar[tuple[str, ...]] = STATED
-    achieved_names: ClassVar[tuple[str, ...]] = STATED
-    desired_names: ClassVar[tuple[str, ...]] = STATED
+    observation_names: ClassVar[tuple[str, ...]] = REQUIRED
+    achieved_names: ClassVar[tuple[str, ...]] = REQUIRED
+    desired_names: ClassVar[tuple[str, ...]] = REQUIRED
 
     @abstractmethod
-    def goal_reward(self, achieved: Floats, desired: Floats) -> Floats:
+    def goal_reward(self, achieved_goal: Floats, desired_goal: Floats) -> Floats:
         """Return the reward, shape (...), for goals of shape (..., entries of a goal)."""
 
 
@@ -193,7 +193,7 @@ class ReleasingModel(CompartmentModel):
     """A model that releases units of its node's stock into batch arcs, of which each of its ``ports`` has one."""
 
     __slots__ = ()
-    ports: ClassVar[tuple[str, ...]] = STATED
+    ports: ClassVar[tuple[str, ...]] = REQUIRED
 
     @property
     def unit_kg(self) -> float | None:
@@ -224,16 +224,16 @@ class Vehicle(CompartmentModel):
         """Return where it can be loaded, shape (B,)."""
 
     @abstractmethod
-    def depart(self, state: Floats, where: Bools) -> Floats:
-        """Return the state, shape (k, B), after it was loaded ``where``, shape (B,)."""
+    def depart(self, state: Floats, mask: Bools) -> Floats:
+        """Return the state, shape (k, B), after it was loaded ``mask``, shape (B,)."""
 
     @abstractmethod
     def has_arrived(self, state: Floats) -> Bools:
         """Return where it is at the recipient with its load, shape (B,)."""
 
     @abstractmethod
-    def turn_back(self, state: Floats, where: Bools) -> Floats:
-        """Return the state, shape (k, B), after it was unloaded ``where``, shape (B,)."""
+    def turn_back(self, state: Floats, mask: Bools) -> Floats:
+        """Return the state, shape (k, B), after it was unloaded ``mask``, shape (B,)."""
 
 
 MOTIONS = (ContinuousModel, OwnStepModel, DiscreteTimeModel)
@@ -243,13 +243,13 @@ OFFERS = (*MOTIONS, OutflowModel, MeasuringModel, Task, GoalTask, ReleasingModel
 """All that a model may inherit from."""
 
 
-def model_faults(found: type[Any]) -> Iterator[str]:
+def model_faults(model_class: type[Any]) -> Iterator[str]:
     """Yield why a class is none of compartment models, the methods of an offer that it does not make included."""
-    if not issubclass(found, MOTIONS):
+    if not issubclass(model_class, MOTIONS):
         yield f"it inherits from none of {', '.join(motion.__name__ for motion in MOTIONS)}"
-    elif isabstract(found):
-        yield f"it lacks {', '.join(sorted(found.__abstractmethods__))}"
+    elif isabstract(model_class):
+        yield f"it lacks {', '.join(sorted(model_class.__abstractmethods__))}"
     for offer in OFFERS:
-        given = [name for name in vars(offer) if name in offer.__abstractmethods__ and hasattr(found, name)]
-        if given and not issubclass(found, offer):
-            yield f"it has {', '.join(given)} and does not inherit from {offer.__name__}"
+        methods = [name for name in vars(offer) if name in offer.__abstractmethods__ and hasattr(model_class, name)]
+        if methods and not issubclass(model_class, offer):
+            yield f"it has {', '.join(methods)} and does not inherit from {offer.__name__}"

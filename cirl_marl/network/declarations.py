@@ -29,26 +29,26 @@ Kind = Literal["mass", "time", "rate", "flow", "steps", "1"]
 Part = TypeVar("Part")
 
 
-def with_field_docs(made: type[Part]) -> type[Part]:
+def with_field_docs(record: type[Part]) -> type[Part]:
     """Let the docstring of a dataclass list its fields with what their annotations declare or, as plain text, say."""
     lines = [
-        textwrap.fill(f"        {name}: {getattr(told, 'meaning', told)}.", 120, subsequent_indent=" " * 12)
-        for name, told in _annotations(made).items()
+        textwrap.fill(f"        {name}: {getattr(note, 'meaning', note)}.", 120, subsequent_indent=" " * 12)
+        for name, note in _annotations(record).items()
     ]
-    made.__doc__ = "\n".join([str(made.__doc__).rstrip(), "", "    Attributes:", *lines, "    "])
-    return made
+    record.__doc__ = "\n".join([str(record.__doc__).rstrip(), "", "    Attributes:", *lines, "    "])
+    return record
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
-def frozen_record(made: type[Part]) -> type[Part]:
+def frozen_record(record: type[Part]) -> type[Part]:
     """Make a dataclass of keywords that cannot be changed, and whose docstring lists them."""
-    return with_field_docs(dataclass(frozen=True, slots=True, kw_only=True)(made))
+    return with_field_docs(dataclass(frozen=True, slots=True, kw_only=True)(record))
 
 
-def _annotations(made: Any) -> dict[str, Any]:
-    hints = get_type_hints(made, include_extras=True)
-    found = {each.name: getattr(hints[each.name], "__metadata__", ()) for each in fields(made)}
-    return {name: told[0] for name, told in found.items() if told}
+def _annotations(record: Any) -> dict[str, Any]:
+    hints = get_type_hints(record, include_extras=True)
+    metadata = {field.name: getattr(hints[field.name], "__metadata__", ()) for field in fields(record)}
+    return {name: notes[0] for name, notes in metadata.items() if notes}
 
 
 class TimeVarying:
@@ -184,25 +184,27 @@ class Subtable(Declaration):
     of: Literal["control", "model", "lifetime"] = "control"
 
 
-def declarations(made: type[Any]) -> Mapping[str, Declaration]:
+def declarations(record: type[Any]) -> Mapping[str, Declaration]:
     """Return the declared fields of a part by name, in their order."""
-    anything: Any = made  # mypy does not know that classes are hashable
-    return _declarations(anything)
+    hashable: Any = record  # mypy does not know that classes are hashable
+    return _declarations(hashable)
 
 
 @cache
-def _declarations(made: Any) -> Mapping[str, Declaration]:
-    return MappingProxyType({name: told for name, told in _annotations(made).items() if isinstance(told, Declaration)})
+def _declarations(record: Any) -> Mapping[str, Declaration]:
+    return MappingProxyType(
+        {name: note for name, note in _annotations(record).items() if isinstance(note, Declaration)}
+    )
 
 
-def default_of(made: type[Any], name: str) -> Any:
+def default_of(record: type[Any], name: str) -> Any:
     """Return the default of a field; ``dataclasses.MISSING`` if it has none."""
-    return made.__dataclass_fields__[name].default
+    return record.__dataclass_fields__[name].default
 
 
-def is_required(made: type[Any], name: str) -> bool:
+def is_required(record: type[Any], name: str) -> bool:
     """Whether definition files must give a field."""
-    return declarations(made)[name].mandatory or default_of(made, name) is MISSING
+    return declarations(record)[name].mandatory or default_of(record, name) is MISSING
 
 
 def check_types(owner: str, part_: Any) -> None:
@@ -211,18 +213,34 @@ def check_types(owner: str, part_: Any) -> None:
     Raises:
         NetworkError: naming every field without its numbers, with what to write, and words with the nearest valid one.
     """
-    faults = []
-    for name, declared in declarations(type(part_)).items():
+    faults, record = [], part_.__class__
+    for name, declaration, default, hint in _checks(record):
         value = getattr(part_, name)
-        if isinstance(declared, Word) and isinstance(declared.of, type):
-            if value not in declared.of.__members__.values():
-                raise NetworkError(owner, [unknown(declared.label or name, value, declared.of)])
-            object.__setattr__(part_, name, declared.of(value))
-        elif value is not None or default_of(type(part_), name) is not None:
-            told = declared.problem(value) or _plain_problem(value, _hints(part_.__class__)[name])
-            faults += [f"{name} must be {told}"] if told else []
+        if value is default or type(value) is hint is float:
+            continue  # by far the most usual
+        if isinstance(declaration, Word) and isinstance(declaration.of, type):
+            if value not in declaration.of.__members__.values():
+                raise NetworkError(owner, [unknown(declaration.label or name, value, declaration.of)])
+            object.__setattr__(part_, name, declaration.of(value))
+        elif fault := declaration.problem(value) or _plain_problem(value, hint):
+            faults.append(f"{name} must be {fault}")
     if faults:
         raise NetworkError(owner, faults)
+
+
+@cache
+def _checks(record: Any) -> tuple[tuple[str, Declaration, Any, Any], ...]:
+    """Return name, declaration, default and type of each field; a default that is not of its type counts as none."""
+    checks = []
+    hints = get_type_hints(record)
+    for name, declaration in _declarations(record).items():
+        default, hint = default_of(record, name), hints[name]
+        if isinstance(declaration, Word) and isinstance(declaration.of, type):
+            valid = isinstance(default, declaration.of)
+        else:
+            valid = default is None or not (declaration.problem(default) or _plain_problem(default, hint))
+        checks.append((name, declaration, default if valid else MISSING, hint))
+    return tuple(checks)
 
 
 class CheckedRecord:
@@ -236,22 +254,17 @@ class CheckedRecord:
         check_types(f"{kind} '{self.id}'" if hasattr(self, "id") else kind, self)
 
 
-def bound_problems(part_: Any, where: str = "") -> Iterator[str]:
+def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
     """Yield every number out of its declared bounds, and every word that is none of its words."""
-    for name, declared in declarations(type(part_)).items():
+    for name, declaration in declarations(type(part_)).items():
         value = getattr(part_, name)
-        if isinstance(declared, Word) and value not in declared.of:
-            yield f"{where}{unknown(declared.label or name, value, declared.of)}"
-        elif isinstance(declared, Quantity) and value is not None:
-            for each in value.extremes if isinstance(value, TimeVarying) else (value,):
-                if told := declared.bound_problem(each):
-                    yield f"{where}{name} {each} {told}"
+        if isinstance(declaration, Word) and value not in declaration.of:
+            yield f"{prefix}{unknown(declaration.label or name, value, declaration.of)}"
+        elif isinstance(declaration, Quantity) and value is not None:
+            for number in value.extremes if isinstance(value, TimeVarying) else (value,):
+                if fault := declaration.bound_problem(number):
+                    yield f"{prefix}{name} {number} {fault}"
                     break
-
-
-@cache
-def _hints(made: Any) -> Mapping[str, Any]:
-    return get_type_hints(made)
 
 
 def _plain_problem(value: object, hint: Any) -> str:
@@ -271,13 +284,15 @@ def _plain_problem(value: object, hint: Any) -> str:
 def _problem(value: object, form: str, shape: tuple[int | None, ...]) -> str:
     if _fits(value, shape):
         return ""
-    instead = (f"; write {each!r}" for each in ((value,), (value, value)) if _fits(each, shape))
+    instead = (f"; write {alternative!r}" for alternative in ((value,), (value, value)) if _fits(alternative, shape))
     return f"{form}, got {value!r}{next(instead, '')}"
 
 
 def _fits(value: object, shape: tuple[int | None, ...]) -> bool:
     if not shape:
-        return isinstance(value, Real)
-    if not isinstance(value, Sequence | np.ndarray) or shape[0] not in (None, len(value)):
+        return type(value) is float or isinstance(value, Real)
+    if not isinstance(value, tuple | Sequence | np.ndarray) or shape[0] not in (None, len(value)):
         return False
-    return all(_fits(each, shape[1:]) for each in value)
+    if len(shape) == 1 and {*map(type, value)} <= {float, int}:
+        return True
+    return all(_fits(part, shape[1:]) for part in value)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.linalg import expm
 
 from cirl_marl.network.elements import Lifetime, Node
 from cirl_marl.network.lifetimes import Chain
@@ -39,8 +38,8 @@ def remaining_history(node: Node, interval: float) -> Floats:
     whole = propagator(chain, interval / lifetime.mean)
     for begin, end, inflow in zip(edges[:-1], edges[1:], history.means(edges), strict=True):
         shorter = end - begin < interval * (1 - 1e-9)
-        kept, got = propagator(chain, (end - begin) / lifetime.mean) if shorter else whole
-        stages = kept @ stages + got * inflow * lifetime.mean
+        transition, gain = propagator(chain, (end - begin) / lifetime.mean) if shorter else whole
+        stages = transition @ stages + gain * inflow * lifetime.mean
     return stages
 
 
@@ -66,11 +65,13 @@ def propagator(chain: Chain, time: float) -> tuple[Floats, Floats]:
 
     Time is in units of the chain's ``mean``, and so is that of the inflow.
     """
+    from scipy.linalg import expm
+
     size = chain.stages
     system = np.zeros((size + 1, size + 1))
     system[:size, :size], system[:size, size] = chain.matrix, chain.inflow_shares
-    moved = expm(system * time)
-    return moved[:size, :size], moved[:size, size]
+    exponential = expm(system * time)
+    return exponential[:size, :size], exponential[:size, size]
 
 
 def past_inflows(node: Node, interval: float, count: int) -> Floats:

@@ -18,7 +18,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import integrate, optimize, special, stats
+from scipy import special
 
 from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.rowsum import Floats
@@ -35,25 +35,41 @@ FIRM = 1e3
 Survival = Callable[[Floats], Floats]
 
 
+def _folded_normal(deviation: float) -> Survival:
+    def survival(age: Floats) -> Floats:
+        x, mean = np.asarray(age) / deviation, 1 / deviation
+        return np.where(x > 0, special.ndtr(-(x - mean)) + special.ndtr(-(x + mean)), 1.0)
+
+    return survival
+
+
 def _lognormal(deviation: float) -> Survival:
     spread = np.sqrt(np.log1p(deviation**2))
-    return lambda age: stats.lognorm.sf(age, spread, scale=np.exp(-(spread**2) / 2))
+
+    def survival(age: Floats) -> Floats:
+        x = np.asarray(age) / np.exp(-(spread**2) / 2)
+        return np.where(x > 0, special.ndtr(-(np.log(np.where(x > 0, x, 1.0)) / spread)), 1.0)
+
+    return survival
 
 
 def _weibull(deviation: float) -> Survival:
-    def squared(shape: float) -> float:
+    from scipy.optimize import brentq
+
+    def variance(shape: float) -> float:
         return float(np.expm1(special.gammaln(1 + 2 / shape) - 2 * special.gammaln(1 + 1 / shape)))
 
-    shape = optimize.brentq(lambda shape: squared(shape) - deviation**2, 0.1, 1e3)
-    return lambda age: stats.weibull_min.sf(age, shape, scale=1 / special.gamma(1 + 1 / shape))
+    shape = brentq(lambda shape: variance(shape) - deviation**2, 0.1, 1e3)
+    scale = 1 / special.gamma(1 + 1 / shape)
+    return lambda age: np.exp(-np.power(np.asarray(age) / scale, shape))
 
 
 SURVIVALS: Mapping[str, Callable[[float], Survival]] = {
-    "normal": lambda deviation: lambda age: stats.norm.sf(age, 1.0, deviation),
-    "folded_normal": lambda deviation: lambda age: stats.foldnorm.sf(age, 1 / deviation, scale=deviation),
+    "normal": lambda deviation: lambda age: special.ndtr(-((np.asarray(age) - 1.0) / deviation)),
+    "folded_normal": _folded_normal,
     "lognormal": _lognormal,
     "weibull": _weibull,
-    "gamma": lambda deviation: lambda age: stats.gamma.sf(age, deviation**-2, scale=deviation**2),
+    "gamma": lambda deviation: lambda age: special.gammaincc(deviation**-2, np.asarray(age) / deviation**2),
     "exponential": lambda deviation: lambda age: np.exp(-age),
 }
 """What is left of a lifetime with parameter ``mean`` 1 at an age, from its deviation.
@@ -80,8 +96,8 @@ class Chain:
     def survival(self, age: ArrayLike) -> Floats:
         """Return S at ages in units of ``mean``, in their shape."""
         ages = np.asarray(age, dtype=np.float64)
-        left: Floats = _survival_terms(self.stages, self.rate, ages.ravel()) @ np.array(self.weights)
-        return left.reshape(ages.shape)
+        share: Floats = _survival_terms(self.stages, self.rate, ages.ravel()) @ np.array(self.weights)
+        return share.reshape(ages.shape)
 
     @property
     def inflow_shares(self) -> Floats:
@@ -103,9 +119,9 @@ class Chain:
 
 def _survival_terms(stages: int, rate: float, ages: Floats) -> Floats:
     """Return Q(n, rate·age) for n = 0 … stages, shape (ages, stages + 1)."""
-    left = np.zeros((len(ages), stages + 1))
-    left[:, 1:] = special.gammaincc(np.arange(1, stages + 1), rate * ages[:, None])
-    return left
+    terms = np.zeros((len(ages), stages + 1))
+    terms[:, 1:] = special.gammaincc(np.arange(1, stages + 1), rate * ages[:, None])
+    return terms
 
 
 @cache
@@ -118,36 +134,40 @@ def chain_of(distribution: str, deviation: float) -> Chain:
     """
     if distribution == "exponential":
         return Chain(1.0, (0.0, 1.0), 0.0)
+    from scipy.integrate import quad  # takes longer to import than most commands run
+
     survival = SURVIVALS[distribution](deviation)
     ages = np.linspace(0.0, 1.0 + 8.0 * deviation, POINTS)
-    wanted, mean = survival(ages), float(integrate.quad(survival, 0.0, 1.0 + 40.0 * deviation, limit=500)[0])
-    best = _fit_chain(LENGTHS[0], 1.0, ages, wanted, mean)
+    target, mean = survival(ages), float(quad(survival, 0.0, 1.0 + 40.0 * deviation, limit=500)[0])
+    best = _fit_chain(LENGTHS[0], 1.0, ages, target, mean)
     for stages in LENGTHS:
-        best = min(best, _closest_chain(stages, ages, wanted, mean), key=lambda chain: chain.error)
+        best = min(best, _closest_chain(stages, ages, target, mean), key=lambda chain: chain.error)
         if best.error <= CLOSE:
             break
     return best
 
 
-def _closest_chain(stages: int, ages: Floats, wanted: Floats, mean: float) -> Chain:
+def _closest_chain(stages: int, ages: Floats, target: Floats, mean: float) -> Chain:
     """Return the closest chain of so many stages."""
-    rates, found = np.geomspace(0.2, 1.0, 12) * stages / mean, []
+    rates, chains = np.geomspace(0.2, 1.0, 12) * stages / mean, []
     for _ in range(2):  # then once more, finer, around the best
-        found += [_fit_chain(stages, float(rate), ages, wanted, mean) for rate in rates]
-        best = min(found, key=lambda chain: chain.error)
+        chains += [_fit_chain(stages, float(rate), ages, target, mean) for rate in rates]
+        best = min(chains, key=lambda chain: chain.error)
         rates = np.clip(best.rate * np.geomspace(0.89, 1.12, 9), 0.0, stages / mean)
-    return min(found, key=lambda chain: chain.error)
+    return min(chains, key=lambda chain: chain.error)
 
 
-def _fit_chain(stages: int, rate: float, ages: Floats, wanted: Floats, mean: float) -> Chain:
+def _fit_chain(stages: int, rate: float, ages: Floats, target: Floats, mean: float) -> Chain:
     """Return the chain of some stages and rate that is closest and has a mean."""
-    left, to_go = _survival_terms(stages, rate, ages), np.arange(stages + 1)
+    from scipy.optimize import nnls
+
+    terms, to_go = _survival_terms(stages, rate, ages), np.arange(stages + 1)
     # nothing leaves at once unless the lifetime says so
-    used = to_go >= (0 if wanted[0] < 1 else 1)
-    firm = FIRM * np.stack([np.ones(stages + 1), to_go / rate])[:, used]
-    found, _ = optimize.nnls(np.concatenate([left[:, used], firm]), np.concatenate([wanted, [FIRM, FIRM * mean]]))
+    free = to_go >= (0 if target[0] < 1 else 1)
+    firm = FIRM * np.stack([np.ones(stages + 1), to_go / rate])[:, free]
+    solution, _ = nnls(np.concatenate([terms[:, free], firm]), np.concatenate([target, [FIRM, FIRM * mean]]))
     weights = np.zeros(stages + 1)
-    weights[used] = found / found.sum()
+    weights[free] = solution / solution.sum()
     rate = float(weights @ to_go) / mean
-    error = float(np.abs(_survival_terms(stages, rate, ages) @ weights - wanted).max())
+    error = float(np.abs(_survival_terms(stages, rate, ages) @ weights - target).max())
     return Chain(rate, tuple(weights.tolist()), error)

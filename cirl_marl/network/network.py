@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse import csgraph
 
 from cirl_marl.errors import CirlError, NetworkError, unknown
 from cirl_marl.network.declarations import declarations
@@ -47,24 +46,24 @@ class Network(Specification):
     def __post_init__(self) -> None:
         """Put nodes with a stock first; refuse a network that cannot be simulated, naming every fault."""
         object.__setattr__(self, "nodes", tuple(sorted(self.nodes, key=lambda node: not node.stores)))
-        found = list(problems(self))
-        if found:
-            raise NetworkError(f"network '{self.name}'", found)
+        faults = list(problems(self))
+        if faults:
+            raise NetworkError(f"network '{self.name}'", faults)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle the fields, not the arrays derived from them."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     def scenario(self, name: str | None) -> Network:
         """Return this network under scenario ``name`` (None: as it is); a ``CirlError`` lists those there are."""
         if name is None or name == self.scenario_name:
             return self
         if not isinstance(name, str) or name not in self.scenarios:
-            known = sorted({self.scenario_name, *self.scenarios})
+            names = sorted({self.scenario_name, *self.scenarios})
             hint = "" if self.scenarios else " A network with other options has no other scenarios: choose it first."
-            raise CirlError(f"network '{self.name}': {unknown('scenario', name, known)}{hint}")
-        found: Network = self.scenarios[name]
-        return found
+            raise CirlError(f"network '{self.name}': {unknown('scenario', name, names)}{hint}")
+        network: Network = self.scenarios[name]
+        return network
 
     def with_options(self, **groups: Mapping[str, object]) -> Network:
         """Return a copy with fields of ``episode``, ``objective`` or ``observation`` replaced.
@@ -76,11 +75,11 @@ class Network(Specification):
         3
         """
         for group, values in groups.items():
-            if group not in (known := ["episode", "objective", "observation"]):
-                raise CirlError(f"with_options: {unknown('group', group, known)}")
-            known = [each.name for each in fields(getattr(self, group))]
-            for name in [each for each in values if each not in known]:
-                raise CirlError(f"with_options: {group}: {unknown('field', name, known)}")
+            if group not in (options := ["episode", "objective", "observation"]):
+                raise CirlError(f"with_options: {unknown('group', group, options)}")
+            options = [item.name for item in fields(getattr(self, group))]
+            for name in [item for item in values if item not in options]:
+                raise CirlError(f"with_options: {group}: {unknown('field', name, options)}")
         changes = {group: replace(getattr(self, group), **dict(values)) for group, values in groups.items()}
         return replace(self, **changes, scenarios={})
 
@@ -91,6 +90,8 @@ class Network(Specification):
         of a large network whose compartments come in random order spends most of its time waiting for memory; in this
         order it does not.
         """
+        from scipy.sparse import csgraph
+
         size = len(self.nodes)
         links = sparse.csr_array((np.ones(len(self.arcs)), (self.donors, self.recipients)), shape=(size, size))
         order = csgraph.reverse_cuthill_mckee(sparse.csr_array(links + links.T), symmetric_mode=True)
@@ -111,11 +112,11 @@ class Network(Specification):
 
         Ids of a copy begin with its region. An arc is of a copy if one of its ends is.
         """
-        own = self.compartments[compartment]
-        places = {own.donor, own.recipient} if isinstance(own, Arc) else {own.id}
+        part = self.compartments[compartment]
+        places = {part.donor, part.recipient} if isinstance(part, Arc) else {part.id}
         for region, nodes in self._nodes_of_copies.items():
-            if own.id.startswith(f"{region}_") and places & nodes:
-                return own.id.removeprefix(f"{region}_")
+            if part.id.startswith(f"{region}_") and places & nodes:
+                return part.id.removeprefix(f"{region}_")
         return None
 
     @cached_property
@@ -139,18 +140,18 @@ class Network(Specification):
         for i, node in enumerate(self.stores):
             if node.initial is None and node.history is not None:
                 initial[:, i] = remaining_history(node, self.episode.control_interval).sum()
-        unknown_ = {node.id for node in self.stores if node.initial is None and node.history is None}
+        without_start = {node.id for node in self.stores if node.initial is None and node.history is None}
         for arc in self.arcs:
-            if arc.donor in unknown_:
+            if arc.donor in without_start:
                 donor = self.nodes[self.node_index[arc.donor]]
                 base = self.interval_means(arc.flow) * highest_factor(self, f"arcs.{arc.id}.flow")
                 base = np.ones_like(base) if arc.law is Law.CONTROLLED else base
                 # a valve on the donor scales all its outflows, a control that sets a flow is of the controlled one
                 sets = [c.control for c in (arc, donor) if c.control is not None]
-                acting = (c for c in sets if c.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
-                factors = [self.interval_means(control.high) for control in acting]
-                asked = np.prod([base, *factors], axis=0).sum() * self.episode.control_interval
-                initial[:, self.node_index[arc.donor]] += asked * (1 + RESERVE)
+                actuators = (c for c in sets if c.kind is ControlKind.RATE or arc.law is Law.CONTROLLED)
+                factors = [self.interval_means(control.high) for control in actuators]
+                demand = np.prod([base, *factors], axis=0).sum() * self.episode.control_interval
+                initial[:, self.node_index[arc.donor]] += demand * (1 + RESERVE)
         return _read_only(initial)
 
     @cached_property
@@ -205,8 +206,8 @@ class Network(Specification):
     def time_dependent(self) -> tuple[str, ...]:
         """Compartments of which a number, or a bound of the control, changes in time."""
         parts = [(c.id, part) for c in self.compartments.values() for part in (c, c.control) if part is not None]
-        found = (i for i, p in parts if any(isinstance(getattr(p, name), Series) for name in declarations(type(p))))
-        return tuple(dict.fromkeys(found))
+        ids = (i for i, p in parts if any(isinstance(getattr(p, name), Series) for name in declarations(type(p))))
+        return tuple(dict.fromkeys(ids))
 
     @cached_property
     def sustainability(self) -> Floats:
@@ -221,9 +222,9 @@ class Network(Specification):
             donor, recipient = self._role(arc.donor), self._role(arc.recipient)
             within = donor is recipient is Role.ENVIRONMENT
             enters = recipient in SINKS and not within and (recipient is not Role.ENVIRONMENT or arc.pollutant)
-            lost = donor is Role.NONRENEWABLE_RESERVOIR or enters
-            regained = (donor is Role.ENVIRONMENT and not within) or recipient is Role.NONRENEWABLE_RESERVOIR
-            signs.append(float(lost) - float(regained))
+            loses = donor is Role.NONRENEWABLE_RESERVOIR or enters
+            regains = (donor is Role.ENVIRONMENT and not within) or recipient is Role.NONRENEWABLE_RESERVOIR
+            signs.append(float(loses) - float(regains))
         return _read_only(np.array(signs))
 
     @cached_property
@@ -241,12 +242,12 @@ class Network(Specification):
         for node in self.nodes:
             graph.add_node(node.id, role=node.role.value, compartment=node)
         for arc in self.arcs:
-            known = graph.get_edge_data(arc.donor, arc.recipient, {"arcs": ()})["arcs"]
-            graph.add_edge(arc.donor, arc.recipient, arcs=(*known, arc))
+            parallel = graph.get_edge_data(arc.donor, arc.recipient, {"arcs": ()})["arcs"]
+            graph.add_edge(arc.donor, arc.recipient, arcs=(*parallel, arc))
         networkx.freeze(graph)
         return graph
 
-    def circularity(self, flow: Floats, batched: Floats | None = None) -> Floats:
+    def circularity(self, flow: Floats, batch_mass: Floats | None = None) -> Floats:
         """Return λ(N;t) = −(m_fb + Δ·σᵀf), shape (...), mass, with σᵀf summed over the continuous flows.
 
         With ``net_zero = "abs"`` the part through the environment enters by its absolute value,
@@ -255,8 +256,8 @@ class Network(Specification):
 
         Args:
             flow: f, shape (arcs, ...), mass/time; entries of batch arcs are ignored.
-            batched: m_fb, net batch mass moved finite-time sustainably so far, not through and through the environment,
-                shape (2, ...), mass; None if nothing moves in batches.
+            batch_mass: m_fb, net batch mass moved finite-time sustainably so far, not through and through the
+                environment, shape (2, ...), mass; None if nothing moves in batches.
 
         Raises:
             CirlError: if there is not one flow for each arc.
@@ -264,12 +265,12 @@ class Network(Specification):
         References: Zocco et al., CiRL (arXiv 2505.21536), Definition 2.
         """
         if flow.shape[:1] != (len(self.arcs),):
-            wanted = f"the first axis is that of its {len(self.arcs)} arcs, {', '.join(self.arc_index)}"
-            raise CirlError(f"network '{self.name}': flows of shape {flow.shape}; {wanted}")
+            expectation = f"the first axis is that of its {len(self.arcs)} arcs, {', '.join(self.arc_index)}"
+            raise CirlError(f"network '{self.name}': flows of shape {flow.shape}; {expectation}")
         columns = (2, math.prod(flow.shape[1:]))
         parts = self._circularity_parts(flow.reshape(len(self.arcs), columns[1]))
-        if batched is not None:
-            parts = parts - batched.reshape(columns)
+        if batch_mass is not None:
+            parts = parts - batch_mass.reshape(columns)
         through = -np.abs(parts[1]) if self.objective.net_zero == "abs" else parts[1]
         circularity: Floats = (parts[0] + through).reshape(flow.shape[1:])
         return circularity
@@ -298,16 +299,16 @@ class Network(Specification):
 
     @cached_property
     def _throughputs(self) -> RowSum:
-        passing = np.flatnonzero(self.donors >= len(self.stores))
+        exits = np.flatnonzero(self.donors >= len(self.stores))
         shape = (len(self.nodes) - len(self.stores), len(self.arcs))
-        return RowSum(self.donors[passing] - len(self.stores), passing, 1.0, shape)
+        return RowSum(self.donors[exits] - len(self.stores), exits, 1.0, shape)
 
     def service_arcs(self, service: Service) -> Integers:
         """Return the arcs whose flows add up to what a service of quantity ``flow`` or ``outflow`` measures."""
         if service.quantity == "outflow":
-            nodes = [self.node_index[each] for each in service.providers]
+            nodes = [self.node_index[id_] for id_ in service.providers]
             return np.flatnonzero(np.isin(self.donors, nodes))
-        return np.array([self.arc_index[each] for each in service.providers])
+        return np.array([self.arc_index[id_] for id_ in service.providers])
 
     def _role(self, node: str) -> Role:
         return self.nodes[self.node_index[node]].role

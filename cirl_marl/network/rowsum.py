@@ -78,10 +78,10 @@ class RowSum:
 
     def scaled_by(self, factor: float) -> RowSum:
         """Return factor·W."""
-        other = object.__new__(RowSum)
-        other.shape, other._starts, other._rows = self.shape, self._starts, self._rows
-        other._weights = self._weights * factor
-        return other
+        matrix = object.__new__(RowSum)
+        matrix.shape, matrix._starts, matrix._rows = self.shape, self._starts, self._rows
+        matrix._weights = self._weights * factor
+        return matrix
 
     def column_sums(self) -> Floats:
         """Return Σ_i W_ik for each column k."""

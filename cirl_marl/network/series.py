@@ -52,7 +52,7 @@ class Series(CheckedRecord, TimeVarying):
         low, high = min(self.values), max(self.values)
         if self.factor is None:
             return low, high
-        corners = [each * other for each in (low, high) for other in self.factor.extremes]
+        corners = [end * other for end in (low, high) for other in self.factor.extremes]
         return min(corners), max(corners)
 
     def __format__(self, spec: str) -> str:
@@ -84,36 +84,39 @@ class Series(CheckedRecord, TimeVarying):
             mistakes = list(self.factor.problems())
             if not mistakes and min(self.factor.values) < 0:
                 mistakes = [f"series: {min(self.factor.values):g} is negative"]
-            yield from (f"multiplied_by: {each}" for each in mistakes)
+            yield from (f"multiplied_by: {mistake}" for mistake in mistakes)
 
-    def coverage_problem(self, length: float, said: Callable[[float], str] = "{:g}".format) -> str:
+    def coverage_problem(self, length: float, format_time: Callable[[float], str] = "{:g}".format) -> str:
         """Return what is missing of an episode of some length; nothing if the series covers it.
 
-        ``said`` puts times into words.
+        ``format_time`` puts times into words.
         """
         slack = 1e-9 * max(length, 1.0)
         if self.times[0] > slack:
-            early = f"series begins at {said(self.times[0])}, after the episode does"
-            return f"{early}; it needs a value for {said(0.0)}, unless its times are of another unit or calendar years"
+            early = f"series begins at {format_time(self.times[0])}, after the episode does; it needs"
+            return f"{early} a value for {format_time(0.0)}, unless its times are of another unit or calendar years"
         if self.end < length - slack:
-            missing = f"series ends at {said(self.end)}, but the episode at {said(length)}"
-            return f"{missing}; give what is missing, or a shorter horizon"
-        other = "" if self.factor is None else self.factor.coverage_problem(length, said)
-        return other and f"multiplied_by: {other}"
+            fault = f"series ends at {format_time(self.end)}, but the episode at {format_time(length)}"
+            return f"{fault}; give what is missing, or a shorter horizon"
+        fault_of_factor = "" if self.factor is None else self.factor.coverage_problem(length, format_time)
+        return fault_of_factor and f"multiplied_by: {fault_of_factor}"
 
-    def history_problem(self, said: Callable[[float], str] = "{:g}".format) -> str:
+    def history_problem(self, format_time: Callable[[float], str] = "{:g}".format) -> str:
         """Return why it does not tell what was before time 0; nothing if it does."""
         if self.times[0] >= 0:
-            return f"series begins at {said(self.times[0])}, not before the episode does"
+            return f"series begins at {format_time(self.times[0])}, not before the episode does"
         if self.end < 0:
-            return f"series ends at {said(self.end)}, before the episode begins at {said(0.0)}; give what is missing"
+            early = f"series ends at {format_time(self.end)}, before the episode begins at {format_time(0.0)}"
+            return f"{early}; give what is missing"
         if self.factor is None:
             return ""
         if self.factor.times[0] > self.times[0]:
-            late = f"series begins at {said(self.factor.times[0])}, after what it multiplies at {said(self.times[0])}"
-            return f"multiplied_by: {late}; give what is missing"
-        other = self.factor.history_problem(said)
-        return other and f"multiplied_by: {other}"
+            late = f"series begins at {format_time(self.factor.times[0])}"
+            return (
+                f"multiplied_by: {late}, after what it multiplies at {format_time(self.times[0])}; give what is missing"
+            )
+        fault_of_factor = self.factor.history_problem(format_time)
+        return fault_of_factor and f"multiplied_by: {fault_of_factor}"
 
     def means(self, edges: Floats) -> Floats:
         """Return the mean over each interval between ``edges``, shape (len(edges) − 1,)."""
@@ -137,17 +140,17 @@ class Series(CheckedRecord, TimeVarying):
 
     def begins(self, times: Floats) -> Floats:
         """Return the values from some times on, shape (times,)."""
-        known, values, slopes = self._lines()
-        index = np.maximum(np.searchsorted(known, times, side="right") - 1, 0)
-        found: Floats = values[index] + slopes[index] * (times - known[index])
-        return found
+        points, values, slopes = self._lines()
+        index = np.maximum(np.searchsorted(points, times, side="right") - 1, 0)
+        starts: Floats = values[index] + slopes[index] * (times - points[index])
+        return starts
 
     def ends(self, times: Floats) -> Floats:
         """Return the values until some times, shape (times,)."""
-        known, values, slopes = self._lines()
-        index = np.maximum(np.searchsorted(known, times, side="left") - 1, 0)
-        found: Floats = values[index] + slopes[index] * (times - known[index])
-        return found
+        points, values, slopes = self._lines()
+        index = np.maximum(np.searchsorted(points, times, side="left") - 1, 0)
+        stops: Floats = values[index] + slopes[index] * (times - points[index])
+        return stops
 
     def _lines(self) -> tuple[Floats, Floats, Floats]:
         """Return times, values and slopes from each time on."""
@@ -159,11 +162,11 @@ class Series(CheckedRecord, TimeVarying):
 
     def _means_of_product(self, edges: Floats) -> Floats:
         """Return the means of the product, by Simpson's rule between all times, where both are straight lines."""
-        both = [replace(self, factor=None), self.factor]
-        known = np.array([*self.times, *self.factor.times])
-        points = np.union1d(edges, known[(known > edges[0]) & (known < edges[-1])])
+        factors = [replace(self, factor=None), self.factor]
+        instants = np.array([*self.times, *self.factor.times])
+        points = np.union1d(edges, instants[(instants > edges[0]) & (instants < edges[-1])])
         begins, ends = (
-            np.array([getattr(each, side)(at) for each in both])
+            np.array([getattr(series, side)(at) for series in factors])
             for side, at in (("begins", points[:-1]), ("ends", points[1:]))
         )
         middle = (begins + ends) / 2

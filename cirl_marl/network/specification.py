@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -75,4 +76,13 @@ class Specification:
         horizon = self.episode.horizon
         if not isinstance(value, Series):
             return np.broadcast_to(np.float64(value), horizon)
-        return value.means(np.arange(horizon + 1, dtype=np.float64) * self.episode.control_interval)
+        # many parts ask for the same series; the cache holds it, so that no other can get its id
+        if id(value) not in self._series_means:
+            means = value.means(np.arange(horizon + 1, dtype=np.float64) * self.episode.control_interval)
+            means.flags.writeable = False
+            self._series_means[id(value)] = value, means
+        return self._series_means[id(value)][1]
+
+    @cached_property
+    def _series_means(self) -> dict[int, tuple[Series, Floats]]:
+        return {}

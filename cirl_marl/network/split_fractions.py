@@ -10,15 +10,17 @@ so that they sum to 1 and low_k ≤ s_k ≤ high_k, always.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.network.elements import Law
-from cirl_marl.network.rowsum import Floats, single_column
+from cirl_marl.network.rowsum import Floats, Integers, single_column
 from cirl_marl.network.series import Series
 from cirl_marl.network.specification import Specification
 
@@ -46,8 +48,8 @@ class Split:
     @property
     def proportions(self) -> Floats:
         """Return π of the other arcs, which sum to 1, shape (others, horizon)."""
-        bounds, given = single_column(self.bounds), single_column(self.stated_shares)
-        return np.broadcast_to(proportions(given, 1.0 - bounds[1].sum(axis=0)), self.stated_shares.shape)
+        bounds, shares = single_column(self.bounds), single_column(self.stated_shares)
+        return np.broadcast_to(proportions(shares, 1.0 - bounds[1].sum(axis=0)), self.stated_shares.shape)
 
     @property
     def table(self) -> Floats:
@@ -55,52 +57,58 @@ class Split:
         bounds, proportions = single_column(self.bounds), single_column(self.proportions)
         return np.concatenate([bounds.reshape(-1, bounds.shape[-1]), proportions])
 
-    def least(self, leaving: Sequence[bool], step: int) -> float:
-        """Return the least that the arcs ``leaving``, one truth value for each arc, get together in an interval."""
-        flags = np.asarray(leaving, dtype=bool)
-        out, other = flags[: len(self.controlled_arcs)], flags[len(self.controlled_arcs) :]
-        low, _, high = self.bounds[:, :, step]
-        sure = float(low[out].sum())
-        left = max(0.0, 1.0 - sure - float(high[~out].sum()))
-        parts = proportions(self.stated_shares[:, step], 1.0 - self.bounds[1, :, step].sum(axis=0))
-        return sure + left * float(parts[other].sum())
+    def least(self, leaves: NDArray[np.bool_], steps: Integers) -> Floats:
+        """Return the least that some of the arcs get together in some intervals, shape (intervals,).
+
+        Args:
+            leaves: which arcs, the controlled ones first, shape (arcs, intervals).
+            steps: the intervals.
+        """
+        out, others = leaves[: len(self.controlled_arcs)], leaves[len(self.controlled_arcs) :]
+        low, _, high = self.bounds[:, :, steps]
+        certain = np.where(out, low, 0.0).sum(axis=0)
+        # the arcs that stay take their highest shares first
+        room = np.maximum(0.0, 1.0 - certain - np.where(out, 0.0, high).sum(axis=0))
+        least: Floats = certain + room * np.where(others, self.proportions[:, steps], 0.0).sum(axis=0)
+        return least
 
     def problems(self) -> Iterator[str]:
         """Yield why these are no shares of a whole in some interval."""
         low, neutral, _ = single_column(self.bounds).sum(axis=1)
-        given = np.nansum(single_column(self.stated_shares), axis=0)
+        stated_sum = np.nansum(single_column(self.stated_shares), axis=0)
         rests = int(np.isnan(self.stated_shares[:, 0]).sum())
-        where = f"node '{self.donor}'"
+        subject = f"node '{self.donor}'"
         if not self.other_arcs:
-            yield f"{where}: all its shares have controls; one arc without a control has to take what they leave"
+            yield f"{subject}: all its shares have controls; one arc without a control has to take what they leave"
         elif rests > 1:
-            yield f"{where}: {rests} arcs of law 'share' state no share; only one can take the rest"
+            yield f"{subject}: {rests} arcs of law 'share' state no share; only one can take the rest"
         elif (low > 1 + ROUNDING).any():
-            yield f"{where}: the lowest shares of its arcs sum to {low.max():g}, more than 1"
-        elif rests and (neutral + given > 1 + SUMS).any():
-            most = (neutral + given).max()
-            yield f"{where}: the shares of its arcs sum to {most:g}, more than 1, though one takes the rest"
-        elif not rests and (abs(neutral + given - 1) > SUMS).any():
-            worst = (neutral + given)[abs(neutral + given - 1).argmax()]
-            yield f"{where}: the shares of its arcs sum to {worst:g}, not to 1; one may be left out and takes the rest"
-        elif not rests and (given == 0).any():
-            yield f"{where}: nothing is left for the shares without control; leave one out, and it takes the rest"
+            yield f"{subject}: the lowest shares of its arcs sum to {low.max():g}, more than 1"
+        elif rests and (neutral + stated_sum > 1 + SUMS).any():
+            most = (neutral + stated_sum).max()
+            yield f"{subject}: the shares of its arcs sum to {most:g}, more than 1, though one takes the rest"
+        elif not rests and (abs(neutral + stated_sum - 1) > SUMS).any():
+            worst = (neutral + stated_sum)[abs(neutral + stated_sum - 1).argmax()]
+            remedy = "one may be left out and takes the rest"
+            yield f"{subject}: the shares of its arcs sum to {worst:g}, not to 1; {remedy}"
+        elif not rests and (stated_sum == 0).any():
+            yield f"{subject}: nothing is left for the shares without control; leave one out, and it takes the rest"
 
 
-def proportions(given: Floats, left: Floats) -> Floats:
+def proportions(shares: Floats, remainder: Floats) -> Floats:
     """Return π of arcs without control, which sum to 1, shape (arcs, …).
 
     Args:
-        given: their shares, NaN for the one that takes the rest, shape (arcs, …).
-        left: what neutral control leaves to them, shape (…).
+        shares: their shares, NaN for the one that takes the rest, shape (arcs, …).
+        remainder: what neutral control leaves to them, shape (…).
     """
-    rest = np.isnan(given)
-    weights = np.where(rest, np.maximum(left - np.nansum(given, axis=0), 0.0), given)
+    rest = np.isnan(shares)
+    weights = np.where(rest, np.maximum(remainder - np.nansum(shares, axis=0), 0.0), shares)
     total = weights.sum(axis=0)
     # where neutral control leaves nothing to them, the one of the rest takes what there may be
     weights = np.where(total > 0, weights, rest)
-    found: Floats = weights / weights.sum(axis=0)
-    return found
+    fractions: Floats = weights / weights.sum(axis=0)
+    return fractions
 
 
 def splits(network: Specification) -> list[Split]:
@@ -110,82 +118,93 @@ def splits(network: Specification) -> list[Split]:
         if arc.law is Law.SHARE:
             arcs.setdefault(arc.donor, []).append(k)
     horizon = network.episode.horizon
-    found = []
+    divisions = []
     for node in network.nodes:
-        mine = [(k, network.arcs[k]) for k in arcs.get(node.id, ())]
-        if mine:
-            controls = [arc.control for _, arc in mine if arc.control is not None]
-            others = [(k, arc.share) for k, arc in mine if arc.control is None]
-            sides = [[getattr(c, side) for c in controls] for side in ("low", "neutral", "high")]
-            shares = [np.nan if share is None else share for _, share in others]
+        exits = [(k, network.arcs[k]) for k in arcs.get(node.id, ())]
+        if exits:
+            controls = [arc.control for _, arc in exits if arc.control is not None]
+            free = [(k, arc.share) for k, arc in exits if arc.control is None]
+            sides: list[list[Any]] = [[getattr(c, side) for c in controls] for side in ("low", "neutral", "high")]
+            shares: list[Any] = [np.nan if share is None else share for _, share in free]
             values = [*(value for side in sides for value in side), *shares]
-            columns = horizon if any(isinstance(value, Series) for value in values) else 1
-            bounds = [[network.interval_means(value)[:columns] for value in side] for side in sides]
-            given = [network.interval_means(share)[:columns] for share in shares]
-            found.append(
+            columns, bounds, given = 1, sides, shares
+            if any(isinstance(value, Series) for value in values):
+                columns = horizon
+                bounds = [list(map(network.interval_means, side)) for side in sides]
+                given = [network.interval_means(share) for share in shares]
+            divisions.append(
                 Split(
                     donor=node.id,
-                    controlled_arcs=tuple(k for k, arc in mine if arc.control is not None),
-                    other_arcs=tuple(k for k, _ in others),
+                    controlled_arcs=tuple(k for k, arc in exits if arc.control is not None),
+                    other_arcs=tuple(k for k, _ in free),
                     bounds=np.broadcast_to(
                         np.array(bounds, dtype=float).reshape(3, -1, columns), (3, len(controls), horizon)
                     ),
                     stated_shares=np.broadcast_to(
-                        np.array(given, dtype=float).reshape(-1, columns), (len(others), horizon)
+                        np.array(given, dtype=float).reshape(-1, columns), (len(free), horizon)
                     ),
                 )
             )
-    return found
+    return divisions
 
 
-def trap_problems(network: Specification, divided: Sequence[Split]) -> Iterator[str]:
+def trap_problems(network: Specification, divisions: Sequence[Split]) -> Iterator[str]:
     """Yield a loop of nodes without stock that could keep mass for ever, in the first interval in which there is one.
 
     Of all such nodes those are removed whose least share leaving the set is positive, again and again; mass leaves
     what is removed sooner or later, whatever the controls. What remains can pass mass round within itself.
     """
-    passing = {node.id for node in network.nodes if not node.stores}
-    by_donor = {each.donor: each for each in divided if each.donor in passing}
-    tables = [each.table for each in by_donor.values()]
-    width = max((table.shape[1] for table in tables), default=1)
-    columns = np.concatenate([np.empty((0, width)), *(np.broadcast_to(t, (len(t), width)) for t in tables)])
-    for step in np.unique(columns, axis=1, return_index=True)[1].tolist() if len(columns) else ():
-        if trapped := _trapping_nodes(network, by_donor, step):
-            loop = _loop(network, by_donor, trapped)
-            when = "" if (columns == columns[:, :1]).all() else f" in interval {step}"
-            yield (
-                f"nodes {', '.join(loop)} store nothing and can pass all they get round in a loop{when}: the arcs that "
-                f"leave it need a share, or a lowest share, above {LEAST:g}, or one of the nodes a stock"
-            )
-            return
+    stockless = {node.id for node in network.nodes if not node.stores}
+    by_donor = {split.donor: split for split in divisions if split.donor in stockless}
+    tables = [split.table for split in by_donor.values()]
+    if not tables:
+        return
+    width = max(table.shape[1] for table in tables)
+    columns = np.concatenate([np.broadcast_to(table, (len(table), width)) for table in tables])
+    steps = np.unique(columns, axis=1, return_index=True)[1]
+    traps_mass = _trapping_nodes(network, by_donor, steps)
+    if traps_mass.any():
+        first = int(traps_mass.any(axis=0).argmax())
+        loop = _loop(
+            network, by_donor, {node for node, traps in zip(by_donor, traps_mass[:, first], strict=True) if traps}
+        )
+        interval = "" if (columns == columns[:, :1]).all() else f" in interval {steps[first]}"
+        yield (
+            f"nodes {', '.join(loop)} store nothing and can pass all they get round in a loop{interval}: the arcs that "
+            f"leave it need a share, or a lowest share, above {LEAST:g}, or one of the nodes a stock"
+        )
 
 
-def _trapping_nodes(network: Specification, by_donor: dict[str, Split], step: int) -> set[str]:
-    """Return the largest set of nodes without stock that can keep all they get, in one interval."""
-    held = set(by_donor)
-    feeding: dict[str, set[str]] = {}
+def _trapping_nodes(network: Specification, by_donor: dict[str, Split], steps: Integers) -> NDArray[np.bool_]:
+    """Return the largest set of nodes without stock that can keep all they get, by interval, (nodes, intervals)."""
+    row = {donor: i for i, donor in enumerate(by_donor)}
+    # a last row stands for all nodes with a stock, which trap nothing
+    traps_mass = np.ones((len(row) + 1, len(steps)), dtype=bool)
+    traps_mass[-1] = False
+    ends, donors = {}, defaultdict(set)
     for donor, split in by_donor.items():
-        for k in (*split.controlled_arcs, *split.other_arcs):
-            feeding.setdefault(network.arcs[k].recipient, set()).add(donor)
-    waiting = sorted(held)
-    while waiting:
-        node = waiting.pop()
-        if node in held:
-            split = by_donor[node]
-            leaving = [network.arcs[k].recipient not in held for k in (*split.controlled_arcs, *split.other_arcs)]
-            if split.least(leaving, step) > LEAST:
-                held.discard(node)
-                waiting += sorted(feeding.get(node, set()) & held)
-    return held
+        ends[donor] = [row.get(network.arcs[k].recipient, -1) for k in (*split.controlled_arcs, *split.other_arcs)]
+        for end in ends[donor]:
+            donors[end].add(donor)
+    queue = sorted(by_donor)
+    while queue:
+        donor = queue.pop()
+        i = row[donor]
+        if traps_mass[i].any():
+            still_traps = traps_mass[i] & (by_donor[donor].least(~traps_mass[ends[donor]], steps) <= LEAST)
+            if (still_traps != traps_mass[i]).any():
+                traps_mass[i] = still_traps
+                queue += sorted(donors[i])
+    return traps_mass[:-1]
 
 
-def _loop(network: Specification, by_donor: dict[str, Split], trapped: set[str]) -> list[str]:
-    """Return nodes of ``trapped`` in the order in which mass passes round them."""
-    path = [min(trapped)]
+def _loop(network: Specification, by_donor: dict[str, Split], trap: set[str]) -> list[str]:
+    """Return nodes of ``trap`` in the order in which mass passes round them."""
+    path = [min(trap)]
     while True:
         split = by_donor[path[-1]]
         recipients = [network.arcs[k].recipient for k in (*split.controlled_arcs, *split.other_arcs)]
-        following = next(each for each in recipients if each in trapped)
-        if following in path:
-            return path[path.index(following) :]
-        path.append(following)
+        successor = next(node for node in recipients if node in trap)
+        if successor in path:
+            return path[path.index(successor) :]
+        path.append(successor)

@@ -61,8 +61,8 @@ class Spread(CheckedRecord):
             return np.asarray(self.low + share * (self.high - self.low))
         low, high = self._ends(self.deviation)
         first, last = (self._below(end, self.deviation) for end in (low, high))
-        found: Floats = np.clip(self._factor(first + share * (last - first), self.deviation), low, high)
-        return found
+        factors: Floats = np.clip(self._factor(first + share * (last - first), self.deviation), low, high)
+        return factors
 
     def _ends(self, deviation: float) -> tuple[float, float]:
         """Return the range, cut to where next to nothing is drawn."""
@@ -91,33 +91,33 @@ class Spread(CheckedRecord):
 
 def numbers_of(network: Specification, kind: str, field: str) -> dict[str, int]:
     """Return the rows of uncertain numbers among the factors, by the id of the part of which they are a field."""
-    found = {}
-    for row, where in enumerate(network.uncertain):
-        each, id_, name = _split(where)
-        if (each, name) == (kind, field):
-            found[id_] = row
-    return found
+    rows = {}
+    for row, path in enumerate(network.uncertain):
+        part_kind, id_, name = _split(path)
+        if (part_kind, name) == (kind, field):
+            rows[id_] = row
+    return rows
 
 
-def highest_factor(network: Specification, where: str) -> float:
+def highest_factor(network: Specification, path: str) -> float:
     """Return the greatest factor on the number at a path; 1 if it is known exactly."""
-    return float(network.uncertain[where].ends[1]) if where in network.uncertain else 1.0
+    return float(network.uncertain[path].ends[1]) if path in network.uncertain else 1.0
 
 
 def uncertainty_problems(network: Specification) -> Iterator[str]:
     """Yield why the numbers that are said to be uncertain cannot be drawn."""
-    for where, spread in network.uncertain.items():
+    for path, spread in network.uncertain.items():
         try:
-            part, name = _uncertain_field(network, where)
+            part, name = _uncertain_field(network, path)
         except KeyError as error:
-            yield f"{where}: {error.args[0]}"
+            yield f"{path}: {error.args[0]}"
             continue
         mistakes = list(spread.problems())
         if not mistakes and extremes(getattr(part, name)) == (0.0, 0.0):
             mistakes = ["it is 0, and so is every draw; give the number"]
         if not mistakes:
             mistakes = list(_undrawable(network, part, name, spread))
-        yield from (f"{where}: {each}" for each in mistakes)
+        yield from (f"{path}: {mistake}" for mistake in mistakes)
 
 
 def _undrawable(network: Specification, part: Any, name: str, spread: Spread) -> Iterator[str]:
@@ -147,25 +147,25 @@ def draw_network(network: Any, factors: Sequence[float]) -> Any:
         network: with uncertain numbers.
         factors: of ``network.uncertain``, in their order.
     """
-    changed: dict[int, tuple[Any, dict[str, Any]]] = {}
+    changes: dict[int, tuple[Any, dict[str, Any]]] = {}
 
     def change(part: Any, name: str, value: Any) -> None:
-        changed.setdefault(id(part), (part, {}))[1][name] = value
+        changes.setdefault(id(part), (part, {}))[1][name] = value
 
-    for where, factor in zip(network.uncertain, factors, strict=True):
-        part, name = _uncertain_field(network, where)
+    for path, factor in zip(network.uncertain, factors, strict=True):
+        part, name = _uncertain_field(network, path)
         value = getattr(part, name)
         if isinstance(value, Series):
-            change(part, name, replace(value, values=tuple(each * float(factor) for each in value.values)))
+            change(part, name, replace(value, values=tuple(part_ * float(factor) for part_ in value.values)))
         else:
             change(part, name, value * float(factor))
     for split in splits(network):
         arcs = [network.arcs[k] for k in split.other_arcs]
-        told = [changed.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs]
-        if any(value is not arc.share for value, arc in zip(told, arcs, strict=True)):
-            given = np.array([network.interval_means(np.nan if value is None else value) for value in told])
-            left = 1.0 - split.bounds[1].sum(axis=0)
-            for arc, shares in zip(arcs, proportions(given, left) * left, strict=True):
+        shares_ = [changes.get(id(arc), (arc, {}))[1].get("share", arc.share) for arc in arcs]
+        if any(value is not arc.share for value, arc in zip(shares_, arcs, strict=True)):
+            drawn_shares = np.array([network.interval_means(np.nan if value is None else value) for value in shares_])
+            remainder = 1.0 - split.bounds[1].sum(axis=0)
+            for arc, shares in zip(arcs, proportions(drawn_shares, remainder) * remainder, strict=True):
                 if arc.share is not None:
                     change(arc, "share", in_intervals(shares, network.episode.control_interval))
     initial: dict[str, Any] = dict(zip((node.id for node in network.stores), network.initial.T.tolist(), strict=True))
@@ -174,36 +174,41 @@ def draw_network(network: Any, factors: Sequence[float]) -> Any:
             change(node, "initial", tuple(initial[node.id]))
     groups = {
         key: tuple(
-            replace(each, **changed[id(each)][1]) if id(each) in changed else each for each in getattr(network, key)
+            replace(part_, **changes[id(part_)][1]) if id(part_) in changes else part_
+            for part_ in getattr(network, key)
         )
         for key in KINDS
     }
     return replace(network, **groups, uncertain={}, scenarios={})
 
 
-def _uncertain_field(network: Specification, where: str) -> tuple[Any, str]:
+def _uncertain_field(network: Specification, path: str) -> tuple[Any, str]:
     """Return the part and the name of the field at a path such as ``arcs.mining.rate``.
 
     Raises:
         KeyError: with what is wrong with the path.
     """
-    kind, id_, name = _split(where)
+    kind, id_, name = _split(path)
     if kind not in KINDS:
         raise KeyError(f"only numbers of {', '.join(KINDS)} can be uncertain")
     parts = {part.id: part for part in getattr(network, kind)}
     if id_ not in parts:
         raise KeyError(unknown(kind[:-1], id_, parts))
-    declared = declarations(KINDS[kind])
-    known = [each for each, told in declared.items() if isinstance(told, Quantity) and told.varies and not told.past]
-    if name not in known:
-        raise KeyError(f"of {kind} these can be uncertain: {', '.join(known)}; '{name}' cannot")
+    fields = declarations(KINDS[kind])
+    options = [
+        field
+        for field, declaration in fields.items()
+        if isinstance(declaration, Quantity) and declaration.varies and not declaration.past
+    ]
+    if name not in options:
+        raise KeyError(f"of {kind} these can be uncertain: {', '.join(options)}; '{name}' cannot")
     if getattr(parts[id_], name) is None:
         raise KeyError(f"'{name}' is not given, so that nothing can be drawn")
     return parts[id_], name
 
 
-def _split(where: str) -> tuple[str, str, str]:
+def _split(path: str) -> tuple[str, str, str]:
     """Return kind, id and field of a path."""
-    kind, _, rest = where.partition(".")
+    kind, _, rest = path.partition(".")
     id_, _, name = rest.rpartition(".")
     return kind, id_, name

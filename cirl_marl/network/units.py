@@ -5,15 +5,19 @@ from __future__ import annotations
 import re
 import tokenize
 from functools import cache
-
-import pint
+from typing import TYPE_CHECKING
 
 from cirl_marl.errors import CirlError
+
+if TYPE_CHECKING:
+    import pint
 
 
 @cache
 def _registry() -> pint.UnitRegistry[float]:
     """Return pint's registry in which ``kt`` is the kilotonne; pint alone reads it as the knot."""
+    import pint  # takes longer to import than most commands run
+
     registry: pint.UnitRegistry[float] = pint.UnitRegistry(on_redefinition="ignore", cache_folder=None)
     registry.define("kilotonne = 1000 * tonne = kt")
     return registry
@@ -40,11 +44,6 @@ MISSPELT = {"y": "year", "T": "t (tonne)", "MT": "Mt (megatonne)"} | dict.fromke
 """Symbols that are written for a unit, and are none or another."""
 
 
-UNREADABLE = (
-    pint.errors.PintError, ArithmeticError, AssertionError, AttributeError, RecursionError, TypeError, ValueError,
-    tokenize.TokenError,
-)  # fmt: skip
-"""What pint raises for texts that are no units."""
 LONGEST = 100
 """Characters of the longest unit."""
 POWER = r"(\*\*|\^)"
@@ -53,17 +52,17 @@ POWER = r"(\*\*|\^)"
 def _check_form(unit: str) -> None:
     """Refuse what no unit needs before it is computed with, such as powers of powers, which take for ever."""
     powers = len(re.findall(POWER, unit))
-    why = None
+    fault = None
     if not unit.isprintable():
-        why = f"{unit[:LONGEST]!r} has characters that cannot be printed"
+        fault = f"{unit[:LONGEST]!r} has characters that cannot be printed"
     elif len(unit) > LONGEST:
-        why = f"it has {len(unit)} characters, and {LONGEST} are enough"
+        fault = f"it has {len(unit)} characters, and {LONGEST} are enough"
     elif re.search(rf"(?<![^\W\d])\b[\d.]+\s*\)*\s*{POWER}|{POWER}[^*^]*\)\s*{POWER}", unit) or powers > 9:
-        why = "powers are those of units, as in m**3"
+        fault = "powers are those of units, as in m**3"
     elif re.search(rf"{POWER}\s*[-+(\s]*\d{{3}}|\d{{16}}", unit):
-        why = "it has a number too long for a unit"
-    if why is not None:
-        raise CirlError(f"unit '{unit[:LONGEST]}': {why}; write units as in kg, t/day, 1/day or m**3")
+        fault = "it has a number too long for a unit"
+    if fault is not None:
+        raise CirlError(f"unit '{unit[:LONGEST]}': {fault}; write units as in kg, t/day, 1/day or m**3")
 
 
 @cache
@@ -88,13 +87,17 @@ def factor(unit: str, target: str) -> float:
     if unit.strip() == "-":
         raise CirlError("unit '-': write '1' for a number without unit")
     registry = _registry()
+    import pint
+
+    # what pint raises for texts that are no units
+    unreadable = (pint.errors.PintError, ArithmeticError, AssertionError, AttributeError, RecursionError, TypeError)
     try:
-        zero, one = (float(registry.Quantity(value, unit).to(target).magnitude) for value in (0.0, 1.0))
+        zero, scale = (float(registry.Quantity(value, unit).to(target).magnitude) for value in (0.0, 1.0))
     except pint.errors.DimensionalityError as error:
         raise CirlError(f"unit '{unit}' is inconsistent: a quantity in '{target}' is needed ({error})") from error
-    except UNREADABLE as error:
+    except (*unreadable, ValueError, tokenize.TokenError) as error:
         form = "write units as in kg, t/day, 1/day or m**3"
         raise CirlError(f"unit '{unit}' cannot be read: {str(error) or 'it breaks off'}; {form}") from error
     if zero != 0.0:
         raise CirlError(f"unit '{unit}': its zero is another than that of '{target}'; give numbers in '{target}'")
-    return one
+    return scale

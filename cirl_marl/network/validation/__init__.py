@@ -42,7 +42,7 @@ def problems(network: Specification) -> Iterator[str]:
     yield from _name_problems([*(("node", n.id) for n in network.nodes), *(("arc", a.id) for a in network.arcs)])
     yield from _name_problems([("service", service.id) for service in network.services])
     nodes = {node.id: node for node in network.nodes}
-    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
+    compartments = {c.id: c for c in (*network.nodes, *network.arcs)}
     outflows: dict[str, list[Arc]] = {}
     inflows: dict[str, list[Arc]] = {}
     for arc in network.arcs:
@@ -54,45 +54,45 @@ def problems(network: Specification) -> Iterator[str]:
         yield from lifetime_problems(network, node, [*inflows.get(node.id, ()), *outflows.get(node.id, ())])
     lawful = True
     for arc in network.arcs:
-        found = list(arc_problems(network, arc, nodes, everyone))
-        yield from found
-        lawful = lawful and not found
+        faults = list(arc_problems(network, arc, nodes, compartments))
+        yield from faults
+        lawful = lawful and not faults
     for node in network.nodes:
-        controlled = [arc for arc in outflows.get(node.id, ()) if arc.law is Law.CONTROLLED]
-        if node.control and node.control.kind is ControlKind.FLOW and len(controlled) != 1:
-            yield f"node '{node.id}': control.kind 'flow' needs one controlled outflow, it has {len(controlled)}"
-        for arc in controlled:
+        controlled_exits = [arc for arc in outflows.get(node.id, ()) if arc.law is Law.CONTROLLED]
+        if node.control and node.control.kind is ControlKind.FLOW and len(controlled_exits) != 1:
+            yield f"node '{node.id}': control.kind 'flow' needs one controlled outflow, it has {len(controlled_exits)}"
+        for arc in controlled_exits:
             setting = sum(c.control is not None and c.control.kind is ControlKind.FLOW for c in (node, arc))
             if setting != 1:
-                where = f"on the arc or on its donor '{node.id}'; it has {setting}"
-                yield f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', {where}"
+                places = f"on the arc or on its donor '{node.id}'; it has {setting}"
+                yield f"arc '{arc.id}': a controlled flow needs one control of kind 'flow', {places}"
     if lawful:
-        divided = splits(network)
-        crooked = [problem for each in divided for problem in each.problems()]
-        yield from crooked or trap_problems(network, divided)
+        divisions = splits(network)
+        faults_of_splits = [problem for split in divisions for problem in split.problems()]
+        yield from faults_of_splits or trap_problems(network, divisions)
     yield from port_problems(network)
     yield from service_problems(network)
     yield from supply_problems(network)
     yield from setting_problems(network)
     yield from uncertainty_problems(network)
-    acting = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
+    actuators = dict.fromkeys(c.id for c in (*network.nodes, *network.arcs) if c.control is not None)
     for agent in network.default_agents:
-        if agent in everyone and agent not in acting:
+        if agent in compartments and agent not in actuators:
             yield f"agents: '{agent}' has no control, so that it cannot act"
-        elif agent not in acting:
-            yield f"agents: {unknown('agent', agent, acting)}"
+        elif agent not in actuators:
+            yield f"agents: {unknown('agent', agent, actuators)}"
     yield from repetitions("agents", network.default_agents)
 
 
-def _name_problems(named: Iterable[tuple[str, str]]) -> Iterator[str]:
+def _name_problems(kinds_and_ids: Iterable[tuple[str, str]]) -> Iterator[str]:
     """Yield ids that are none, and those used twice, of what shares one set of names, given as (kind, id)."""
     kinds: dict[str, list[str]] = {}
-    for kind, id_ in named:
+    for kind, id_ in kinds_and_ids:
         kinds.setdefault(id_, []).append(kind)
     for id_, users in kinds.items():
-        who = f"{' and '.join(dict.fromkeys(users))} '{id_}'"
+        subject = f"{' and '.join(dict.fromkeys(users))} '{id_}'"
         if not re.fullmatch(IDENTIFIER, id_):
-            yield f"{who}: an id begins with a letter and has lower-case letters, digits and underscores only"
+            yield f"{subject}: an id begins with a letter and has lower-case letters, digits and underscores only"
         if len(users) > 1:
-            shared = "; nodes and arcs share one set of names" if len(set(users)) > 1 else ""
-            yield f"{who}: the id is used twice{shared}"
+            explanation = "; nodes and arcs share one set of names" if len(set(users)) > 1 else ""
+            yield f"{subject}: the id is used twice{explanation}"

@@ -19,65 +19,65 @@ from cirl_marl.network.validation.settings import repetitions
 
 def service_problems(network: Specification) -> Iterator[str]:
     """Yield every mistake in the services of ``network``."""
-    everyone = {c.id: c for c in (*network.nodes, *network.arcs)}
+    compartments = {c.id: c for c in (*network.nodes, *network.arcs)}
     providers = _providers(network)
     for service in network.services:
-        yield from _service_problems(network, service, everyone, providers)
+        yield from _service_problems(network, service, compartments, providers)
         yield from _outflow_problems(service, network.arcs)
 
 
 def _providers(network: Specification) -> dict[str, dict[str, None]]:
     """Return the compartments that may provide a service of each quantity."""
-    nodes, everyone = network.nodes, (*network.nodes, *network.arcs)
-    found = {
+    nodes, compartments = network.nodes, (*network.nodes, *network.arcs)
+    candidates = {
         "flow": [arc.id for arc in network.arcs],
         "stock": [
             *(node.id for node in nodes if node.stores),
             *(arc.id for arc in network.arcs if arc.law is Law.BATCH),
         ],
-        "measure": [c.id for c in everyone if isinstance(c.model, MeasuringModel)],
+        "measure": [c.id for c in compartments if isinstance(c.model, MeasuringModel)],
         "outflow": [node.id for node in nodes],
     }
-    return {quantity: dict.fromkeys(ids) for quantity, ids in found.items()}
+    return {quantity: dict.fromkeys(ids) for quantity, ids in candidates.items()}
 
 
 def _service_problems(
     network: Specification,
     service: Service,
-    everyone: Mapping[str, Compartment],
+    compartments: Mapping[str, Compartment],
     providers: Mapping[str, Mapping[str, None]],
 ) -> Iterator[str]:
-    where = f"service '{service.id}'"
-    yield from bound_problems(service, f"{where}: ")
-    known = providers.get(service.quantity, providers["outflow"])
-    if service.provider in known and service.quantity == "measure":
-        model = everyone[service.provider].model
+    subject = f"service '{service.id}'"
+    yield from bound_problems(service, f"{subject}: ")
+    options = providers.get(service.quantity, providers["outflow"])
+    if service.provider in options and service.quantity == "measure":
+        model = compartments[service.provider].model
         if isinstance(model, MeasuringModel) and service.measure not in model.measure_names:
-            yield f"{where}: {unknown('measure', service.measure, model.measure_names)}"
-    for place, each in enumerate(service.providers):
-        key, provider = "also" if place else "provider", everyone.get(each)
+            yield f"{subject}: {unknown('measure', service.measure, model.measure_names)}"
+    for place, id_ in enumerate(service.providers):
+        key, provider = "also" if place else "provider", compartments.get(id_)
         if isinstance(provider, Node) and not provider.stores and service.quantity == "stock":
-            yield f"{where}: {key}: '{provider.id}' stores nothing; ask for its outflow"
-        elif each not in known:
+            yield f"{subject}: {key}: '{provider.id}' stores nothing; ask for its outflow"
+        elif id_ not in options:
             kind = {"flow": "arc", "measure": "compartment that measures"}.get(service.quantity, "node")
-            yield f"{where}: {key}: {unknown(kind, each, known)}"
-    yield from repetitions(f"{where}: also", service.providers)
+            yield f"{subject}: {key}: {unknown(kind, id_, options)}"
+    yield from repetitions(f"{subject}: also", service.providers)
     if service.also and service.quantity == "measure":
-        yield f"{where}: also: measures of several compartments do not add up; give each a service"
+        yield f"{subject}: also: measures of several compartments do not add up; give each a service"
     if service.measure and service.quantity != "measure":
-        yield f"{where}: measure '{service.measure}': quantity '{service.quantity}' takes none"
-    yield from repetitions(f"{where}: owed_by", service.owed_by)
+        yield f"{subject}: measure '{service.measure}': quantity '{service.quantity}' takes none"
+    yield from repetitions(f"{subject}: owed_by", service.owed_by)
     for debtor in service.owed_by:
-        if debtor not in everyone:
-            yield f"{where}: owed_by: {unknown('compartment', debtor, everyone)}"
-    low, high = (np.array(network.interval_means(each)) for each in (service.low, service.high))
+        if debtor not in compartments:
+            yield f"{subject}: owed_by: {unknown('compartment', debtor, compartments)}"
+    low, high = (np.array(network.interval_means(id_)) for id_ in (service.low, service.high))
     if extremes(service.low)[0] < 0:
-        yield f"{where}: low {extremes(service.low)[0]:g} must not be negative"
+        yield f"{subject}: low {extremes(service.low)[0]:g} must not be negative"
     elif not ((low >= 0) & (low <= high) & (high > 0)).all():
         worst = int(np.argmin((low >= 0) & (low <= high) & (high > 0)))
-        yield f"{where}: the band [{low[worst]}, {high[worst]}] must not be negative or empty"
+        yield f"{subject}: the band [{low[worst]}, {high[worst]}] must not be negative or empty"
     elif (low == 0).all() and np.isinf(high).all():
-        yield f"{where}: the band from 0 without an upper end asks for nothing"
+        yield f"{subject}: the band from 0 without an upper end asks for nothing"
 
 
 def _outflow_problems(service: Service, arcs: tuple[Arc, ...]) -> Iterator[str]:
@@ -94,23 +94,23 @@ def _outflow_problems(service: Service, arcs: tuple[Arc, ...]) -> Iterator[str]:
 def supply_problems(network: Specification) -> Iterator[str]:
     """Yield why arcs cannot make up for what a service lacks."""
     services = {service.id: service for service in network.services}
-    supplying: dict[str, list[Arc]] = {}
-    passing: dict[str, list[Arc]] = {node.id: [] for node in network.nodes if not node.stores}
+    suppliers: dict[str, list[Arc]] = {}
+    stockless_exits: dict[str, list[Arc]] = {node.id: [] for node in network.nodes if not node.stores}
     for arc in network.arcs:
-        passing.get(arc.donor, []).append(arc)
+        stockless_exits.get(arc.donor, []).append(arc)
     for arc in network.arcs:
-        where, kind = f"arc '{arc.id}'", arc.control.kind if arc.control else None
+        subject, kind = f"arc '{arc.id}'", arc.control.kind if arc.control else None
         if not arc.makes_up_for:
             if arc.weight is not None:
-                yield f"{where}: weight: it makes up for no service; leave it out"
+                yield f"{subject}: weight: it makes up for no service; leave it out"
         elif arc.makes_up_for not in services:
-            yield f"{where}: makes_up_for: {unknown('service', arc.makes_up_for, services)}"
+            yield f"{subject}: makes_up_for: {unknown('service', arc.makes_up_for, services)}"
         elif arc.law is not Law.CONTROLLED or kind is not ControlKind.FLOW:
-            yield f"{where}: makes_up_for needs law 'controlled' and a control of kind 'flow' of its own"
+            yield f"{subject}: makes_up_for needs law 'controlled' and a control of kind 'flow' of its own"
         else:
-            supplying.setdefault(arc.makes_up_for, []).append(arc)
-            yield from _reach_problems(passing, arc, services[arc.makes_up_for])
-    for service, arcs in supplying.items():
+            suppliers.setdefault(arc.makes_up_for, []).append(arc)
+            yield from _reach_problems(stockless_exits, arc, services[arc.makes_up_for])
+    for service, arcs in suppliers.items():
         weights = [arc.weight for arc in arcs]
         ids = ", ".join(arc.id for arc in arcs)
         if len(arcs) > 1 and None in weights:
@@ -121,25 +121,29 @@ def supply_problems(network: Specification) -> Iterator[str]:
                 yield f"service '{service}': the weights of {ids}, which make up for it, sum to {total:g}, not to 1"
 
 
-def _reach_problems(passing: Mapping[str, Sequence[Arc]], arc: Arc, service: Service) -> Iterator[str]:
+def _reach_problems(stockless_exits: Mapping[str, Sequence[Arc]], arc: Arc, service: Service) -> Iterator[str]:
     """Yield it if what an arc carries does not reach a service at once, past the outflows of nodes without stock."""
-    where = f"arc '{arc.id}': makes_up_for '{service.id}'"
+    subject = f"arc '{arc.id}': makes_up_for '{service.id}'"
     if service.quantity == "measure":
-        yield f"{where}: it asks for a measure of a model, which no flow makes up for at once"
+        yield f"{subject}: it asks for a measure of a model, which no flow makes up for at once"
         return
-    reached, waiting = {arc.recipient}, [arc.recipient]
+    nodes, queue = {arc.recipient}, [arc.recipient]
     flows = {arc.id}
-    while waiting:
-        node = waiting.pop()
-        if node in passing:
-            out = passing[node]
-            flows |= {each.id for each in out}
-            new = {each.recipient for each in out} - reached
-            reached |= new
-            waiting += sorted(new)
-    known = (
-        flows if service.quantity == "flow" else reached if service.quantity == "stock" else reached & passing.keys()
+    while queue:
+        node = queue.pop()
+        if node in stockless_exits:
+            out = stockless_exits[node]
+            flows |= {exit_.id for exit_ in out}
+            new = {exit_.recipient for exit_ in out} - nodes
+            nodes |= new
+            queue += sorted(new)
+    within_reach = (
+        flows
+        if service.quantity == "flow"
+        else nodes
+        if service.quantity == "stock"
+        else nodes & stockless_exits.keys()
     )
-    if known.isdisjoint(service.providers):
+    if within_reach.isdisjoint(service.providers):
         between = "only nodes that store nothing may lie between them"
-        yield f"{where}: what it carries does not reach '{service.provider}' at once; {between}"
+        yield f"{subject}: what it carries does not reach '{service.provider}' at once; {between}"

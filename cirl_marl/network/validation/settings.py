@@ -26,21 +26,21 @@ def setting_problems(network: Specification) -> Iterator[str]:
     else:
         if episode.solver_step is not None:
             yield f"solver 'exact' takes no solver_step, got {episode.solver_step}"
-        moving = any(isinstance(c.model, ContinuousModel | OwnStepModel) for c in (*network.nodes, *network.arcs))
-        if moving or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
+        continuous = any(isinstance(c.model, ContinuousModel | OwnStepModel) for c in (*network.nodes, *network.arcs))
+        if continuous or any(arc.law is Law.COMPARTMENT for arc in network.arcs):
             yield "solver 'exact' knows no continuous inner physics: a network with models needs 'rk4' or 'euler'"
-    everyone = (*network.nodes, *network.arcs)
-    for compartment in everyone:
+    compartments = (*network.nodes, *network.arcs)
+    for compartment in compartments:
         yield from _clock_problems(network, compartment)
-    tracked = dict.fromkeys(c.id for c in everyone if c.set_point is not None)
+    with_set_point = dict.fromkeys(c.id for c in compartments if c.set_point is not None)
     yield from repetitions("objective.tracked", objective.tracked)
     yield from repetitions("observation.nodes", network.observation.nodes)
     for name in objective.tracked:
-        if name not in tracked:
-            yield f"objective.tracked: {unknown('compartment with a set_point', name, tracked)}"
+        if name not in with_set_point:
+            yield f"objective.tracked: {unknown('compartment with a set_point', name, with_set_point)}"
     if (network.observation.mode == "stocks") != bool(network.observation.nodes):
         yield "observation: mode 'stocks', and only that mode, lists its nodes"
-    inner = [f"{c.id}.{name}" for c in everyone if c.model is not None for name in c.model.state_names]
+    inner = [f"{c.id}.{name}" for c in compartments if c.model is not None for name in c.model.state_names]
     signals = dict.fromkeys((*(node.id for node in network.nodes), *inner))
     for name in network.observation.nodes:
         if name not in signals:
@@ -72,8 +72,8 @@ def _clock_problems(network: Specification, compartment: Compartment) -> Iterato
         return  # a problem of its own, units.time
     if isinstance(model, DiscreteTimeModel) and not math.isclose(interval, model.interval, rel_tol=1e-9):
         steps = f"in steps of {model.interval:g} {model.time_unit}"
-        given = f"the control interval is {interval:g} {model.time_unit}"
-        yield f"'{compartment.id}': model '{model.kind}' moves {steps}; {given}"
+        actual = f"the control interval is {interval:g} {model.time_unit}"
+        yield f"'{compartment.id}': model '{model.kind}' moves {steps}; {actual}"
 
 
 def _step_problems(episode: Episode, unit: str) -> Iterator[str]:
@@ -91,11 +91,11 @@ def _step_problems(episode: Episode, unit: str) -> Iterator[str]:
         yield f"control_interval {interval} is not a whole number of solver steps of {step} ({ratio:.6g} steps)"
 
 
-def repetitions(where: str, names: Iterable[str]) -> Iterator[str]:
+def repetitions(subject: str, names: Iterable[str]) -> Iterator[str]:
     """Yield names that a list has twice."""
     for name, times in Counter(names).items():
         if times > 1:
-            yield f"{where}: names '{name}' twice"
+            yield f"{subject}: names '{name}' twice"
 
 
 def is_whole(ratio: float) -> bool:

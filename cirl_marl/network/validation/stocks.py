@@ -29,30 +29,32 @@ NARROWEST, WIDEST = 0.02, 3.0
 
 def storage_problems(node: Node, outflows: Sequence[Arc]) -> Iterator[str]:
     """Yield what does not go with a stock that a node has, has not, or whose start is unknown."""
-    where, shares = f"node '{node.id}'", [arc.id for arc in outflows if arc.law is Law.SHARE]
+    subject, shares = f"node '{node.id}'", [arc.id for arc in outflows if arc.law is Law.SHARE]
     if node.stores:
-        unscheduled = [arc.id for arc in outflows if arc.law not in (Law.CONTROLLED, Law.EXOGENOUS)]
-        if node.initial is None and node.history is None and unscheduled:
-            allowed = "only a node whose outflows are all scheduled may leave it out"
-            yield f"{where}: initial: missing; {allowed}, and '{unscheduled[0]}' is not"
+        proportional = [arc.id for arc in outflows if arc.law not in (Law.CONTROLLED, Law.EXOGENOUS)]
+        if node.initial is None and node.history is None and proportional:
+            rule = "only a node whose outflows are all scheduled may leave it out"
+            yield f"{subject}: initial: missing; {rule}, and '{proportional[0]}' is not"
         if node.lifetime is not None:
             return
         if bool(shares) != (extremes(node.rate)[1] > 0):
             remedy = "give the node a rate, 1/time, a lifetime, or stores = false"
-            told = f"arc '{shares[0]}' shares what it releases; {remedy}" if shares else "it is for arcs of law 'share'"
-            yield f"{where}: rate = {node.rate!r}: {told}"
+            remedy_ = (
+                f"arc '{shares[0]}' shares what it releases; {remedy}" if shares else "it is for arcs of law 'share'"
+            )
+            yield f"{subject}: rate = {node.rate!r}: {remedy_}"
         return
-    given_ = {"initial": node.initial, "model": node.model, "rate": node.rate or None, "lifetime": node.lifetime}
-    for name, given in given_.items():
-        if given is not None:
-            yield f"{where}: {name}: it stores nothing, so that it has none"
+    fields = {"initial": node.initial, "model": node.model, "rate": node.rate or None, "lifetime": node.lifetime}
+    for name, number in fields.items():
+        if number is not None:
+            yield f"{subject}: {name}: it stores nothing, so that it has none"
     if node.control is not None:
         remedy = "put controls of kind 'share' on its arcs"
-        yield f"{where}: control: it stores nothing, so that all it gets leaves at once; {remedy}"
+        yield f"{subject}: control: it stores nothing, so that all it gets leaves at once; {remedy}"
     if node.role is not Role.TECHNOSPHERE:
-        yield f"{where}: role '{node.role}': a node that stores nothing is of the technosphere"
+        yield f"{subject}: role '{node.role}': a node that stores nothing is of the technosphere"
     if not outflows:
-        yield f"{where}: it stores nothing and no arc leaves it, so that what enters has nowhere to go"
+        yield f"{subject}: it stores nothing and no arc leaves it, so that what enters has nowhere to go"
     for arc in outflows:
         if arc.law is not Law.SHARE:
             reason = f"its donor '{node.id}' stores nothing, so that only law 'share' can leave it"
@@ -63,65 +65,71 @@ def series_problems(network: Specification) -> Iterator[str]:
     """Yield series that are none, or that do not cover the episode."""
     length = network.episode.control_interval * network.episode.horizon
 
-    def said(time: float) -> str:
-        return f"{time:g}" + "".join(f" ({each})" for dates in labels(network, time)[1] for each in dates)
+    def format_time(time: float) -> str:
+        return f"{time:g}" + "".join(f" ({fault})" for dates in labels(network, time)[1] for fault in dates)
 
     parts: list[Any] = [*network.nodes, *network.arcs, *network.services]
-    named: list[tuple[str, Any]] = [(f"{type(part).__name__.lower()} '{part.id}': ", part) for part in parts]
-    named += [(f"{where}control.", c.control) for where, c in named if isinstance(c, Compartment) and c.control]
-    for where, part in named:
-        for name, declared in declarations(type(part)).items():
+    owners: list[tuple[str, Any]] = [(f"{type(part).__name__.lower()} '{part.id}': ", part) for part in parts]
+    owners += [(f"{prefix}control.", c.control) for prefix, c in owners if isinstance(c, Compartment) and c.control]
+    for prefix, part in owners:
+        for name, declaration in declarations(type(part)).items():
             value = getattr(part, name)
             if isinstance(value, Series):
-                past = isinstance(declared, Quantity) and declared.past
-                told = list(value.problems())
-                if not told:
-                    told = [value.history_problem(said) if past else value.coverage_problem(length, said)]
+                past = isinstance(declaration, Quantity) and declaration.past
+                faults = list(value.problems())
+                if not faults:
+                    faults = [
+                        value.history_problem(format_time) if past else value.coverage_problem(length, format_time)
+                    ]
                 origin = f" ({value.origin})" if value.origin else ""
-                yield from (f"{where}{name}: {each}{origin}" for each in told if each)
+                yield from (f"{prefix}{name}: {fault}{origin}" for fault in faults if fault)
 
 
-def share_problems(where: str, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
+def share_problems(subject: str, arc: Arc, nodes: Mapping[str, Node]) -> Iterator[str]:
     """Yield what does not go with shares, or with an end that stores nothing."""
     kind = arc.control.kind if arc.control else None
     if kind is ControlKind.SHARE and arc.law is not Law.SHARE:
-        yield f"{where}: control.kind 'share' needs law 'share', not '{arc.law}'"
+        yield f"{subject}: control.kind 'share' needs law 'share', not '{arc.law}'"
     if arc.law is Law.SHARE and kind not in (None, ControlKind.SHARE):
         remedy = f"a valve on '{arc.donor}' acts on all that it releases"
-        yield f"{where}: law 'share' needs control.kind 'share', not '{kind}'; {remedy}"
+        yield f"{subject}: law 'share' needs control.kind 'share', not '{kind}'; {remedy}"
     if kind is ControlKind.SHARE and arc.share is not None:
-        yield f"{where}: share: its control sets it; leave it out"
+        yield f"{subject}: share: its control sets it; leave it out"
     if arc.law in (Law.BATCH, Law.RECIPIENT):
         for node in (nodes.get(arc.donor), nodes.get(arc.recipient)):
             if node is not None and not node.stores:
-                yield f"{where}: law '{arc.law}' needs a stock at both ends; '{node.id}' stores nothing"
+                yield f"{subject}: law '{arc.law}' needs a stock at both ends; '{node.id}' stores nothing"
 
 
 def lifetime_problems(network: Specification, node: Node, arcs: Sequence[Arc]) -> Iterator[str]:
     """Yield what does not go with a lifetime that a node has or has not; ``arcs`` are those that enter or leave it."""
-    where, kind = f"node '{node.id}': ", node.control.kind if node.control else None
+    prefix, kind = f"node '{node.id}': ", node.control.kind if node.control else None
     if node.lifetime is None:
-        told = {"stretch": node.stretch != 1.0, "history": node.history is not None, "growth": node.growth is not None}
-        for name in (name for name, given in told.items() if given):
-            yield f"{where}{name}: it has no lifetime; give it one, or leave this out"
+        states = {
+            "stretch": node.stretch != 1.0,
+            "history": node.history is not None,
+            "growth": node.growth is not None,
+        }
+        for name in (name for name, states_it in states.items() if states_it):
+            yield f"{prefix}{name}: it has no lifetime; give it one, or leave this out"
         if kind is ControlKind.STRETCH:
-            yield f"{where}control.kind 'stretch' needs a lifetime; a valve is of kind 'rate'"
+            yield f"{prefix}control.kind 'stretch' needs a lifetime; a valve is of kind 'rate'"
         return
     if not node.stores:
         return  # told with all else that such a node has not
-    for name, given in (("model", node.model is not None), ("rate", extremes(node.rate)[1] > 0)):
-        if given:
-            yield f"{where}lifetime: it says when what enters leaves, so that there is no {name}"
+    for name, states_it in (("model", node.model is not None), ("rate", extremes(node.rate)[1] > 0)):
+        if states_it:
+            yield f"{prefix}lifetime: it says when what enters leaves, so that there is no {name}"
     if kind not in (None, ControlKind.STRETCH):
-        yield f"{where}control.kind '{kind}': a node with a lifetime is controlled by kind 'stretch'"
+        yield f"{prefix}control.kind '{kind}': a node with a lifetime is controlled by kind 'stretch'"
     yield from _end_problems(node, arcs)
-    mistakes = [*bound_problems(node.lifetime, f"{where}lifetime.")]
-    mistakes = mistakes or [f"{where}lifetime.{each}" for each in _spread_problems(network, node.lifetime)]
+    mistakes = [*bound_problems(node.lifetime, f"{prefix}lifetime.")]
+    mistakes = mistakes or [f"{prefix}lifetime.{fault}" for fault in _spread_problems(network, node.lifetime)]
     if node.lifetime.distribution == FIXED_LIFETIME and (kind is ControlKind.STRETCH or node.stretch != 1.0):
-        mistakes.append(f"{where}stretch: a fixed lifetime has none; give it a distribution and a small deviation")
+        mistakes.append(f"{prefix}stretch: a fixed lifetime has none; give it a distribution and a small deviation")
     yield from mistakes
     if not mistakes and not [*bound_problems(node)]:
-        yield from (f"{where}{each}" for each in age_problems(node, network.episode.control_interval))
+        yield from (f"{prefix}{fault}" for fault in age_problems(node, network.episode.control_interval))
 
 
 def _end_problems(node: Node, arcs: Sequence[Arc]) -> Iterator[str]:
@@ -151,5 +159,5 @@ def _spread_problems(network: Specification, lifetime: Lifetime) -> Iterator[str
         yield f"deviation: missing; a {lifetime.distribution} lifetime needs one"
     elif not NARROWEST <= deviation / mean <= WIDEST:
         remedy = "take distribution = 'fixed'" if deviation < mean else "is it in the unit of the mean?"
-        known = f"{deviation / mean:.3g} of the mean; from {NARROWEST:g} to {WIDEST:g} can be followed"
-        yield f"deviation {deviation:g} is {known}: {remedy}"
+        range_ = f"{deviation / mean:.3g} of the mean; from {NARROWEST:g} to {WIDEST:g} can be followed"
+        yield f"deviation {deviation:g} is {range_}: {remedy}"
