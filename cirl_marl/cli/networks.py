@@ -190,7 +190,7 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
 
 def _check_network(source: str, progress: Callable[[float], None]) -> None:
     from cirl_marl.controllers.lint import lint_warnings
-    from cirl_marl.definitions.catalogue import load_network
+    from cirl_marl.definitions.catalogue import definition, load_network
     from cirl_marl.environments.vector import MultiAgentVectorEnv
 
     network = load_network(source)

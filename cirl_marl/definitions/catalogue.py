@@ -69,7 +69,7 @@ def load_network(name: str | Path, *, scenario: str | None = None, allow_code: b
         path_and_region = _in_catalogue(network)
     path, region = path_and_region
     with code_allowed(allow_code):
-        return _definition(path).network(region=region).scenario(variant).scenario(scenario)
+        return definition(path).network(region=region).scenario(variant).scenario(scenario)
 
 
 def file_and_region(name: str) -> tuple[Path, str] | None:
