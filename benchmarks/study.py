@@ -36,7 +36,7 @@ from cirl_marl.network import Floats
 from cirl_marl.optimum import gap
 from cirl_marl.optimum.mpc import MPC, SERVICE_FIRST
 from cirl_marl.records.files import write_json
-from cirl_marl.report.fronts import write_comparison
+from cirl_marl.report.tradeoffs import write_comparison
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "study.md"
 FIRST_SEED, SEEDS, EPISODES = 300, 5, 256

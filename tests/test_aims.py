@@ -35,7 +35,7 @@ from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.optimum import Bound, NoCertificate, bound
 from cirl_marl.reasons.inverse import ObjectiveWeights, infer
 from cirl_marl.reasons.objective_terms import PlannedEpisode, objective_terms
-from cirl_marl.reasons.plans import episodes_of_plan
+from cirl_marl.reasons.plan_files import episodes_of_plan
 from cirl_marl.reasons.prices import shadow_prices
 from cirl_marl.report.objective_weights import weights_sentences, write_weights
 

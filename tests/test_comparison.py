@@ -28,7 +28,7 @@ from cirl_marl.learners import Progress, Recipe, RunDirectory, Training, load_re
 from cirl_marl.network import Network
 from cirl_marl.optimum import search_each
 from cirl_marl.records.files import publish_folder
-from cirl_marl.report.fronts import COMPARISON_FILES, write_comparison
+from cirl_marl.report.tradeoffs import COMPARISON_FILES, write_comparison
 
 pytestmark = pytest.mark.medium
 

@@ -15,7 +15,7 @@ from cirl_marl.evaluation.pareto import ParetoFront, pareto_front
 from cirl_marl.learners import load_recipe
 from cirl_marl.network import Network
 from cirl_marl.optimum import NoCertificate
-from cirl_marl.report.fronts import PARETO_FILES, write_front
+from cirl_marl.report.tradeoffs import PARETO_FILES, write_front
 
 pytestmark = pytest.mark.medium
 

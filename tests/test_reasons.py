@@ -29,8 +29,8 @@ from cirl_marl.learners.views import OneAgent
 from cirl_marl.reasons import extras
 from cirl_marl.reasons.attribution import _memories, attribute_inputs
 from cirl_marl.reasons.explanation import explain
+from cirl_marl.reasons.input_signals import policy_columns, signal_of
 from cirl_marl.reasons.interventions import Recorder, play_episodes
-from cirl_marl.reasons.observations import policy_columns, signal_of
 from cirl_marl.reasons.rules import distil_rules
 from cirl_marl.reasons.sentences import input_sentence, rule_sentences
 from cirl_marl.report.explanations import read_reasons, write_reasons

@@ -56,7 +56,7 @@ def compare(
     Where nothing bounds a network, optimum is the best plan that a search by simulation finds, without certificate.
     """
     from cirl_marl.evaluation import compare as compared
-    from cirl_marl.report.fronts import comparison_notes, comparison_table, write_comparison
+    from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, write_comparison
 
     names = common.listed(controllers)
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
@@ -104,7 +104,7 @@ def pareto(
     """
     from cirl_marl.definitions.catalogue import load_network
     from cirl_marl.evaluation.pareto import pareto_front as swept
-    from cirl_marl.report.fronts import write_front
+    from cirl_marl.report.tradeoffs import write_front
 
     page = common.page_for(html)
     folder = common.folder_for(

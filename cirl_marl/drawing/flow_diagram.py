@@ -137,12 +137,12 @@ def flow_diagrams(network: Network, peaks: Floats) -> list[FlowDiagram]:
 def _diagram(network: Network, members: Mapping[str, list[int]], name: str, peaks: Floats) -> FlowDiagram:
     """Return the diagram with one group unfolded and of the rest only what it has to do with; without a name, all."""
     inside = set(members.get(name, ()))
-    group = {i: other for other, nodes in members.items() if other != name for i in nodes}
+    group = {i: title for title, nodes in members.items() if title != name for i in nodes}
     ends = list(zip(network.donors.tolist(), network.recipients.tolist(), strict=True))
     near = set(range(len(network.nodes)))
     if name:
         near = {i for pair in ends if inside & set(pair) for i in pair}
-        near |= {i for other in {group[i] for i in near if i in group} for i in members[other]}
+        near |= {i for title in {group[i] for i in near if i in group} for i in members[title]}
     boxes: list[Box] = []
     box_of: dict[int, int] = {}
     for i in sorted(near):

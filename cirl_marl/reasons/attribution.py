@@ -21,8 +21,8 @@ from cirl_marl.evaluation.statistics import Aggregate, over_episodes
 from cirl_marl.network import Floats
 from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.reasons.extras import module_for
+from cirl_marl.reasons.input_signals import Signal, observation_entries, policy_columns, signal_of
 from cirl_marl.reasons.interventions import FixedInputs, RecordedEpisodes, Substitution, play_episodes
-from cirl_marl.reasons.observations import Signal, observation_entries, policy_columns, signal_of
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies, Policy

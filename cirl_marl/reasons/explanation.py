@@ -55,7 +55,7 @@ def explain(
     seed: int = 0,
     top: int = TOP,
     leaves: int = LEAVES,
-    progress: Callable[[str, float], None] = lambda what, share: None,
+    progress: Callable[[str, float], None] = lambda task, share: None,
 ) -> Explanation:
     """Explain a network, or what the policies of a run do in it.
 

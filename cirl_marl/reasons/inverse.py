@@ -32,7 +32,7 @@ from cirl_marl.optimum.options import DEGREE
 from cirl_marl.optimum.program import Programs
 from cirl_marl.optimum.solver import Basis, solve
 from cirl_marl.reasons.objective_terms import KINDS, ObjectiveTerm, PlannedEpisode, objective_terms
-from cirl_marl.reasons.plans import episode_setting, episodes_of_plan
+from cirl_marl.reasons.plan_files import episode_setting, episodes_of_plan
 
 WITHIN = 0.01
 ROUNDS = 200

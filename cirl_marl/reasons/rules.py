@@ -22,8 +22,8 @@ from cirl_marl.network import Floats, Integers
 from cirl_marl.network.declarations import with_field_docs
 from cirl_marl.reasons.attribution import PairedDifference, paired_difference
 from cirl_marl.reasons.extras import module_for
+from cirl_marl.reasons.input_signals import PolicyColumns, Signal, policy_columns, signal_of
 from cirl_marl.reasons.interventions import RecordedEpisodes, Recorder, Substitution, play_episodes
-from cirl_marl.reasons.observations import PolicyColumns, Signal, policy_columns, signal_of
 
 if TYPE_CHECKING:
     from cirl_marl.learners.policies import Policies

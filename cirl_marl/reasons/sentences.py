@@ -15,7 +15,7 @@ from cirl_marl.network.calendar import labels
 from cirl_marl.network.elements import Arc, ControlKind
 from cirl_marl.reasons.attribution import AgentInputs, PairedDifference
 from cirl_marl.reasons.explanation import Explanation
-from cirl_marl.reasons.observations import TIME, Signal
+from cirl_marl.reasons.input_signals import TIME, Signal
 from cirl_marl.reasons.prices import ShadowPrices
 from cirl_marl.reasons.rules import Condition, Leaf, Rule
 

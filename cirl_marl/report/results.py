@@ -18,10 +18,10 @@ from cirl_marl.evaluation.simulations import Simulation
 from cirl_marl.report import report_page
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table
 from cirl_marl.report.differences import save_alternatives
-from cirl_marl.report.fronts import comparison_notes, comparison_table, save_comparison, save_pareto
 from cirl_marl.report.page_html import write_page
 from cirl_marl.report.run import draw_circularity, page_of_evaluation
 from cirl_marl.report.terminal import evaluation_table
+from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, save_comparison, save_pareto
 from cirl_marl.report.trajectory import draw_trajectory
 
 Result = Simulation | Sequence[Simulation] | Schedule | Comparison | ParetoFront | Evaluation
