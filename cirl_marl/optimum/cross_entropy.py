@@ -38,7 +38,7 @@ exact where more of it costs less than that; a steeper one lets the draws hug th
 KNOTS = 16
 """Stretches of an episode with deviations of their own, unless another number is asked for."""
 SearchReport = Callable[[float, Floats], None]
-"""Takes the share of all episodes that is simulated and the best merit from each start so far, shape (starts,)."""
+"""Takes the share of all episodes that is simulated and the best objective from each start so far, shape (starts,)."""
 ELITE_SHARE = 0.125
 """Share of a population that makes up the elite."""
 MEAN_STEP = 0.6
@@ -99,11 +99,11 @@ def search(
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
-    progress: SearchReport = lambda share, merit: None,
+    progress: SearchReport = lambda share, objective: None,
 ) -> Incumbent:
     """Look for the actions that do best over one episode, for any network; nothing is proved about the result.
 
-    The merit of an episode is λ̄/circularity_scale; with ``service_weight`` w, λ̄/circularity_scale + w·(mean service
+    The objective of an episode is λ̄/circularity_scale; with ``service_weight`` w, λ̄/circularity_scale + w·(mean service
     level); with ``min_service`` s, λ̄/circularity_scale − SHORTFALL_PRICE·Σ max(0, s − mean level), over the services: a
     plan may miss s if no better one was found, and its ``levels`` tell.
 
@@ -161,7 +161,7 @@ def search_each(
     population: int = 64,
     iterations: int = 30,
     seed: int = 0,
-    progress: SearchReport = lambda share, merit: None,
+    progress: SearchReport = lambda share, objective: None,
 ) -> list[Incumbent]:
     """Look for the best actions from several starts at once, which costs less than one after the other.
 
@@ -176,7 +176,7 @@ def search_each(
     if knots > network.episode.horizon:
         raise CirlError(f"knots: {knots} are more than the {network.episode.horizon} decisions of an episode")
     demand = None if min_service is None else demanded_levels(network, min_service)
-    merit = _Objective(network.objective.circularity_scale, service_weight, demand)
+    objective = _Objective(network.objective.circularity_scale, service_weight, demand)
     starts = np.asarray(initial, dtype=float)
     copies = Population(network, agents, starts, population)
     options = standard_candidates(copies.agents) if candidates is None else dict(candidates)
@@ -194,18 +194,18 @@ def search_each(
     first = Population(network, copies.agents, starts, len(options)).run(
         controllers, entrants, np.zeros((*entrants.shape, 1, copies.entries)), report(len(options))
     )
-    best = _Best.among(first, merit.of(first))
+    best = _Best.among(first, objective.of(first))
     origin = best.copy
-    gaussians = Gaussians(best.merit, population, copies.entries, seed)
-    episodes_done, highest = len(options), best.merit
+    gaussians = Gaussians(best.objective, population, copies.entries, seed)
+    episodes_done, highest = len(options), best.objective
     for count in knot_counts(knots, iterations):
         gaussians.refine(count)
         controller = np.repeat(origin[:, None], population, axis=1)
         trial = copies.run(controllers, controller, gaussians.draw(), report(population))
-        gaussians.learn(merit.of(trial), trial.deviation)
-        best = best.or_better(_Best.among(trial, merit.of(trial)))
-        episodes_done, highest = episodes_done + population, best.merit
-    progress(1.0, best.merit)
+        gaussians.learn(objective.of(trial), trial.deviation)
+        best = best.or_better(_Best.among(trial, objective.of(trial)))
+        episodes_done, highest = episodes_done + population, best.objective
+    progress(1.0, best.objective)
     return [
         Incumbent(
             network=network,
@@ -241,14 +241,14 @@ class _Objective:
     min_service: Floats | None
 
     def of(self, episodes: Episodes) -> Floats:
-        """Return the merit of each episode, shape (starts, copies)."""
-        merit: Floats = episodes.circularity / self.scale
+        """Return the objective of each episode, shape (starts, copies)."""
+        objective: Floats = episodes.circularity / self.scale
         if self.service_weight is not None:
-            merit = merit + self.service_weight * episodes.service
+            objective = objective + self.service_weight * episodes.service
         if self.min_service is not None:
             lack = np.maximum(0.0, self.min_service[:, None, None] - episodes.levels)
-            merit = merit - SHORTFALL_PRICE * lack.sum(axis=0)
-        return merit
+            objective = objective - SHORTFALL_PRICE * lack.sum(axis=0)
+        return objective
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,7 +257,7 @@ class _Best:
 
     Attributes:
         copy: which of the copies it was, shape (starts,).
-        merit: shape (starts,).
+        objective: shape (starts,).
         circularity: λ̄, shape (starts,), mass.
         service: mean service level, shape (starts,).
         levels: of each service, shape (starts, services).
@@ -265,26 +265,26 @@ class _Best:
     """
 
     copy: Integers
-    merit: Floats
+    objective: Floats
     circularity: Floats
     service: Floats
     levels: Floats
     actions: Floats
 
     @classmethod
-    def among(cls, episodes: Episodes, merit: Floats) -> _Best:
-        """Return the first of the best ``episodes``, of ``merit`` (starts, copies)."""
-        copy, start = merit.argmax(axis=1), np.arange(len(merit))
+    def among(cls, episodes: Episodes, objective: Floats) -> _Best:
+        """Return the first of the best ``episodes``, of ``objective`` (starts, copies)."""
+        copy, start = objective.argmax(axis=1), np.arange(len(objective))
         actions = np.stack([episodes.actions[:, :, i, c] for i, c in zip(start, copy, strict=True)])
         figures = episodes.circularity[start, copy], episodes.service[start, copy], episodes.levels[:, start, copy].T
-        return cls(copy, merit[start, copy], *figures, actions)
+        return cls(copy, objective[start, copy], *figures, actions)
 
     def or_better(self, rival: _Best) -> _Best:
         """Return the better of the two from each start, these if they are equal."""
-        better = rival.merit > self.merit
+        better = rival.objective > self.objective
         return _Best(
             np.where(better, rival.copy, self.copy),
-            np.where(better, rival.merit, self.merit),
+            np.where(better, rival.objective, self.objective),
             np.where(better, rival.circularity, self.circularity),
             np.where(better, rival.service, self.service),
             np.where(better[:, None], rival.levels, self.levels),
@@ -295,17 +295,17 @@ class _Best:
 class Gaussians:
     """Deviations from each start, independent in every stretch of time and entry; first constants around 0."""
 
-    def __init__(self, merit: Floats, population: int, entries: int, seed: int) -> None:
+    def __init__(self, objective: Floats, population: int, entries: int, seed: int) -> None:
         """Begin with constants.
 
         Args:
-            merit: of no deviation, shape (starts,).
+            objective: of no deviation, shape (starts,).
             population: deviations drawn for each start.
             entries: of an action.
             seed: of the draws.
         """
-        self._merit, self._elite = merit[:, None], np.zeros((len(merit), 1, 1, entries))
-        self._mean, self._variance = self._elite[:, 0].copy(), np.full((len(merit), 1, entries), SPREAD**2)
+        self._objective, self._elite = objective[:, None], np.zeros((len(objective), 1, 1, entries))
+        self._mean, self._variance = self._elite[:, 0].copy(), np.full((len(objective), 1, entries), SPREAD**2)
         self._spread, self._population = SPREAD, population
         self._random = np.random.default_rng(seed)
 
@@ -318,7 +318,7 @@ class Gaussians:
         if parts == 1:
             return
         self._spread *= SPREAD_DECAY
-        self._merit, self._elite = self._merit[:, :1], np.repeat(self._elite[:, :1], parts, axis=2)
+        self._objective, self._elite = self._objective[:, :1], np.repeat(self._elite[:, :1], parts, axis=2)
         self._mean = self._elite[:, 0].copy()
         self._variance = np.full(self._mean.shape, self._spread**2)
 
@@ -328,17 +328,17 @@ class Gaussians:
         deviation: Floats = self._mean[:, None] + np.sqrt(self._variance)[:, None] * normal
         return deviation
 
-    def learn(self, merit: Floats, deviation: Floats) -> None:
+    def learn(self, objective: Floats, deviation: Floats) -> None:
         """Move the Gaussians towards the best deviations so far; those of earlier iterations compete.
 
         Args:
-            merit: shape (starts, population).
+            objective: shape (starts, population).
             deviation: as it came through the bounds of the actions, shape (starts, population, knots, entries).
         """
-        merit = np.concatenate([self._merit, merit], axis=1)
+        objective = np.concatenate([self._objective, objective], axis=1)
         deviation = np.concatenate([self._elite, deviation], axis=1)
-        order = np.argsort(-merit, axis=1, kind="stable")[:, : round(self._population * ELITE_SHARE)]
-        self._merit = np.take_along_axis(merit, order, axis=1)
+        order = np.argsort(-objective, axis=1, kind="stable")[:, : round(self._population * ELITE_SHARE)]
+        self._objective = np.take_along_axis(objective, order, axis=1)
         self._elite = np.take_along_axis(deviation, order[:, :, None, None], axis=1)
         self._mean += MEAN_STEP * (self._elite.mean(axis=1) - self._mean)
         self._variance += MEAN_STEP * (self._elite.var(axis=1) - self._variance)

@@ -75,8 +75,8 @@ def improved(
     for done in range(rounds):
         if trust < SMALLEST or enough(run):
             break
-        slopes = _jacobians(best) if slopes is None else slopes
-        step = _step(best, run, price, trust, slopes)
+        slopes = _jacobians(best, dynamics) if slopes is None else slopes
+        step = _step(best, dynamics, run, price, trust, slopes)
         progress((done + 1) / rounds)
         if step is None:  # a smaller region is another program
             trust /= 4
@@ -92,7 +92,7 @@ def improved(
     return best
 
 
-def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
+def _jacobians(bound: Bound, dynamics: Dynamics) -> tuple[Floats, Floats, Floats]:
     """Return ∂(x', f̄)/∂x and ∂(x', f̄)/∂a of every interval, and what each ends with, around the bound's actions.
 
     Shapes are (steps, stocks + arcs, stocks), (steps, stocks + arcs, entries) and (steps, stocks); stocks are those of
@@ -100,7 +100,6 @@ def _jacobians(bound: Bound) -> tuple[Floats, Floats, Floats]:
     """
     network = bound.network
     steps, entries = bound.actions.shape
-    dynamics = Dynamics(network)
     rows, nodes = dynamics.rows, dynamics.rows.nodes.stop
     stock = _path(bound, dynamics)
     inputs = np.concatenate([stock[:-1], bound.actions], axis=1)
@@ -140,7 +139,7 @@ def _path(bound: Bound, dynamics: Dynamics) -> Floats:
 
 
 def _step(
-    bound: Bound, run: Rollout, price: Floats, trust: float, slopes: tuple[Floats, Floats, Floats]
+    bound: Bound, dynamics: Dynamics, run: Rollout, price: Floats, trust: float, slopes: tuple[Floats, Floats, Floats]
 ) -> Floats | None:
     """Return the best change of the actions within the trust region to first order, shape (steps, entries).
 
@@ -156,14 +155,12 @@ def _step(
     size = outputs + entries + services + 1
     level, imbalance = outputs + entries, size - 1
     # δ(x', f̄)_t − J_x δx'_{t−1} − J_a δa_t = 0, block row t of the equations
-    once = sparse.identity(steps)
-    carry = sparse.csr_array(_diagonal(-by_stock, (outputs, nodes)))
-    carry_over = carry @ sparse.kron(sparse.eye_array(steps, k=-1), sparse.eye_array(nodes, size))
+    now, before = sparse.identity(steps), sparse.eye_array(steps, k=-1)
     select_out, select_in = sparse.eye_array(outputs, size), sparse.eye_array(entries, size, k=outputs)
-    linear = sparse.kron(once, select_out) - sparse.csr_array(_diagonal(by_action, (outputs, entries))) @ sparse.kron(
-        once, select_in
-    )
-    dynamics = Dynamics(network)
+    carry = sparse.csr_array(_diagonal(-by_stock, (outputs, nodes)))
+    carry_over = carry @ sparse.kron(before, sparse.eye_array(nodes, size))
+    effect = sparse.csr_array(_diagonal(by_action, (outputs, entries))) @ sparse.kron(now, select_in)
+    linear = sparse.kron(now, select_out) - effect
     measure, imbalances = _measures(bound, dynamics)
     state = np.concatenate([stocks, run.flow], axis=1)
     low = np.array([network.interval_means(service.low) for service in network.services]).reshape(services, steps)

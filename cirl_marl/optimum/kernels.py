@@ -44,13 +44,10 @@ class Kernel:
             # of what is there at the end of piece q, what leaves in each later one
             if q + 1 < pieces:
                 later_outflow = np.concatenate([parts[q + 1].outflow[None], later_outflow @ parts[q + 1].whole])
-            for target, (low, high) in (
-                (slice(q, q + 1), parts[q].own_bounds),
-                (slice(q + 1, pieces), parts[q].later.bounds(later_outflow.reshape(-1, stages) / moments)),
-            ):
-                self.low[target, :, q], self.high[target, :, q] = (
-                    mu.reshape(-1, moments, moments) for mu in (low, high)
-                )
+            later_bounds = parts[q].later.bounds(later_outflow.reshape(-1, stages) / moments)
+            for target, bounds in ((slice(q, q + 1), parts[q].own_bounds), (slice(q + 1, pieces), later_bounds)):
+                low, high = (bound.reshape(-1, moments, moments) for bound in bounds)
+                self.low[target, :, q], self.high[target, :, q] = low, high
         at_once = chain.weights[0] * np.eye(pieces * moments).reshape(shape)
         self.low += at_once
         self.high += at_once

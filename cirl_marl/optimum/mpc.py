@@ -188,8 +188,8 @@ class MPC(Planner):
         window = rest if self._horizon is None else rest[: self._horizon]
         try:
             return self._solve_window(copy, rest, window, last)
-        except SolverFailure as missing:
-            self.note = f"MPC goes on as it planned before, or neutrally, where a plan is missing: {missing}"
+        except SolverFailure as failure:
+            self.note = f"MPC goes on as it planned before, or neutrally, where a plan is missing: {failure}"
             return self._older(copy, window, last)
 
     def _solve_window(self, copy: int, rest: range, window: range, last: _Plan | None) -> _Plan:
@@ -240,7 +240,7 @@ class MPC(Planner):
                 demanded.
             basis: from which the solver starts.
             prices: of the stocks at the end, shape (nodes,), in the objective of plans that meet the demand, per mass.
-            as_outlook: whether the multipliers must be good.
+            as_outlook: whether the multipliers must be good, as they are the prices of later plans.
         """
         stock = self._env.physical.stock[self._env.rows.nodes, copy]
         demand = None if deficit is None else np.maximum(0.0, deficit / len(intervals))
@@ -309,9 +309,9 @@ class Optimum(Planner):
         """
         try:
             self.plans, self.note = self._bound_plans(env, progress), ""
-        except NoCertificate as missing:
+        except NoCertificate as reason:
             self.plans = self._search_plans(env, progress)
-            self.note = f"best plan found, no certificate: {missing}"
+            self.note = f"best plan found, no certificate: {reason}"
         self._plan = Plan(self.plans)
         self._plan.start(env, seed)
 
@@ -348,7 +348,7 @@ class Optimum(Planner):
             service_weight=self._service_weight,
             agents=env.agents or None,
             knots=min(KNOTS, env.network.episode.horizon),
-            progress=lambda share, merit: progress(share),
+            progress=lambda share, objective: progress(share),
         )
 
 

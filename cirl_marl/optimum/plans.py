@@ -175,10 +175,8 @@ class Population:
             controller.start(env, EVALUATION_SEEDS)
         steps, knots = env.network.episode.horizon, deviation.shape[2]
         added_deviation = np.ascontiguousarray(np.moveaxis(deviation.reshape(len(choice), knots, -1), 0, 2))
-        deviation_sum, counts = (
-            np.zeros_like(added_deviation),
-            np.bincount(np.arange(steps) * knots // steps, minlength=knots),
-        )
+        deviation_sum = np.zeros_like(added_deviation)
+        counts = np.bincount(np.arange(steps) * knots // steps, minlength=knots)
         actions = np.empty((steps, *added_deviation.shape[1:]))
         for t in range(steps):
             action = actions[t]

@@ -129,13 +129,8 @@ class _DecayChains:
             scale: largest factor of the stock itself that is in x.
         """
         free = factor[0] < factor[1]
-        nodes, quantity, column, driver, (low, high) = (
-            nodes[free],
-            quantity[free],
-            column[free],
-            driver[free],
-            factor[:, free],
-        )
+        nodes, quantity, column, driver = (part[free] for part in (nodes, quantity, column, driver))
+        low, high = factor[:, free]
         spread = (high - low) * np.broadcast_to(scale, free.shape)[free]
         weight = np.ones(len(nodes))
         self._write_steps(nodes, 2 * quantity, column, weight, driver, -low, spread)

@@ -84,11 +84,10 @@ def changes(bound: Bound, admissible: Admissible, variant: Program) -> Floats:
         raise ValueError("the programs differ in their rows or variables")
     reduced_cost = problem.cost - problem.equal.T @ y - problem.under.T @ mu
     least, most = np.maximum(reduced_cost, 0.0), np.minimum(reduced_cost, 0.0)
-    wider = np.where(
-        np.tile(_start_dependent(admissible, layout), len(v) // layout.size), 0.0, variant.high - problem.high
-    )
-    cost = (variant.cost - problem.cost) * v + least * (variant.low - problem.low) + most * wider
     steps = len(v) // layout.size
+    # boxes that follow from the start are as wide as they were made: their change counts for nothing
+    wider = np.where(np.tile(_start_dependent(admissible, layout), steps), 0.0, variant.high - problem.high)
+    cost = (variant.cost - problem.cost) * v + least * (variant.low - problem.low) + most * wider
     by_interval = cost.reshape(steps, -1).sum(axis=1)
     rights = (variant.equal_to - problem.equal_to, variant.under_to - problem.under_to)
     for (rows, variant_rows), multipliers, right in zip(pairs, (y, mu), rights, strict=True):
