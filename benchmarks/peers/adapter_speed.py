@@ -37,7 +37,14 @@ def measured(copies: int) -> tuple[float, float, float]:
     policy = TensorDictModule(network, in_keys=[(GROUP, "observation")], out_keys=[(GROUP, "action")])
     ours = MultiAgentVectorEnv(NETWORK, num_envs=copies)
     horizon = ours.network.episode.horizon
-    collector = Collector(env, policy, frames_per_batch=copies * horizon, total_frames=-1)
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=copies * horizon,
+        total_frames=-1,
+        device="cpu",
+        auto_register_policy_transforms=False,
+    )
     batches = iter(collector)
 
     @torch.no_grad()

@@ -65,6 +65,7 @@ class TorchRLEnv(EnvBase):  # type: ignore[misc]
         self._observed, seen = _padding([space.shape[0] for space in observations])
         self._acting, acts = _padding([space.shape[0] for space in actions])
         agents = (num_envs, len(observations))
+        self._shape_of_observations, self._shape_of_actions = (*agents, seen), (*agents, acts)
         ends = np.zeros((2, len(observations) * seen), dtype=np.float32)
         ends[:, self._observed] = np.concatenate([[space.low, space.high] for space in observations], axis=1)
         low, high = (torch.from_numpy(end).reshape(agents[1], seen).expand(*agents, seen) for end in ends)
@@ -85,9 +86,9 @@ class TorchRLEnv(EnvBase):  # type: ignore[misc]
         return self._outcome(stacked.T, np.zeros(self.vector_env.num_envs, dtype=bool))
 
     def _step(self, tensordict: Any) -> Any:
-        actions, expected = tensordict[GROUP, "action"].detach().numpy(), self.full_action_spec[GROUP, "action"].shape
-        if actions.shape != expected:
-            raise ControlError(f"actions must have shape {tuple(expected)}, got {actions.shape}")
+        actions = tensordict[GROUP, "action"].detach().numpy()
+        if actions.shape != self._shape_of_actions:
+            raise ControlError(f"actions must have shape {self._shape_of_actions}, got {actions.shape}")
         stacked = actions.reshape(len(actions), -1).T[self._acting]
         outcome = self.vector_env.advance(stacked.astype(float))
         told = self._outcome(outcome.observation, outcome.truncated)
@@ -97,7 +98,7 @@ class TorchRLEnv(EnvBase):  # type: ignore[misc]
 
     def _outcome(self, observation: NDArray[np.float32], ended: NDArray[np.bool_]) -> Any:
         """Return padded observations, of those stacked in shape (entries of all agents, B), and who is at the end."""
-        shape = self.observation_spec[GROUP, "observation"].shape
+        shape = self._shape_of_observations
         padded = np.zeros((shape[0], shape[1] * shape[2]), dtype=np.float32)
         padded[:, self._observed] = observation.T
         group = TensorDict({"observation": torch.from_numpy(padded).view(shape)}, batch_size=shape[:2])
