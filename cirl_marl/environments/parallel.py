@@ -216,7 +216,7 @@ def first_copy(batch: Mapping[str, Any]) -> dict[str, Any]:
     {'cost': 0.5, 'flows': array([1., 2.])}
     """
     return {
-        key: first_copy(value) if isinstance(value, dict) else value[0] if value.ndim > 1 else value[0].item()
+        key: first_copy(value) if type(value) is dict else value.item(0) if value.ndim == 1 else value[0]
         for key, value in batch.items()
     }
 

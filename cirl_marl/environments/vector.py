@@ -6,6 +6,7 @@ Every other view (PettingZoo, Gymnasium, the environments of the learners) stand
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -260,18 +261,21 @@ class MultiAgentVectorEnv:
         ``year``               calendar year at the end, shape (B,), if the network begins in one
         =====================  ==================================================================================
         """
-        levels, shortfalls = outcome.levels, 1.0 - outcome.levels
-        # unlike a sum it adds one service after the other, whatever the number of copies
-        cost = np.add.accumulate(shortfalls)[-1] if len(levels) else np.zeros(self.num_envs)
-        for array in (outcome.circularity, outcome.service_level, levels, shortfalls, cost):
-            array.flags.writeable = False  # the same for all agents
+        levels = outcome.levels
+        shortfalls = 1.0 - levels
+        for array in (outcome.circularity, outcome.service_level, levels, shortfalls):
+            array.setflags(write=False)  # the same for all agents
+        costs = [*shortfalls]
+        # np.sum would add in another order for another number of copies
+        cost = reduce(np.add, costs) if costs else np.zeros(self.num_envs)
+        cost.setflags(write=False)
         info: dict[str, Any] = {
             "circularity": outcome.circularity,
             "flows": outcome.flow.T,
             "service_level": outcome.service_level,
             "service_levels": dict(zip(self._services, levels, strict=True)),
             "cost": cost,
-            **dict(zip(self._costs, shortfalls, strict=True)),
+            **dict(zip(self._costs, costs, strict=True)),
         }
         if (factors := self.physical.factors_if_any) is not None:
             info["drawn"] = factors.T
