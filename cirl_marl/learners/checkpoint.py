@@ -1,4 +1,7 @@
-"""What an algorithm of Stable-Baselines3 has in it between two rollouts: all that it goes on from, bit for bit."""
+"""Checkpoints: all that an algorithm of Stable-Baselines3 resumes from, bit for bit, and the files that it is kept in.
+
+A checkpoint is a tree of plain values and arrays, written as JSON and safetensors: nobody can hide code in these.
+"""
 
 from __future__ import annotations
 
@@ -237,11 +240,9 @@ def _array(numbers: Mapping[str, Any]) -> Any:
 
 def _is_progress(value: object) -> bool:
     """Return whether an attribute tells how far a model is: lists alone do not, which hold parts of its networks."""
-    return _is_observation(value) or (not isinstance(value, list | Mapping | str) and is_plain(value))
-
-
-def _is_observation(value: object) -> bool:
-    return isinstance(value, dict) and bool(value) and all(isinstance(part, np.ndarray) for part in value.values())
+    if isinstance(value, dict):  # an observation
+        return bool(value) and all(isinstance(part, np.ndarray) for part in value.values())
+    return not isinstance(value, list | Mapping | str) and is_plain(value)
 
 
 def _like(now: Any, value: Any) -> Any:

@@ -49,7 +49,7 @@ def demonstrate(model: BaseAlgorithm, steps: int, act: Act) -> None:
     """
     if model.num_timesteps >= steps:
         return
-    model.learn(0, reset_num_timesteps=model.num_timesteps == 0)  # takes a seat: resets its environment, does no step
+    model.learn(0, reset_num_timesteps=model.num_timesteps == 0)  # resets its environment, does no step
     if isinstance(model, OffPolicyAlgorithm):
         _keep(model, steps, act)
     else:

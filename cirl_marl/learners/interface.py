@@ -1,4 +1,7 @@
-"""Begin a training, or go on with one: from what a user names to seated learners and a run directory."""
+"""The interface: begin a training or resume one, have its policies as a controller, export them.
+
+What a user names becomes a recipe, an environment, learners and a run directory; the trainer does the rest.
+"""
 
 from __future__ import annotations
 

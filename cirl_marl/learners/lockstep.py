@@ -185,7 +185,7 @@ class World:
         truncated = np.array(list(truncations.values()))
         dones = truncated | list(terminations.values())
         self._returns = self._returns + list(rewards.values())
-        self._lengths = self._lengths + self._took_part()
+        self._lengths = self._lengths + 1
         returns = self._by_agent(self._returns)
         step = JointStep(
             observations,
@@ -205,10 +205,6 @@ class World:
                     infos[agent]["episode_return"] = total.copy()
             hook(infos, dones.all(axis=0))
         self._returns, self._lengths = np.where(dones, 0.0, self._returns), np.where(dones, 0, self._lengths)
-
-    def _took_part(self) -> int | NDArray[np.integer]:
-        """Return 1 for each agent and copy in which it acted."""
-        return 1
 
     def _by_agent(self, rows: NDArray[Any]) -> dict[str, NDArray[Any]]:
         return dict(zip(self.env.agents, rows, strict=True))

@@ -266,15 +266,13 @@ class Recipe(Settings):
                 number = next(i for i, settings in enumerate(specs) if settings is spec)
                 name = f"{spec.scheme}-learner" + (f"-{number}" if alike > 1 else "")
                 if spec.among == "copies":
-                    self._has_copies(network)
+                    if not network.copies:
+                        reason = f"network '{network.name}' is not made of copies ([copies]); use all"
+                        self._refuse([f"among: copies, but {reason}"])
                     name += f"-{network.counterpart(agent) or agent}"
             members = groups[name].agents if name in groups else ()
             groups[name] = Group(name, (*members, agent), spec)
         return tuple(groups.values())
-
-    def _has_copies(self, network: Network) -> None:
-        if not network.copies:
-            self._refuse([f"among: copies, but network '{network.name}' is not made of copies ([copies]); use all"])
 
     def check(self, steps: int) -> None:
         """Raise a ``RecipeError`` that names all that is wrong whatever the network, in a run of ``steps``."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -89,15 +90,9 @@ def _take_over(source: Learner, learner: Learner) -> None:
 def _other_settings(source: LearnerSettings, target: LearnerSettings) -> Iterator[str]:
     """Yield which settings that a policy depends on differ."""
     for key in ("scheme", "algorithm", "policy", "normalise.observation", "normalise.clip_observation"):
-        old, new = (_at(settings, key) for settings in (source, target))
+        old, new = map(attrgetter(key), (source, target))
         if old != new and not (key == "normalise.clip_observation" and not source.normalise.observation):
             yield f"has {key} = {_toml(old)}, not {_toml(new)}"
-
-
-def _at(settings: Any, key: str) -> Any:
-    for part in key.split("."):
-        settings = getattr(settings, part)
-    return settings
 
 
 def _toml(value: object) -> str:

@@ -1,4 +1,4 @@
-"""Training: seat the learners, let them run in lockstep or stacked, keep what they learn and choose the best of it."""
+"""The trainer: learners run in lockstep or stacked, are validated and saved; the best policies are chosen."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Training:
         checkpoint: Path | None = None,
         checkpoint_every: float | None = None,
     ) -> None:
-        """Seat the learners and make their algorithms, or load those of a ``checkpoint`` from which a run goes on.
+        """Make the learners, or load those of a ``checkpoint`` from which a run is resumed.
 
         ``checkpoint_every`` are seconds, 0 for no checkpoints by time and None for a minute.
         """
@@ -137,7 +137,7 @@ class Training:
         self._appoint_demonstrators()
 
     def _service_multiplier(self, checkpoint: Path | None) -> ServiceMultiplier | None:
-        """Return the price of service if it moves; a resumed one goes on."""
+        """Return the multiplier of the service if it moves, at the value that a checkpoint has."""
         settings = self.config.recipe.run
         if not settings.price_rate or settings.min_service is None or not self.env.network.services:
             return None
@@ -287,20 +287,17 @@ class Training:
             for learner in self.learners.values():
                 learner.barrier.folder = self._checkpoint_folder
 
-    def keep(self, state: str) -> None:
-        """Write the checkpoint for which every learner has written its state."""
+    def keep(self, how: str) -> None:
+        """Complete the checkpoint for which every learner has written its state; ``how`` is part of its name."""
         if self.run is None or self._checkpoint_folder is None:
             return
         began = time.perf_counter()
         for learner in self.learners.values():
             learner.write_journal(self._checkpoint_folder)
             learner.barrier.release()
-        write_tree(
-            self._checkpoint_folder,
-            "training",
-            {"begun": self.first_step, "world": self.world.state_dict(), "best": self._kept_best},
-        )
-        self._end_checkpoint(self._checkpoint_folder, state)
+        state = {"begun": self.first_step, "world": self.world.state_dict(), "best": self.run.status["best"]}
+        write_tree(self._checkpoint_folder, "training", state)
+        self._end_checkpoint(self._checkpoint_folder, how)
         self._checkpoint_folder, self._due, self._saved_at = None, False, time.monotonic()
         self._checkpoint_seconds += time.perf_counter() - began
         if self._checkpoint_interval is not None:
@@ -319,7 +316,7 @@ class Training:
         self._checkpoint_seconds += time.perf_counter() - began
 
     def _evaluate(self, evaluation: ValidationEpisodes) -> None:
-        """Play its episodes by the policies of now, keep these if they are the best so far, and move the price."""
+        """Play its episodes by the policies of now, keep these if they are the best so far, and move the multiplier."""
         self._bring_up_to_date()
         policies = Policies({name: learner.policy for name, learner in self.learners.items()})
         score, target = evaluation.score(policies), self.config.recipe.run.min_service
@@ -334,11 +331,6 @@ class Training:
             self._evaluations.append([*steps, *score.figures().values(), self.env.circularity_weight, better])
         if self._multiplier is not None and self.joint_steps * self.config.envs >= MULTIPLIER_FROM * self.config.steps:
             self._multiplier.update(score.service_bound)
-
-    @property
-    def _kept_best(self) -> dict[str, Any] | None:
-        best: dict[str, Any] | None = self.run.status["best"] if self.run is not None else None
-        return best
 
     def _write_policies(self, folder: Path) -> None:
         for learner in self.learners.values():
@@ -397,9 +389,8 @@ def run_together(
     try:
         with one_torch_thread(), _interruption() as stop_requested:
             hooks = [partial(t.after_step, began, observer) for t, observer in zip(trainings, reports, strict=True)]
-            lockstep = Lockstep(
-                [t.world for t in trainings], list(_participants(trainings, stacks_of_learners, callbacks))
-            )
+            participants = list(_participants(trainings, stacks_of_learners, callbacks))
+            lockstep = Lockstep([t.world for t in trainings], participants)
             lockstep.run(hooks, partial(_keep, trainings, lockstep, stop_requested))
             for training in trainings:
                 training.finish()
@@ -421,7 +412,7 @@ def _keep(trainings: Sequence[Training], lockstep: Lockstep, stop_requested: Cal
     """Ask for checkpoints when it is time, or when somebody wants to stop, and write those that are complete.
 
     Raises:
-        TrainingStop: when everything is written, or if somebody who is shown what to do cannot be saved.
+        TrainingStop: when everything is written, or if a learner follows a demonstrator, as it cannot be saved then.
     """
     stops = stop_requested()
     if stops and (lockstep.busy or all(training.run is None for training in trainings)):
@@ -439,12 +430,11 @@ def _keep(trainings: Sequence[Training], lockstep: Lockstep, stop_requested: Cal
 def _participants(
     trainings: Sequence[Training], stacks: Sequence[Stack], callbacks: Mapping[str, BaseCallback]
 ) -> Iterator[Participant]:
-    """Yield who acts: each stack, then everyone else, in the order of their seats."""
+    """Yield who acts: each stack, then every other learner, in the order of the agents."""
     steps = trainings[0].config.steps
     for stack in stacks:
-        title = ", ".join(member.agent_env.title for member in stack.members[:3]) + (
-            ", …" if len(stack.members) > 3 else ""
-        )
+        titles = [member.agent_env.title for member in stack.members]
+        title = ", ".join(titles[:3] + ["…"] * (len(titles) > 3))
         yield Participant(
             f"the stack of {title}",
             partial(stack.learn, steps, wait),
