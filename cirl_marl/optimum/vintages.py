@@ -95,7 +95,7 @@ class Lifetimes:
         self.simulator_network = simulated_network(network)
         self.state_layout = StateLayout(self.simulator_network)
         self.passive: list[PassiveLifetime] = []
-        self._kernels: dict[tuple[str, bytes, int], Kernel] = {}
+        self._kernels: dict[tuple[str, bytes, int, int], Kernel] = {}
         nodes = [node for node in network.stores if node.lifetime is not None]
         if not nodes:
             return
@@ -222,7 +222,7 @@ class Lifetimes:
     ) -> tuple[Any, Any, Floats]:
         """Return c̲ and c̄ of what leaves a chain, sparse, and what leaves of what is there at the start."""
         rate = lifetime.rate[intervals.start : intervals.stop]
-        key = (lifetime.node.id, rate.tobytes(), layout.pieces)
+        key = (lifetime.node.id, rate.tobytes(), layout.pieces, layout.degree)
         if key not in self._kernels:
             self._kernels[key] = Kernel(lifetime.chain, np.repeat(rate, layout.pieces), layout.length, layout.degree)
         kernel, count = self._kernels[key], len(intervals) * len(layout.moments)
