@@ -24,7 +24,7 @@ from cirl_marl.controllers.schedule import Schedule, schedule
 from cirl_marl.definitions.writer import fingerprint
 from cirl_marl.network import Floats
 from cirl_marl.optimum import NoCertificate, Plan, bound, improved, search
-from cirl_marl.optimum.plans import starting_states
+from cirl_marl.optimum.planned_episodes import starting_states
 from cirl_marl.records.files import write_atomically
 from cirl_marl.records.machine import versions
 

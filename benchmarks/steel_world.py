@@ -28,7 +28,7 @@ from cirl_marl.importing.definition import identifiers, shares_of
 from cirl_marl.importing.flow_table import read_flows
 from cirl_marl.network import Floats, Network
 from cirl_marl.optimum import achieved, bound, improved
-from cirl_marl.optimum.plans import HasPlan, Plan
+from cirl_marl.optimum.planned_episodes import HasPlan, Plan
 from cirl_marl.records.files import write_table
 
 GOODS = ("ore", "pig_iron", "dri", "scrap", "semis", "long", "flat", "goods")

@@ -88,8 +88,8 @@ if TYPE_CHECKING:
     from cirl_marl.optimum.cross_entropy import search as search
     from cirl_marl.optimum.improve import improved as improved
     from cirl_marl.optimum.mpc import MPC as MPC
-    from cirl_marl.optimum.plans import Plan as Plan
-    from cirl_marl.optimum.plans import achieved as achieved
+    from cirl_marl.optimum.planned_episodes import Plan as Plan
+    from cirl_marl.optimum.planned_episodes import achieved as achieved
     from cirl_marl.reasons.explanation import explain as explain
     from cirl_marl.reasons.inverse import infer as infer
     from cirl_marl.report.results import draw as draw
@@ -135,7 +135,7 @@ _MODULES = {
     "optimum.cross_entropy": "search",
     "optimum.improve": "improved",
     "optimum.mpc": "MPC",
-    "optimum.plans": "Plan achieved",
+    "optimum.planned_episodes": "Plan achieved",
     "reasons.explanation": "explain",
     "reasons.inverse": "infer",
     "report.results": "draw summarise write_report",

@@ -20,7 +20,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.network import Floats
 from cirl_marl.optimum import NoCertificate, Plan, achieved, bound, improved, program, search, solver
 from cirl_marl.optimum.mpc import MPC
-from cirl_marl.optimum.plans import starting_states
+from cirl_marl.optimum.planned_episodes import starting_states
 
 KILOTONNES = {"kg": 1e6, "kt": 1.0, "Gt": 1e-6}
 

@@ -15,7 +15,7 @@ from cirl_marl.controllers.rollout import EVALUATION_SEEDS, rollout
 from cirl_marl.optimum import Incumbent, Plan, bound, search, search_each, standard_candidates
 from cirl_marl.optimum.cross_entropy import SHORTFALL_PRICE, Gaussians, knot_counts
 from cirl_marl.optimum.mpc import Optimum
-from cirl_marl.optimum.plans import Population, starting_states
+from cirl_marl.optimum.planned_episodes import Population, starting_states
 
 EVERYWHERE = PLAYED
 

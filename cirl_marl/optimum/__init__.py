@@ -5,7 +5,7 @@ from cirl_marl.optimum.bounds import Bound, Envelope, bound, envelope, gap
 from cirl_marl.optimum.certificate import Certificate, Verification
 from cirl_marl.optimum.cross_entropy import Incumbent, search, search_each, standard_candidates
 from cirl_marl.optimum.improve import improved
-from cirl_marl.optimum.plans import Plan, achieved
+from cirl_marl.optimum.planned_episodes import Plan, achieved
 
 __all__ = [
     "Bound",

@@ -30,7 +30,7 @@ from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Integers, Network
 from cirl_marl.optimum.options import DEGREE, check_options, demanded_levels
-from cirl_marl.optimum.plans import Episodes, Population, by_state_name, starting_states
+from cirl_marl.optimum.planned_episodes import Episodes, Population, by_state_name, starting_states
 
 SHORTFALL_PRICE = 10.0
 """What a service whose mean level is short of ``min_service`` by 1 costs, against λ̄/circularity_scale. The penalty is

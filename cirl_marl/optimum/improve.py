@@ -25,7 +25,7 @@ from cirl_marl.network import Floats
 from cirl_marl.optimum.admissible import Admissible, normalised_actions
 from cirl_marl.optimum.bounds import Bound
 from cirl_marl.optimum.matrices import Layout
-from cirl_marl.optimum.plans import achieved
+from cirl_marl.optimum.planned_episodes import achieved
 from cirl_marl.optimum.program import LinearProgram, Programs
 from cirl_marl.optimum.solver import Infeasible, SolverFailure, best_values, solve
 

@@ -30,7 +30,7 @@ from cirl_marl.optimum.bounds import Bound, bound
 from cirl_marl.optimum.cross_entropy import KNOTS, Incumbent, search_each
 from cirl_marl.optimum.improve import improved
 from cirl_marl.optimum.options import check_options, demanded_levels
-from cirl_marl.optimum.plans import Plan, starting_states
+from cirl_marl.optimum.planned_episodes import Plan, starting_states
 from cirl_marl.optimum.program import Program, Programs
 from cirl_marl.optimum.solver import Basis, Infeasible, Solution, SolverFailure, solve
 
