@@ -193,7 +193,8 @@ def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     script = ["bash", str(TESTS / "slurm_node.sh"), str(folder), request.param]
     before = os.environ.copy()
     try:
-        subprocess.run(script, check=True, capture_output=True, text=True, timeout=180)
+        with (folder / "setup.log").open("w") as log:  # servers keep it open, for which a pipe would wait
+            subprocess.run(script, check=True, stdout=log, stderr=log, timeout=180)
         os.environ["SLURM_CONF"] = str(folder / "slurm.conf")
         os.environ["PYTHONPATH"] = os.pathsep.join([str(TESTS), str(TESTS.parent)])
         yield request.param
