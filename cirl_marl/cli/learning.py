@@ -274,10 +274,10 @@ def _write_figures(evaluation: Evaluation) -> None:
 
 def _say_lacking(evaluation: Evaluation) -> None:
     """Say under which control flows and services were less than was asked for, as means over the episodes."""
-    from cirl_marl.controllers.outcome import lacking
+    from cirl_marl.controllers.outcome import shortage_lines
 
     for name, rollout in evaluation.rollouts.items():
-        for line in lacking(evaluation.env.network, rollout):
+        for line in shortage_lines(evaluation.env.network, rollout):
             say(f"{name}: {line}")
 
 

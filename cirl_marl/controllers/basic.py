@@ -49,19 +49,19 @@ class Constant(Controller):
 
     def __init__(self, actions: Mapping[str, float] | None = None) -> None:
         """Hold ``actions``, agent → value in [−1, 1]."""
-        self._wanted = dict(actions or {})
+        self._constants = dict(actions or {})
         self._actions: dict[str, NDArray[np.floating]] = {}
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
         """Take the actions of ``env``'s agents; an agent that does not act or a value out of bounds is refused."""
-        for agent, value in self._wanted.items():
+        for agent, value in self._constants.items():
             if agent not in env.agents:
                 raise ControlError(f"constant control: {unknown('agent', agent, env.agents)}")
             if not -1.0 <= value <= 1.0:
                 raise ControlError(f"constant control of '{agent}' is {value}; it must lie in [-1, 1]")
         self._env = env
         self._actions = {
-            a: np.full_like(n, self._wanted[a]) for a, n in env.neutral_action.items() if a in self._wanted
+            a: np.full_like(n, self._constants[a]) for a, n in env.neutral_action.items() if a in self._constants
         }
         for action in self._actions.values():
             action.flags.writeable = False
@@ -99,8 +99,8 @@ class ProgressController(Controller):
     >>> from cirl_marl.controllers import Neutral
     >>> from cirl_marl.controllers.rollout import rollout
     >>> shares = []
-    >>> watched = Watched(Neutral(), shares.append)
-    >>> _ = rollout(MultiAgentVectorEnv("net_zero", num_envs=1, horizon=2), watched, progress=watched.acted)
+    >>> watched = ProgressController(Neutral(), shares.append)
+    >>> _ = rollout(MultiAgentVectorEnv("net_zero", num_envs=1, horizon=2), watched, progress=watched.report_steps)
     >>> shares
     [0.5, 1.0]
     """
@@ -123,6 +123,6 @@ class ProgressController(Controller):
         """Return the controller's actions."""
         return self._controller.act(observations)
 
-    def acted(self, intervals: int) -> None:
+    def report_steps(self, intervals: int) -> None:
         """Tell that so many intervals are done; ``rollout`` takes this as its ``progress``."""
         self._progress(self._ahead + (1.0 - self._ahead) * intervals / self._steps)

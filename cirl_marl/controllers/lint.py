@@ -39,8 +39,8 @@ def lint_warnings(network: Network) -> Iterator[str]:
         _shares,
         _departures,
         _free,
-        _starved,
-        _unsupplied,
+        _short_flows,
+        _short_services,
         _aimless,
         _unpaid,
         _coarse,
@@ -51,20 +51,20 @@ def lint_warnings(network: Network) -> Iterator[str]:
 
 def _apart(network: Network) -> Iterator[str]:
     """Yield nodes that no arc touches and that have nothing else to do, and those without stock that get nothing."""
-    fed = {arc.recipient for arc in network.arcs}
-    touched = fed | {arc.donor for arc in network.arcs}
+    recipients = {arc.recipient for arc in network.arcs}
+    connected = recipients | {arc.donor for arc in network.arcs}
     for node in network.nodes:
-        if node.model is None and node.id not in touched:
+        if node.model is None and node.id not in connected:
             yield f"node '{node.id}': no arc begins or ends here, so that no mass enters or leaves it"
-        elif not node.stores and node.id not in fed:
+        elif not node.stores and node.id not in recipients:
             yield f"node '{node.id}': it stores nothing and nothing enters it, so that nothing ever leaves it"
 
 
 def _without_effect(network: Network) -> Iterator[str]:
     """Yield valves and pollutants that change nothing."""
-    scaled = {arc.donor for arc in network.arcs if arc.law is not Law.BATCH}
+    donors = {arc.donor for arc in network.arcs if arc.law is not Law.BATCH}
     for node in network.nodes:
-        if node.control is not None and node.control.kind is ControlKind.RATE and node.id not in scaled:
+        if node.control is not None and node.control.kind is ControlKind.RATE and node.id not in donors:
             yield f"node '{node.id}': its valve scales no flow, as nothing but batches leaves it"
     for arc in network.arcs:
         recipient = network.nodes[network.node_index[arc.recipient]]
@@ -88,12 +88,12 @@ def _shares(network: Network) -> Iterator[str]:
                 (v * share / (1 + (v - 1) * share), v, end)
                 for v, end in ((extremes(control.low)[0], "lowest"), (extremes(control.high)[1], "highest"))
             ]
-            passed, valve, end = max(ends, key=lambda found: abs(found[1] * share - found[0]))
-            if abs(valve * share - passed) > COARSE:
-                part = f"{passed:.0%} of what leaves '{node.id}' in proportion to its stock"
-                taken = f"not {valve * share:.0%}: {valve:.3g} × {share:.0%}"
+            passing_share, valve, end = max(ends, key=lambda candidate: abs(candidate[1] * share - candidate[0]))
+            if abs(valve * share - passing_share) > COARSE:
+                part = f"{passing_share:.0%} of what leaves '{node.id}' in proportion to its stock"
+                comparison = f"not {valve * share:.0%}: {valve:.3g} × {share:.0%}"
                 remedy = 'law = "share" with control.kind = "share" sets a share itself'
-                yield f"arc '{arc.id}': at its {end} its valve lets through {part}, {taken}; {remedy}"
+                yield f"arc '{arc.id}': at its {end} its valve lets through {part}, {comparison}; {remedy}"
 
 
 def _departures(network: Network) -> Iterator[str]:
@@ -111,8 +111,10 @@ def _departures(network: Network) -> Iterator[str]:
             if round(time / interval) >= horizon:
                 yield f"{at}: {end}, so that it never leaves"
             if batch_kg is not None and not is_whole(mass * factor(network.mass_unit, "kg") / batch_kg):
-                made = f"batches of {batch_kg:g} kg, as '{recipient.id}' makes them, so that a part of it waits there"
-                yield f"{at}: {mass:g} {network.mass_unit} are no whole number of {made}"
+                batch_size = (
+                    f"batches of {batch_kg:g} kg, as '{recipient.id}' makes them, so that a part of it waits there"
+                )
+                yield f"{at}: {mass:g} {network.mass_unit} are no whole number of {batch_size}"
 
 
 def _coarse(network: Network) -> Iterator[str]:
@@ -124,16 +126,18 @@ def _coarse(network: Network) -> Iterator[str]:
         for action in (-1.0, 1.0):
             _states(network, action, SHORT)
         finer = network.with_options(episode={"solver_step": step / 2})
-        shown = [_states(each, None, INTERVALS) for each in (network, finer)]
+        trajectories = [_states(variant, None, INTERVALS) for variant in (network, finer)]
     except CirlError as error:
         yield str(error)
         return
-    size = np.maximum(np.abs(shown[1]).max(axis=0), 1e-9)
-    apart = np.abs(shown[0] - shown[1]).max(axis=0) / size
+    size = np.maximum(np.abs(trajectories[1]).max(axis=0), 1e-9)
+    apart = np.abs(trajectories[0] - trajectories[1]).max(axis=0) / size
     if apart[worst := int(apart.argmax())] > COARSE:
         name = MultiAgentVectorEnv(network, num_envs=1).state_names[worst]
-        other = f"neutral control gives another {name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
-        yield f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, {other}"
+        difference = (
+            f"neutral control gives another {name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
+        )
+        yield f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, {difference}"
 
 
 def _lives(network: Network) -> Iterator[str]:
@@ -154,8 +158,12 @@ def _states(network: Network, action: float | None, intervals: int) -> Floats:
     env.reset(seed=0)
     controls = env.dynamics.neutral.copy()
     if action is not None:
-        acting = [row for agent in env.agents for row in range(*network.control_rows[agent].indices(len(controls)))]
-        controls[acting] = (env.dynamics.control_low if action < 0 else env.dynamics.control_high)[acting]
+        rows_of_agents = [
+            row for agent in env.agents for row in range(*network.control_rows[agent].indices(len(controls)))
+        ]
+        controls[rows_of_agents] = (env.dynamics.control_low if action < 0 else env.dynamics.control_high)[
+            rows_of_agents
+        ]
     state, rows = env.physical, []
     with np.errstate(all="ignore"):
         for step in range(min(network.episode.horizon, intervals)):
@@ -168,49 +176,55 @@ def _states(network: Network, action: float | None, intervals: int) -> Floats:
 
 def _free(network: Network) -> Iterator[str]:
     """Yield nodes of the technosphere that give what never came in, other than by physics of their own."""
-    fed, giving = ({getattr(arc, end) for arc in network.arcs} for end in ("recipient", "donor"))
+    recipients, donors = ({getattr(arc, end) for arc in network.arcs} for end in ("recipient", "donor"))
     for node, most in zip(network.stores, network.initial[1], strict=True):
-        given = node.id in giving - fed and most > 0 and node.model is None
-        if given and node.role is Role.TECHNOSPHERE:
-            meant = "if it stands for mining or for imports of primary material, its role is nonrenewable_reservoir"
-            yield f"node '{node.id}': nothing enters it, and what it delivers counts nothing in λ; {meant}"
+        is_free = node.id in donors - recipients and most > 0 and node.model is None
+        if is_free and node.role is Role.TECHNOSPHERE:
+            remedy = "if it stands for mining or for imports of primary material, its role is nonrenewable_reservoir"
+            yield f"node '{node.id}': nothing enters it, and what it delivers counts nothing in λ; {remedy}"
 
 
-def _starved(network: Network) -> Iterator[str]:
+def _short_flows(network: Network) -> Iterator[str]:
     """Yield scheduled flows that run short: under neutral control, and from sources whose controls are at the highest.
 
     A source is a donor that nothing enters. That agents can empty others is no fault of the network.
     """
-    scheduled = {arc.id: arc.donor for arc in network.arcs if LAWS[arc.law].is_scheduled}
-    if not scheduled:
+    scheduled_donors = {arc.id: arc.donor for arc in network.arcs if LAWS[arc.law].is_scheduled}
+    if not scheduled_donors:
         return
-    fed = {arc.recipient for arc in network.arcs}
-    sources = {id_ for arc, donor in scheduled.items() if donor not in fed for id_ in (arc, donor)}
+    recipients = {arc.recipient for arc in network.arcs}
+    sources = {id_ for arc, donor in scheduled_donors.items() if donor not in recipients for id_ in (arc, donor)}
     highest = Constant({agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)})
-    env, said = MultiAgentVectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS)), set[str]()
-    begun = episode_start(env)
-    for control, controller, looked_at in (("neutral", Neutral(), set(scheduled)), ("the highest", highest, sources)):
+    env, reported = (
+        MultiAgentVectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS)),
+        set[str](),
+    )
+    origin = episode_start(env)
+    for control, controller, looked_at in (
+        ("neutral", Neutral(), set(scheduled_donors)),
+        ("the highest", highest, sources),
+    ):
         try:
-            run = rollout(env, controller, seed=begun.seed, start=begun.initial_state)
+            run = rollout(env, controller, seed=origin.seed, start=origin.initial_state)
         except CirlError as error:
             yield str(error)
             return
         for short in shortages(run, env.network):
             arc, since = short.arc, f"from {short.begins:g} {network.time_unit} on"
-            if arc.id in looked_at - said:
-                said.add(arc.id)
+            if arc.id in looked_at - reported:
+                reported.add(arc.id)
                 little = f"under {control} control '{arc.donor}' holds too little for its flow {since}"
                 yield f"arc '{arc.id}': {little}; give it a larger initial stock if it stands for the world outside"
 
 
-def _unsupplied(network: Network) -> Iterator[str]:
+def _short_services(network: Network) -> Iterator[str]:
     """Yield services that fall short of what is demanded though arcs make up for them."""
     if not any(arc.makes_up_for for arc in network.arcs):
         return
     env = MultiAgentVectorEnv(network, num_envs=1)
-    begun = episode_start(env)
-    for said in service_shortages(rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state), network):
-        yield f"under neutral control {said}; widen the bounds of its control, or ask for less"
+    origin = episode_start(env)
+    for shortage in service_shortages(rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state), network):
+        yield f"under neutral control {shortage}; widen the bounds of its control, or ask for less"
 
 
 def _scales(network: Network, id_: str) -> bool:
@@ -239,10 +253,10 @@ def _unpaid(network: Network) -> Iterator[str]:
         return
     for service in network.services:
         idle = [debtor for debtor in service.debtors if debtor not in network.agents]
-        owed = "owed_by" if service.owed_by else "owed_by is left out, so the provider owes it;"
+        debt = "owed_by" if service.owed_by else "owed_by is left out, so the provider owes it;"
         if len(idle) == len(service.debtors):
             unpaid = f"no agent is paid less when the service fails; agents are {', '.join(network.agents)}"
-            yield f"service '{service.id}': {owed} {', '.join(idle)}: does not act, so that {unpaid}"
+            yield f"service '{service.id}': {debt} {', '.join(idle)}: does not act, so that {unpaid}"
         elif idle:
             yield f"service '{service.id}': owed_by: {', '.join(idle)} does not act and cannot be paid less"
 

@@ -28,7 +28,7 @@ from cirl_marl.network.elements import ControlKind, Law, Role
 
 RANK, DECAY = 1e-9, 1e-7
 """Relative singular value, and rate of decay relative to ‖A‖, below which they count as zero."""
-ITERATIONS, CONVERGED = 500, 1e-12
+ITERATIONS, TOLERANCE = 500, 1e-12
 """Most steps of the fixed point of output feedback, and the relative change at which it has converged."""
 
 
@@ -61,12 +61,12 @@ class LinearSystem:
         """
         laws = FlowLaws(network)
         actuators = Actuators(network, agents, 1)
-        inputs, acting = actuators.agents, actuators.control_rows
+        inputs, action_rows = actuators.agents, actuators.control_rows
         if problems := list(_nonlinear(network, inputs)):
             problem = f"is no linear system: {'; '.join(problems)}. {_remedy(network)}"
             raise CirlError(f"'{network.name}' ({network.scenario_name}) {problem}")
-        controls = np.repeat(laws.neutral[:, :1], 1 + len(acting), axis=1)
-        controls[acting] = np.eye(1 + len(acting))[1:]
+        controls = np.repeat(laws.neutral[:, :1], 1 + len(action_rows), axis=1)
+        controls[action_rows] = np.eye(1 + len(action_rows))[1:]
         rate, units = laws.rate(controls), np.eye(laws.rows.masses)  # no input, then one unit of each
         routes = laws.routing.routes(rate[:, :1])
 
@@ -77,12 +77,14 @@ class LinearSystem:
             return laws.incidence(flow)[:-1]
 
         A, c = np.split(gain(units, np.repeat(rate[:, :1], len(units), axis=1)), [-1], axis=1)
-        B = gain(units[:, [-1] * len(acting)], rate[:, 1:] - rate[:, :1])
+        B = gain(units[:, [-1] * len(action_rows)], rate[:, 1:] - rate[:, :1])
         targets = _targets(network, set_points)
-        wanted = np.array([node.id in targets for node in network.stores], dtype=bool)
-        held = np.array([node.role is Role.NONRENEWABLE_RESERVOIR for node in network.stores], dtype=bool) & ~wanted
-        c = c[:, 0] + A[:, held] @ network.initial.mean(axis=0)[held]
-        rows = np.flatnonzero((A.any(axis=0) | wanted) & ~held)
+        has_target = np.array([node.id in targets for node in network.stores], dtype=bool)
+        is_constant = (
+            np.array([node.role is Role.NONRENEWABLE_RESERVOIR for node in network.stores], dtype=bool) & ~has_target
+        )
+        c = c[:, 0] + A[:, is_constant] @ network.initial.mean(axis=0)[is_constant]
+        rows = np.flatnonzero((A.any(axis=0) | has_target) & ~is_constant)
         if not B[rows].any():
             raise CirlError(f"network '{network.name}': {list(inputs)} move no stock that drives a flow or is tracked")
         nodes = [network.nodes[i] for i in rows]
@@ -94,9 +96,9 @@ class LinearSystem:
             B=B[rows],
             c=c[rows],
             set_points=np.array([targets.get(node.id, np.nan) for node in nodes]),
-            scale=np.array([each.scale for each in (*nodes, *flows)]),
-            bounds=np.stack([laws.control_low[acting, 0], laws.control_high[acting, 0]]),
-            neutral=laws.neutral[acting, 0],
+            scale=np.array([element.scale for element in (*nodes, *flows)]),
+            bounds=np.stack([laws.control_low[action_rows, 0], laws.control_high[action_rows, 0]]),
+            neutral=laws.neutral[action_rows, 0],
         )
 
     def equilibrium(self) -> tuple[Floats, Floats]:
@@ -110,25 +112,27 @@ class LinearSystem:
         """
         count = len(self.states)
         laws = np.hstack([self.A, self.B]) * self.scale
-        found = linalg.lstsq(laws, -self.c, cond=RANK)[0]
-        if np.abs(laws @ found + self.c).max() > RANK * np.abs(self.c).max():
+        equilibrium = linalg.lstsq(laws, -self.c, cond=RANK)[0]
+        if np.abs(laws @ equilibrium + self.c).max() > RANK * np.abs(self.c).max():
             raise CirlError(f"LQR: no equilibrium: whatever constant {list(self.inputs)}, some stock drifts for ever")
-        wanted = np.append(self.set_points, self.neutral) / self.scale
+        target = np.append(self.set_points, self.neutral) / self.scale
         free = linalg.null_space(laws, rcond=RANK)
-        for rows in np.flatnonzero(~np.isnan(self.set_points)), np.arange(count, len(wanted)):
-            left, sizes, right = linalg.svd(free[rows])
+        for rows in np.flatnonzero(~np.isnan(self.set_points)), np.arange(count, len(target)):
+            U, sizes, right = linalg.svd(free[rows])
             rank = int((sizes > RANK).sum())
-            found = found + free @ (right[:rank].T @ ((left.T @ (wanted - found)[rows])[:rank] / sizes[:rank]))
+            equilibrium = equilibrium + free @ (
+                right[:rank].T @ ((U.T @ (target - equilibrium)[rows])[:rank] / sizes[:rank])
+            )
             free = free @ right[rank:].T
         if free.size:
             loose = self.states[int(np.abs(free[:count]).max(axis=1).argmax())]
             raise CirlError(f"LQR: the set-points leave '{loose}' free at equilibrium: give it one in set_points")
-        found *= self.scale
+        equilibrium *= self.scale
         low, high = np.hstack([[np.zeros(count), np.full(count, np.inf)], self.bounds])
-        if (out := (found < low - RANK * self.scale) | (found > high + RANK * self.scale)).any():
-            name, value = (*self.states, *self.inputs)[out.argmax()], found[out.argmax()]
+        if (out := (equilibrium < low - RANK * self.scale) | (equilibrium > high + RANK * self.scale)).any():
+            name, value = (*self.states, *self.inputs)[out.argmax()], equilibrium[out.argmax()]
             raise CirlError(f"LQR: the set-points want an equilibrium out of bounds, '{name}' = {value:.6g}")
-        return found[:count], found[count:]
+        return equilibrium[:count], equilibrium[count:]
 
 
 def full_state_gain(A: Floats, B: Floats, Q: Floats, R: Floats) -> tuple[Floats, Floats]:
@@ -141,13 +145,13 @@ def full_state_gain(A: Floats, B: Floats, Q: Floats, R: Floats) -> tuple[Floats,
     Raises:
         CirlError: if a mode that control does not reach is not stable, or the weights leave no stabilising optimum.
     """
-    reached, rest = _kalman(A, B)
+    reachable, rest = _kalman(A, B)
     _refuse_unstable(rest.T @ A @ rest, A, "no control reaches")
     try:
-        core = linalg.solve_continuous_are(reached.T @ A @ reached, reached.T @ B, reached.T @ Q @ reached, R)
+        core = linalg.solve_continuous_are(reachable.T @ A @ reachable, reachable.T @ B, reachable.T @ Q @ reachable, R)
     except linalg.LinAlgError as error:
         raise CirlError(f"LQR: no optimal gain stabilises; does a mode cost nothing? ({error})") from error
-    K = linalg.solve(R, B.T @ reached @ core @ reached.T)
+    K = linalg.solve(R, B.T @ reachable @ core @ reachable.T)
     _refuse_unstable(A - B @ K, A, "the weights ignore")
     for _ in range(2):  # the Newton step, then P of the gain it gave
         P = linalg.solve_continuous_lyapunov((A - B @ K).T, -Q - K.T @ R @ K)
@@ -165,14 +169,14 @@ def output_gain(A: Floats, B: Floats, C: Floats, Q: Floats, R: Floats) -> tuple[
     Raises:
         CirlError: if a gain on the way does not stabilise, or the iteration does not converge.
     """
-    seen = linalg.pinv(C)
-    K = full_state_gain(A, B, Q, R)[0] @ seen
+    C_inverse = linalg.pinv(C)
+    K = full_state_gain(A, B, Q, R)[0] @ C_inverse
     for _ in range(ITERATIONS):
-        closed = A - B @ K @ C
-        _refuse_unstable(closed, A, "output feedback does not stabilise")
-        P = linalg.solve_continuous_lyapunov(closed.T, -Q - C.T @ K.T @ R @ K @ C)
-        before, K = K, linalg.solve(R, B.T @ P @ seen)
-        if np.abs(K - before).max() <= CONVERGED * np.abs(K).max():
+        closed_loop = A - B @ K @ C
+        _refuse_unstable(closed_loop, A, "output feedback does not stabilise")
+        P = linalg.solve_continuous_lyapunov(closed_loop.T, -Q - C.T @ K.T @ R @ K @ C)
+        before, K = K, linalg.solve(R, B.T @ P @ C_inverse)
+        if np.abs(K - before).max() <= TOLERANCE * np.abs(K).max():
             return K, P
     raise CirlError(f"LQR: the gain of output feedback has not converged in {ITERATIONS} iterations")
 
@@ -234,14 +238,14 @@ class LQR(Controller):
 
 
 def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:
-    refused = {
+    obstacles = {
         ControlKind.RATE: "rate controls multiply flows (bilinear)",
         ControlKind.SHARE: "shares multiply flows (bilinear)",
         ControlKind.INPUT: "inputs set no flows",
     }
-    for kind, reason in refused.items():
-        if acting := [a for a in agents if (control := network.compartments[a].control) and control.kind is kind]:
-            yield f"{reason}: {', '.join(acting)}"
+    for kind, reason in obstacles.items():
+        if bilinear := [a for a in agents if (control := network.compartments[a].control) and control.kind is kind]:
+            yield f"{reason}: {', '.join(bilinear)}"
     reasons = {Law.COMPARTMENT: "inner physics drives", Law.BATCH: "batches move along"}
     for arc in network.arcs:
         if reason := reasons.get(arc.law, ""):
@@ -253,8 +257,8 @@ def _nonlinear(network: Network, agents: Sequence[str]) -> Iterator[str]:
 def _remedy(network: Network) -> str:
     """Say which agents leave a network linear, and where they can be chosen."""
     able = [agent for agent in network.controllable if not any(_nonlinear(network, [agent]))]
-    others = network.scenarios.items()
-    linear = [name for name, other in others if other.agents and not any(_nonlinear(other, other.agents))]
+    variants = network.scenarios.items()
+    linear = [name for name, scenario in variants if scenario.agents and not any(_nonlinear(scenario, scenario.agents))]
     if not able and not linear:
         return "No choice of agents makes it one"
     ways = [f"in Python agents={able}"] if able else []
@@ -263,49 +267,51 @@ def _remedy(network: Network) -> str:
 
 
 def _targets(network: Network, set_points: Mapping[str, float] | None) -> dict[str, float]:
-    tracked = network.objective.tracked or tuple(network.node_index)
-    own = {node.id: node.set_point for node in network.nodes if node.set_point is not None and node.id in tracked}
-    chosen = own if set_points is None else dict(set_points)
-    for node, value in chosen.items():
+    tracked_nodes = network.objective.tracked or tuple(network.node_index)
+    defaults = {
+        node.id: node.set_point for node in network.nodes if node.set_point is not None and node.id in tracked_nodes
+    }
+    targets = defaults if set_points is None else dict(set_points)
+    for node, value in targets.items():
         if node not in network.node_index:
             raise CirlError(f"LQR: set_points: {unknown('node', node, network.node_index)}")
         if not 0.0 <= value < np.inf:
             raise CirlError(f"LQR: set_points: '{node}' = {value} must be finite and not negative")
-    return chosen
+    return targets
 
 
-def _subset(kind: str, chosen: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
-    for each in chosen or [""]:
-        if each not in known:
-            raise ControlError(f"LQR: {unknown(kind, each, known)}")
-    return tuple(dict.fromkeys(chosen))
+def _subset(kind: str, names: Sequence[str], choices: Sequence[str]) -> tuple[str, ...]:
+    for name in names or [""]:
+        if name not in choices:
+            raise ControlError(f"LQR: {unknown(kind, name, choices)}")
+    return tuple(dict.fromkeys(names))
 
 
-def _weight(name: str, given: ArrayLike | None, default: Floats, *, definite: bool) -> Floats:
-    values = default if given is None else np.asarray(given, dtype=np.float64)
+def _weight(name: str, weights: ArrayLike | None, default: Floats, *, definite: bool) -> Floats:
+    values = default if weights is None else np.asarray(weights, dtype=np.float64)
     matrix: Floats = np.diag(values) if values.ndim == 1 else values
     if matrix.shape == 2 * (len(default),) and np.isfinite(matrix).all() and (matrix == matrix.T).all():
         modes = linalg.eigvalsh(matrix)
         if modes[-1] > 0 and modes[0] > (RANK if definite else -RANK) * modes[-1]:
             return matrix
-    wanted = f"positive {'' if definite else 'semi-'}definite matrix, or its diagonal, of {len(default)} rows"
-    raise ControlError(f"LQR: {name} must be a symmetric {wanted}, not {given!r}")
+    kind = f"positive {'' if definite else 'semi-'}definite matrix, or its diagonal, of {len(default)} rows"
+    raise ControlError(f"LQR: {name} must be a symmetric {kind}, not {weights!r}")
 
 
 def _kalman(A: Floats, B: Floats) -> tuple[Floats, Floats]:
     """Return orthonormal bases of what control reaches and of the rest, shapes (n, r) and (n, n − r)."""
-    reached, block = np.empty((len(A), 0)), B / max(linalg.norm(B), 1.0)
+    basis, block = np.empty((len(A), 0)), B / max(linalg.norm(B), 1.0)
     while block.shape[1]:
         for _ in range(2):  # the second pass removes round-off along what is reached already
-            block = block - reached @ (reached.T @ block)
-        left, sizes, _ = linalg.svd(block, full_matrices=False)
-        block = left[:, sizes > RANK]
-        reached = np.hstack([reached, block])
+            block = block - basis @ (basis.T @ block)
+        U, sizes, _ = linalg.svd(block, full_matrices=False)
+        block = U[:, sizes > RANK]
+        basis = np.hstack([basis, block])
         block = A @ block / max(linalg.norm(A), RANK)
-    return reached, linalg.svd(reached)[0][:, reached.shape[1] :]
+    return basis, linalg.svd(basis)[0][:, basis.shape[1] :]
 
 
-def _refuse_unstable(closed: Floats, A: Floats, why: str) -> None:
-    for mode in linalg.eigvals(closed):
+def _refuse_unstable(closed_loop: Floats, A: Floats, reason: str) -> None:
+    for mode in linalg.eigvals(closed_loop):
         if mode.real > -DECAY * linalg.norm(A):
-            raise CirlError(f"LQR: {why} the mode with eigenvalue {mode:.6g}, which is not stable")
+            raise CirlError(f"LQR: {reason} the mode with eigenvalue {mode:.6g}, which is not stable")

@@ -51,7 +51,7 @@ def pyramids(network: Network, run: Rollout, start: Floats) -> list[Pyramid]:
         run: the episode.
         start: stocks at its start, shape (stores,), mass; their ages are those of history or growth.
     """
-    interval, found = network.episode.control_interval, []
+    interval, result = network.episode.control_interval, []
     for place, node in enumerate(network.stores):
         if node.lifetime is None:
             continue
@@ -63,16 +63,16 @@ def pyramids(network: Network, run: Rollout, start: Floats) -> list[Pyramid]:
             mass = _of_line(node, interval, inflow, start[place])
         else:
             mass = _of_chain(node, chain, interval, inflow, start[place], stretch)
-        found.append(Pyramid(node.id, interval, mass))
-    return found
+        result.append(Pyramid(node.id, interval, mass))
+    return result
 
 
 def _of_line(node: Node, interval: float, inflow: Floats, start: float) -> Floats:
     assert node.lifetime is not None
     count = slots(node.lifetime, interval)
     past = past_inflows(node, interval, count)
-    every = np.concatenate([(past * start / past.sum())[::-1], inflow * interval])
-    return np.array([every[step : step + count][::-1] for step in range(len(inflow) + 1)])
+    cohorts = np.concatenate([(past * start / past.sum())[::-1], inflow * interval])
+    return np.array([cohorts[step : step + count][::-1] for step in range(len(inflow) + 1)])
 
 
 def _of_chain(node: Node, chain: Chain, interval: float, inflow: Floats, start: float, stretch: Floats) -> Floats:
@@ -81,28 +81,28 @@ def _of_chain(node: Node, chain: Chain, interval: float, inflow: Floats, start: 
     mean = node.lifetime.mean
 
     @cache
-    def moved(factor: float) -> tuple[Floats, Floats]:
+    def transition(factor: float) -> tuple[Floats, Floats]:
         return propagator(chain, interval / (mean * factor))
 
-    count = _told_apart(chain, interval / mean / max(1.0, float(stretch.max())))
-    kept, got = moved(1.0)
-    stages, cohorts = got, np.zeros((chain.stages, count))
+    count = _age_classes(chain, interval / mean / max(1.0, float(stretch.max())))
+    survival, entry = transition(1.0)
+    stages, cohorts = entry, np.zeros((chain.stages, count))
     for age, mass in enumerate(past_inflows(node, interval, count)):
         cohorts[:, age] = stages * mass
-        stages = kept @ stages
+        stages = survival @ stages
     cohorts *= start / cohorts.sum()
-    found = [cohorts.sum(axis=0)]
+    masses = [cohorts.sum(axis=0)]
     for flow, factor in zip(inflow, stretch.tolist(), strict=True):
-        kept, got = moved(factor)
-        cohorts = kept @ cohorts
+        survival, entry = transition(factor)
+        cohorts = survival @ cohorts
         # what is too old to be told apart stays in the last class
         oldest = cohorts[:, -1] + cohorts[:, -2] if count > 1 else cohorts[:, -1]
-        cohorts = np.concatenate([(got * flow * mean * factor)[:, None], cohorts[:, :-2], oldest[:, None]], axis=1)
-        found.append(cohorts.sum(axis=0))
-    return np.array(found)
+        cohorts = np.concatenate([(entry * flow * mean * factor)[:, None], cohorts[:, :-2], oldest[:, None]], axis=1)
+        masses.append(cohorts.sum(axis=0))
+    return np.array(masses)
 
 
-def _told_apart(chain: Chain, interval: float) -> int:
+def _age_classes(chain: Chain, interval: float) -> int:
     """Return the number of intervals, in lifetimes, until next to nothing is left."""
-    gone = np.flatnonzero(chain.survival(interval * np.arange(2, MOST + 1)) < OLD)
-    return int(gone[0]) + 2 if len(gone) else MOST
+    empty = np.flatnonzero(chain.survival(interval * np.arange(2, MOST + 1)) < OLD)
+    return int(empty[0]) + 2 if len(empty) else MOST

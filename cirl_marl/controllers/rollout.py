@@ -107,14 +107,16 @@ def rollout(
     total_flow = np.zeros(len(env.network.arcs))
     orders = np.flatnonzero(env.dynamics.is_scheduled[: len(total_flow)])
     controls = np.empty((steps, len(env.dynamics.neutral)))
-    unmet = np.zeros((steps, len(orders)))
+    shortage = np.zeros((steps, len(orders)))
     for t in range(steps):
         outcome = env.advance(env.stack(controller.act(observations)))
         controls[t] = env.controls[:, 0]
         if len(orders):
-            asked = env.dynamics.rate(env.controls, np.full(env.num_envs, t), env.physical.factors_if_any)[orders]
-            short = asked - outcome.flow[orders]
-            unmet[t] = np.where(short > ROUNDING * np.abs(asked), short, 0.0).mean(axis=1)
+            ordered_flow = env.dynamics.rate(env.controls, np.full(env.num_envs, t), env.physical.factors_if_any)[
+                orders
+            ]
+            short = ordered_flow - outcome.flow[orders]
+            shortage[t] = np.where(short > ROUNDING * np.abs(ordered_flow), short, 0.0).mean(axis=1)
         circularity[:, t], mean[:, t] = outcome.circularity, outcome.circularity_mean
         service[:, t], levels[:, :, t] = outcome.service_level, outcome.levels.T
         local += outcome.local
@@ -125,11 +127,11 @@ def rollout(
         observations = env.by_agent(outcome.observation)
         if progress is not None:
             progress(t + 1)
-    unmet *= env.network.episode.control_interval
+    shortage *= env.network.episode.control_interval
     final = rows.stocks(env.physical.stock).mean(axis=1)
     flows = total_flow / steps
-    seen = (stock, flow, load, inner, controls)
-    return Rollout(circularity, mean, service, levels, local, returns, *seen, unmet, final, flows)
+    first_copy = (stock, flow, load, inner, controls)
+    return Rollout(circularity, mean, service, levels, local, returns, *first_copy, shortage, final, flows)
 
 
 def episode_start(env: MultiAgentVectorEnv, seed: int | None = None) -> EpisodeStart:
@@ -145,8 +147,8 @@ def episode_start(env: MultiAgentVectorEnv, seed: int | None = None) -> EpisodeS
     inner = env.dynamics.inner
     rows = zip(inner.range_rows.tolist(), inner.low.tolist(), inner.high.tolist(), strict=True)
     middle |= {inner.names[row]: (low + high) / 2 for row, low, high in rows}
-    drawn = "" if len(inner.range_rows) == len(inner.names) else "; what models draw themselves as in evaluation 0"
-    return EpisodeStart(first_seed(0), middle, f"the middle of all initial ranges{drawn}")
+    note = "" if len(inner.range_rows) == len(inner.names) else "; what models draw themselves as in evaluation 0"
+    return EpisodeStart(first_seed(0), middle, f"the middle of all initial ranges{note}")
 
 
 def interval_ends(network: Network) -> Floats:

@@ -56,13 +56,13 @@ class Schedule:
             raise CirlError(f"{path}: the folder {path.parent} does not exist")
         calendar, dates = labels(self.network, interval_ends(self.network) - self.network.episode.control_interval)
         texts = [[f"{value:.10g}" for value in column] for column in self.columns]
-        header = (*self.header[:2], *(f"{each} at the start" for each in calendar), *self.header[2:])
+        header = (*self.header[:2], *(f"{label} at the start" for label in calendar), *self.header[2:])
         rows = zip(*texts[:2], *dates, *texts[2:], strict=True)
         write_atomically(path, lambda partial: write_table(partial, header, list(rows)))
 
 
 @dataclass
-class _Recorded(Controller):
+class _ActionRecorder(Controller):
     """A controller whose actions are kept."""
 
     controller: Controller
@@ -98,13 +98,13 @@ def schedule(
     network = env.network
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
-    recorded, begun = _Recorded(controller, env), episode_start(env, seed)
-    begun.reset(env)
+    recorder, origin = _ActionRecorder(controller, env), episode_start(env, seed)
+    origin.reset(env)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
-    usual = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
-    run = rollout(env, recorded, seed=begun.seed, start=begun.initial_state, progress=progress)
-    actuators = Actuators(env.network, env.agents, len(recorded.actions))
-    values = actuators.controls(np.array(recorded.actions).T, np.arange(len(recorded.actions)))[actuators.control_rows]
+    usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
+    run = rollout(env, recorder, seed=origin.seed, start=origin.initial_state, progress=progress)
+    actuators = Actuators(env.network, env.agents, len(recorder.actions))
+    values = actuators.controls(np.array(recorder.actions).T, np.arange(len(recorder.actions)))[actuators.control_rows]
     ends = interval_ends(network)
     columns = [
         (f"from ({network.time_unit})", ends - network.episode.control_interval),
@@ -115,8 +115,8 @@ def schedule(
         (f"mean circularity ({network.mass_unit})", run.circularity_mean[0]),
         ("service level (1)", run.service[0]),
     ]
-    header, found = zip(*columns, strict=True)
-    return Schedule(network, header, np.array(found), begun, run, usual, env.agents, start)
+    header, table = zip(*columns, strict=True)
+    return Schedule(network, header, np.array(table), origin, run, usual, env.agents, start)
 
 
 def control_names(network: Network, agents: tuple[str, ...]) -> Iterator[str]:
@@ -144,5 +144,5 @@ def _throughputs(network: Network, agents: tuple[str, ...], flow: Floats) -> Ite
     for agent in agents:
         if agent in network.arc_index:
             yield f"{agent}: flow ({unit})", flow[network.arc_index[agent]]
-        elif (leaving := steady & (network.donors == network.node_index[agent])).any():
-            yield f"{agent}: total outflow ({unit})", flow[leaving].sum(axis=0)
+        elif (outflows := steady & (network.donors == network.node_index[agent])).any():
+            yield f"{agent}: total outflow ({unit})", flow[outflows].sum(axis=0)

@@ -35,7 +35,7 @@ HOLDING_M = 0.03
 """Opening of each finger below which the gripper holds something; an object of 5 cm leaves them at 0.025."""
 
 
-def fetch(seen: ModelStates, model: Any = None) -> Floats:
+def fetch(states: ModelStates, model: Any = None) -> Floats:
     """Return the inputs of the Fetch robot that reach, grasp, lift, carry and place, shape (4, B).
 
     A function of the observation alone. Away from the object the gripper is open and comes down to it on a slope, or at
@@ -43,33 +43,33 @@ def fetch(seen: ModelStates, model: Any = None) -> Floats:
     hold, it is lifted, carried and set down; at the target it is let go.
     """
     whats = ("grip", "object", "desired")
-    grip, item, target = (np.stack([seen[f"{what}_{axis}"] for axis in "xyz"]) for what in whats)
+    grip, item, target = (np.stack([states[f"{part}_{axis}"] for axis in "xyz"]) for part in whats)
     away = grip - item
     aside = np.hypot(*away[:2])
     around = (aside < 0.02) & (np.abs(away[2]) < 0.02)
-    held = around & (0.5 * (seen["finger_r"] + seen["finger_l"]) < HOLDING_M)
-    left = np.hypot(*(target - item)[:2])
-    placed = (left < 0.03) & (item[2] < target[2] + 0.03)
+    holds = around & (0.5 * (states["finger_r"] + states["finger_l"]) < HOLDING_M)
+    distance = np.hypot(*(target - item)[:2])
+    is_placed = (distance < 0.03) & (item[2] < target[2] + 0.03)
     reach, carry = item.copy(), target.copy()
     reach[2] += np.where(np.abs(away[1]) < STRADDLE_M, 0.0, np.clip(SLOPE * (aside - 0.015), 0.0, HOVER_M))
-    carry[2] += np.where(left > NEAR_M, CARRY_M, PLACE_M)
-    towards = np.where(held, carry, np.where(around, item, reach))
-    towards = np.where(placed, np.stack([grip[0], grip[1], target[2] + HOVER_M]), towards)
+    carry[2] += np.where(distance > NEAR_M, CARRY_M, PLACE_M)
+    towards = np.where(holds, carry, np.where(around, item, reach))
+    towards = np.where(is_placed, np.stack([grip[0], grip[1], target[2] + HOVER_M]), towards)
     move = np.clip(1.5 * (towards - grip) / MOVE_M, -1.0, 1.0)
-    fingers = np.where(around & ~placed, SHUT_FINGERS, OPEN_FINGERS)
+    fingers = np.where(around & ~is_placed, SHUT_FINGERS, OPEN_FINGERS)
     return np.concatenate([move, fingers[None]])
 
 
-def reacher(seen: ModelStates, model: Any = None) -> Floats:
+def reacher(states: ModelStates, model: Any = None) -> Floats:
     """Return the torques of the Reacher that move its tip to the target and let it rest, shape (2, B).
 
     Inverse kinematics give the joint angles, a damped spring the torques.
     """
-    first = np.arctan2(seen["sin_0"], seen["cos_0"])
-    second = np.arctan2(seen["sin_1"], seen["cos_1"])
-    speed = np.stack([seen["speed_0_rad_s"], seen["speed_1_rad_s"]])
-    wanted = _joint_angles(seen["target_x_m"], seen["target_y_m"], second)
-    turn = np.stack([wanted[0] - first, wanted[1] - second])
+    first = np.arctan2(states["sin_0"], states["cos_0"])
+    second = np.arctan2(states["sin_1"], states["cos_1"])
+    speed = np.stack([states["speed_0_rad_s"], states["speed_1_rad_s"]])
+    angles = _joint_angles(states["target_x_m"], states["target_y_m"], second)
+    turn = np.stack([angles[0] - first, angles[1] - second])
     turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
     return np.clip(STIFFNESS * turn - DAMPER * speed, -1.0, 1.0)
 
@@ -84,25 +84,25 @@ STIFFNESS, DAMPER = 0.4, 0.05
 
 def _joint_angles(x_m: Floats, y_m: Floats, second: Floats) -> tuple[Floats, Floats]:
     """Return the angles of both joints that put the tip at (x, y), the elbow bent to the side it already is."""
-    squared = x_m**2 + y_m**2
-    cosine = np.clip((squared - UPPER_M**2 - LOWER_M**2) / (2.0 * UPPER_M * LOWER_M), -1.0, 1.0)
+    distance2 = x_m**2 + y_m**2
+    cosine = np.clip((distance2 - UPPER_M**2 - LOWER_M**2) / (2.0 * UPPER_M * LOWER_M), -1.0, 1.0)
     elbow = np.where(second >= 0.0, 1.0, -1.0) * np.minimum(np.arccos(cosine), ELBOW_RAD)
     shoulder = np.arctan2(y_m, x_m) - np.arctan2(LOWER_M * np.sin(elbow), UPPER_M + LOWER_M * np.cos(elbow))
     return shoulder, elbow
 
 
-def truck(seen: ModelStates, model: Any = None) -> Floats:
+def truck(states: ModelStates, model: Any = None) -> Floats:
     """Return the force that drives a truck to its destination and stops it there, shape (1, B), N: a damped spring."""
-    return SPRING_N_M * (seen["destination_m"] - seen["position_m"])[None] - BRAKE_N_S_M * seen["speed_m_s"][None]
+    return SPRING_N_M * (states["destination_m"] - states["position_m"])[None] - BRAKE_N_S_M * states["speed_m_s"][None]
 
 
 SPRING_N_M, BRAKE_N_S_M = 4e3, 6e3
 """[chosen: about critical for 3.2 t]"""
 
 
-def incinerator(seen: ModelStates, model: Incinerator) -> Floats:
+def incinerator(states: ModelStates, model: Incinerator) -> Floats:
     """Return the heat to take from the freeboard, shape (1, B), kJ/min: more where it is hotter than its set-point."""
-    return HOLD_KJ_MIN + GAIN_KJ_MIN_K * (seen["freeboard_degc"] - model.target_degc)[None]
+    return HOLD_KJ_MIN + GAIN_KJ_MIN_K * (states["freeboard_degc"] - model.target_degc)[None]
 
 
 HOLD_KJ_MIN, GAIN_KJ_MIN_K = 3.56e5, 3e4
@@ -118,7 +118,7 @@ class ScriptController(Controller):
     def __init__(self, constant: Mapping[str, float] | None = None) -> None:
         """Hold the actions of some agents, agent → value in [−1, 1]; others without a script stay neutral."""
         self._constant = Constant(constant)
-        self._held = frozenset(constant or ())
+        self._constant_agents = frozenset(constant or ())
         self._scripts: dict[str, tuple[Script, CompartmentModel, dict[str, int]]] = {}
 
     def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
@@ -128,7 +128,12 @@ class ScriptController(Controller):
         for agent in env.agents:
             compartment = env.network.compartments[agent]
             model, control = compartment.model, compartment.control
-            if model is None or agent in self._held or control is None or control.kind is not ControlKind.INPUT:
+            if (
+                model is None
+                or agent in self._constant_agents
+                or control is None
+                or control.kind is not ControlKind.INPUT
+            ):
                 continue
             if script := SCRIPTS.get(model.robot.kind):
                 places = {name: i for i, name in enumerate(env.layout.names[agent]) if name.startswith(f"{agent}.")}
@@ -144,9 +149,9 @@ class ScriptController(Controller):
         """Return each agent's action; a ``ControlError`` names a state that its script needs and it does not see."""
         actions = dict(self._constant.act(observations))
         for agent, (script, model, columns) in self._scripts.items():
-            seen = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}
+            states = {name: observations[agent][:, i].astype(np.float64) for name, i in columns.items()}
             try:
-                inputs = script(seen, model)
+                inputs = script(states, model)
             except KeyError as missing:
                 raise ControlError(f"scripted control of '{agent}' needs to see its state {missing}") from None
             actions[agent] = self._env.normalise(agent, inputs)

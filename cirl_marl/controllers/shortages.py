@@ -30,13 +30,13 @@ class Shortage:
 def shortages(run: Rollout, network: Network) -> Iterator[Shortage]:
     """Yield the scheduled flows that were cut in a rollout of ``network``; masses are means over its copies."""
     interval = network.episode.control_interval
-    scheduled = [k for k, arc in enumerate(network.arcs) if LAWS[arc.law].is_scheduled]
-    for k, unmet in zip(scheduled, run.shortage.T, strict=True):
-        mass = float(unmet.sum())
-        asked = mass + float(run.mean_flow[k]) * interval * len(unmet)
-        if mass > NOTABLE * asked:
-            arc, begins = network.arcs[k], float(np.argmax(unmet > 0)) * interval
-            less = f"{mass:.4g} {network.mass_unit} ({mass / asked:.1%}) less than asked for"
+    scheduled_arcs = [k for k, arc in enumerate(network.arcs) if LAWS[arc.law].is_scheduled]
+    for k, lack in zip(scheduled_arcs, run.shortage.T, strict=True):
+        mass = float(lack.sum())
+        order = mass + float(run.mean_flow[k]) * interval * len(lack)
+        if mass > NOTABLE * order:
+            arc, begins = network.arcs[k], float(np.argmax(lack > 0)) * interval
+            less = f"{mass:.4g} {network.mass_unit} ({mass / order:.1%}) less than asked for"
             first = f"first at {begins:g} {network.time_unit}"
             yield Shortage(arc, begins, mass, f"arc '{arc.id}' moved {less}, {first}: '{arc.donor}' held too little")
 
@@ -49,11 +49,11 @@ def service_shortages(run: Rollout, network: Network) -> Iterator[str]:
         levels = run.levels[:, s].mean(axis=0)
         if arcs and levels.min() < 1 - NOTABLE:
             first = int(np.argmax(levels < 1 - NOTABLE))
-            when = " ".join(f"({column[0]})" for column in labels(network, first * interval)[1])
-            at = f"{first * interval:g} {network.time_unit} {when}".strip()
+            date = " ".join(f"({column[0]})" for column in labels(network, first * interval)[1])
+            at = f"{first * interval:g} {network.time_unit} {date}".strip()
             flows = [f"'{arc.id}' {run.controls[first, network.control_rows[arc.id].start]:.4g}" for arc in arcs]
             unit = f"{network.mass_unit}/{network.time_unit}"
-            told = (
+            text = (
                 f"falls to {levels.min():.4f}, short first at {at}, when {' and '.join(flows)} {unit} makes up for it"
             )
-            yield f"service '{service.id}' {told}"
+            yield f"service '{service.id}' {text}"

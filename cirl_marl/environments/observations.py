@@ -179,8 +179,8 @@ class ObservationLayout:
         compartments = network.compartments.values()
         scales = np.array([c.scale for c in compartments])
         low, high = np.zeros(signals.rows), np.ones(signals.rows)
-        conserved = slice(0, signals.flows.stop)
-        low[conserved], high[conserved] = -np.inf, np.inf
+        mass_rows = slice(0, signals.flows.stop)
+        low[mass_rows], high[mass_rows] = -np.inf, np.inf
         if dynamics.physical:
             mass = network.initial[1].sum()
             drive = np.where(dynamics.driver == dynamics.rows.unit, 1.0, mass)
@@ -195,8 +195,8 @@ class ObservationLayout:
             stores = signals.throughputs.start
             through, flows = through[: len(network.nodes) - stores], flows[: len(network.arcs)]
             limits = np.concatenate([np.full(stores, mass), through, flows]) / scales
-            low[conserved], high[conserved] = 0.0, limits * (1 + 1e-6) + 1e-6
-        low[conserved.stop : signals.quantities], high[conserved.stop : signals.quantities] = -np.inf, np.inf
+            low[mass_rows], high[mass_rows] = 0.0, limits * (1 + 1e-6) + 1e-6
+        low[mass_rows.stop : signals.quantities], high[mass_rows.stop : signals.quantities] = -np.inf, np.inf
         low[signals.loads] = 0.0
         set_points = np.abs([c.set_point or 0.0 for c in compartments]) / scales
         low[signals.set_points], high[signals.set_points] = -set_points - 1, set_points + 1

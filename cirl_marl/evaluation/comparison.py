@@ -175,7 +175,7 @@ def compare(
         controller = contender.controller()
         checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
         watched = ProgressController(controller, part_of(progress, contender.name, place * share, share))
-        rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.acted))
+        rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.report_steps))
     measure, proved = _unproved(len(entered), "")
     if bounds:
         first_env, done = entered[0].env(episodes), len(entered) * share

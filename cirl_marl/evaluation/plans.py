@@ -54,7 +54,7 @@ def plan(
     """
     env, controller = _environment_and_controller(source, control, scenario, min_service)
     watched = ProgressController(controller, progress)
-    table = schedule(env, watched, seed=seed, progress=watched.acted)
+    table = schedule(env, watched, seed=seed, progress=watched.report_steps)
     name = type(control).__name__ if isinstance(control, Controller) else control or ""
     return replace(table, control=name, note=controller.note)
 

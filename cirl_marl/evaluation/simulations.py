@@ -221,7 +221,7 @@ def _simulated(
     begun = episode_start(env, seed)
     begun.reset(env)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
-    run = rollout(env, watched, seed=begun.seed, start=begun.initial_state, progress=watched.acted)
+    run = rollout(env, watched, seed=begun.seed, start=begun.initial_state, progress=watched.report_steps)
     return Simulation(name, control, env, begun, start, run)
 
 

@@ -98,38 +98,38 @@ def import_flows(
             raise CirlError(_imbalance_message(table, residuals))
         table, changes = processes.reconcile()
         processes = Processes(table, processes.of(ProcessKind.STORE))
-    told = _roles(table, processes, roles, ask)
+    role_of = _roles(table, processes, roles, ask)
     name = identifiers([out.stem])[out.stem]
     if name != out.stem:
         raise CirlError(f"--out {out}: the name of a network has lower case letters, digits and _, as {name}.toml")
-    made = definition_files(
+    definition = definition_files(
         table,
         processes,
-        told,
+        role_of,
         known_stocks,
         name=name,
         title=title or name,
         source=source or f"imported from {flows.name}",
     )
     with publish_folder(out.parent) as partial:
-        files = _write(partial, out.name, name, made, changes)
-        error = _largest_error(partial / out.name, table, made, progress)
+        files = _write(partial, out.name, name, definition, changes)
+        error = _largest_error(partial / out.name, table, definition, progress)
     mistakes = processes.stock_mistakes(known_stocks)
     return ImportReport(
-        table, processes, told, tuple(changes), mistakes, error, tuple(out.parent / file for file in files)
+        table, processes, role_of, tuple(changes), mistakes, error, tuple(out.parent / file for file in files)
     )
 
 
-def _matching_processes(table: FlowTable, patterns: Sequence[str], what: str) -> list[str]:
+def _matching_processes(table: FlowTable, patterns: Sequence[str], label: str) -> list[str]:
     """Return the processes that names or patterns stand for; a ``CirlError`` for one that stands for none."""
     names = list(dict.fromkeys(end for pair in table.pairs for end in (pair.source, pair.target)))
-    found: list[str] = []
+    processes: list[str] = []
     for pattern in patterns:
-        matching = [name for name in names if fnmatchcase(name, pattern)]
-        if not matching:
-            raise CirlError(f"{table.name}: {what}: {unknown('process', pattern, names)}")
-        found += matching
-    return list(dict.fromkeys(found))
+        matches = [name for name in names if fnmatchcase(name, pattern)]
+        if not matches:
+            raise CirlError(f"{table.name}: {label}: {unknown('process', pattern, names)}")
+        processes += matches
+    return list(dict.fromkeys(processes))
 
 
 def _stock_processes(table: FlowTable, stocks: Mapping[tuple[str, str, int], float]) -> list[str]:
@@ -144,42 +144,42 @@ def _roles(
     table: FlowTable, processes: Processes, roles: Mapping[str, Sequence[str]], ask: Ask | None
 ) -> dict[str, Role]:
     """Return the roles of processes; sources and sinks all have one."""
-    told: dict[str, Role] = {}
+    role_of: dict[str, Role] = {}
     for role, patterns in roles.items():
         for name in _matching_processes(table, patterns, role):
-            if told.setdefault(name, Role(role)) is not Role(role):
-                raise CirlError(f"'{name}' is given two roles, {told[name].value} and {role}; leave one out")
+            if role_of.setdefault(name, Role(role)) is not Role(role):
+                raise CirlError(f"'{name}' is given two roles, {role_of[name].value} and {role}; leave one out")
             if processes.kinds[name] is ProcessKind.TRANSIT and Role(role) is not Role.TECHNOSPHERE:
                 raise CirlError(f"'{name}' is given the role {role}, but what enters it leaves it; it has none")
-    missing = [name for name in processes.of(ProcessKind.SOURCE, ProcessKind.SINK) if name not in told]
-    if missing and ask is None:
-        said = "; ".join(f"'{name}' ({processes.kinds[name].value})" for name in missing)
+    unclear = [name for name in processes.of(ProcessKind.SOURCE, ProcessKind.SINK) if name not in role_of]
+    if unclear and ask is None:
+        labels = "; ".join(f"'{name}' ({processes.kinds[name].value})" for name in unclear)
         choices = "--reservoir, --landfill, --incinerator, --environment, or --outside (trade, other economies)"
-        raise CirlError(f"{table.name}: what is {said}? Say so by {choices}, such as --outside 'Imports of *'")
-    for name in missing:
+        raise CirlError(f"{table.name}: what is {labels}? Say so by {choices}, such as --outside 'Imports of *'")
+    for name in unclear:
         assert ask is not None
-        told[name] = ask(name, processes.kinds[name])
-    return told
+        role_of[name] = ask(name, processes.kinds[name])
+    return role_of
 
 
 def _imbalance_message(table: FlowTable, residuals: Sequence[Residual]) -> str:
     """Say what does not balance."""
-    names = dict.fromkeys(each.process for each in residuals)
-    lines = [f"  {each}" for each in residuals[:MOST_LINES]]
+    names = dict.fromkeys(residual.process for residual in residuals)
+    lines = [f"  {residual}" for residual in residuals[:MOST_LINES]]
     more = [f"  and {len(residuals) - MOST_LINES} more"] if len(residuals) > MOST_LINES else []
     remedy = "Name those that hold a stock with --store, or adjust the flows with --reconcile"
-    said = f"{table.name}: {len(names)} processes do not balance ({table.unit}); the largest residuals are"
-    return "\n".join([said, *lines, *more, f"{remedy}; nothing was written."])
+    headline = f"{table.name}: {len(names)} processes do not balance ({table.unit}); the largest residuals are"
+    return "\n".join([headline, *lines, *more, f"{remedy}; nothing was written."])
 
 
-def _write(folder: Path, file: str, name: str, made: ImportedFiles, changes: Sequence[Change]) -> list[str]:
+def _write(folder: Path, file: str, name: str, definition: ImportedFiles, changes: Sequence[Change]) -> list[str]:
     """Write the files and return their names."""
     files = [file, f"{name}.csv"]
-    (folder / file).write_text(made.text, encoding="utf-8")
-    write_table(folder / files[1], list(map(str, made.data[0])), made.data[1:])
-    if made.regions:
+    (folder / file).write_text(definition.text, encoding="utf-8")
+    write_table(folder / files[1], list(map(str, definition.data[0])), definition.data[1:])
+    if definition.regions:
         files.append(f"{name}_regions.csv")
-        write_table(folder / files[-1], list(map(str, made.regions[0])), made.regions[1:])
+        write_table(folder / files[-1], list(map(str, definition.regions[0])), definition.regions[1:])
     if changes:
         files.append(f"{name}_changes.csv")
         header = ["region", "year", "source", "target", "type", "before", "after", "deviation", "in deviations"]
@@ -195,13 +195,13 @@ def _write(folder: Path, file: str, name: str, made: ImportedFiles, changes: Seq
                 c.deviation,
                 c.in_deviations,
             )
-            for c in sorted(changes, key=lambda each: -abs(each.after - each.before))
+            for c in sorted(changes, key=lambda change: -abs(change.after - change.before))
         ]
         write_table(folder / files[-1], header, rows)
     return files
 
 
-def _largest_error(path: Path, table: FlowTable, made: ImportedFiles, progress: Callable[[float], None]) -> float:
+def _largest_error(path: Path, table: FlowTable, definition: ImportedFiles, progress: Callable[[float], None]) -> float:
     """Simulate every region without agents, and return how far a flow is from the table.
 
     Raises:
@@ -212,20 +212,20 @@ def _largest_error(path: Path, table: FlowTable, made: ImportedFiles, progress: 
     for done, (region, id_) in enumerate(ids.items()):
         network = load_network(f"{path}:{id_}" if id_ else path)
         env = MultiAgentVectorEnv(network, num_envs=1)
-        begun = episode_start(env)
-        run = rollout(env, Neutral(), seed=begun.seed, start=begun.initial_state)
-        expected = np.array(
-            [[table.flows.get((region, year, pair), 0.0) for pair in made.arcs] for year in table.years]
+        origin = episode_start(env)
+        run = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
+        table_flows = np.array(
+            [[table.flows.get((region, year, pair), 0.0) for pair in definition.arcs] for year in table.years]
         )
-        order = [network.arc_index[arc] for arc in made.arcs.values()]
-        errors = np.abs(run.flow[:, order] - expected)
-        if errors.max() > WRONG * expected.max():
+        order = [network.arc_index[arc] for arc in definition.arcs.values()]
+        errors = np.abs(run.flow[:, order] - table_flows)
+        if errors.max() > WRONG * table_flows.max():
             y, k = np.unravel_index(int(errors.argmax()), errors.shape)
-            pair = [*made.arcs][int(k)]
-            simulated = run.flow[y, order[int(k)]]
-            when = f"{table.years[int(y)]}{f' in {region}' if region else ''}"
+            pair = [*definition.arcs][int(k)]
+            value = run.flow[y, order[int(k)]]
+            label = f"{table.years[int(y)]}{f' in {region}' if region else ''}"
             raise CirlError(
-                f"{table.name}: the network does not give back {pair} in {when}: {simulated:g}, not {expected[y, k]:g} "
+                f"{table.name}: the network does not give back {pair} in {label}: {value:g}, not {table_flows[y, k]:g} "
                 f"{table.unit}; a store may run empty: give stocks"
             )
         worst = max(worst, float(errors.max()))

@@ -40,13 +40,13 @@ class Residual:
     process: Annotated[str, "its name"]
     region: Annotated[str, "empty without regions"]
     year: Annotated[int, "the year"]
-    entered: Annotated[float, "sum of its inflows"]
-    left: Annotated[float, "sum of its outflows"]
+    inflow: Annotated[float, "sum of its inflows"]
+    outflow: Annotated[float, "sum of its outflows"]
 
     def __str__(self) -> str:
         """Say it as in a message."""
-        where = f"{self.region}, {self.year}" if self.region else str(self.year)
-        return f"'{self.process}' ({where}): {self.entered:g} enter, {self.left:g} leave"
+        place = f"{self.region}, {self.year}" if self.region else str(self.year)
+        return f"'{self.process}' ({place}): {self.inflow:g} enter, {self.outflow:g} leave"
 
 
 @with_field_docs
@@ -93,27 +93,27 @@ class Processes:
         for k, pair in enumerate(pairs):
             self._incidence[self._place[pair.source], k] -= 1.0
             self._incidence[self._place[pair.target], k] += 1.0
-        entered, left = self._sums(1.0), self._sums(-1.0)
-        stays = entered - left
+        inflow, outflow = self._sums(1.0), self._sums(-1.0)
+        stays = inflow - outflow
         beyond = np.abs(stays) > self._tolerance()[:, None, None]
-        whole = entered.sum(axis=(0, 1))
+        whole = inflow.sum(axis=(0, 1))
         grows = stays.sum(axis=(0, 1)) >= GROWS * whole
         self.kinds: dict[str, ProcessKind] = {}
-        assumed = []
+        inferred = []
         for i, name in enumerate(self.names):
             if whole[i] == 0:
                 kind = ProcessKind.SOURCE
-            elif not left[:, :, i].any():
+            elif not outflow[:, :, i].any():
                 kind = ProcessKind.SINK
             elif name in stores:
                 kind = ProcessKind.STORE
             elif not stores and beyond[:, :, i].any() and grows[i]:
                 kind = ProcessKind.STORE
-                assumed.append(name)
+                inferred.append(name)
             else:
                 kind = ProcessKind.TRANSIT
             self.kinds[name] = kind
-        self.inferred_stores = tuple(assumed)
+        self.inferred_stores = tuple(inferred)
 
     def of(self, *kinds: ProcessKind) -> tuple[str, ...]:
         """Return the processes of some kinds."""
@@ -122,14 +122,14 @@ class Processes:
     @property
     def residuals(self) -> list[Residual]:
         """What does not balance beyond rounding, the largest first."""
-        entered, left = self._sums(1.0), self._sums(-1.0)
-        passing = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
-        wrong = (np.abs(entered - left) > self._tolerance()[:, None, None]) & passing
-        found = [
-            Residual(self.names[i], self._table.regions[r], self._table.years[y], entered[r, y, i], left[r, y, i])
+        inflow, outflow = self._sums(1.0), self._sums(-1.0)
+        transit = np.array([kind is ProcessKind.TRANSIT for kind in self.kinds.values()])
+        wrong = (np.abs(inflow - outflow) > self._tolerance()[:, None, None]) & transit
+        residuals = [
+            Residual(self.names[i], self._table.regions[r], self._table.years[y], inflow[r, y, i], outflow[r, y, i])
             for r, y, i in np.argwhere(wrong).tolist()
         ]
-        return sorted(found, key=lambda each: -abs(each.entered - each.left))
+        return sorted(residuals, key=lambda residual: -abs(residual.inflow - residual.outflow))
 
     def reconcile(self) -> tuple[FlowTable, list[Change]]:
         """Return flows that balance and are closest to those of the table, and what was changed.
@@ -143,19 +143,21 @@ class Processes:
         balances, changes = self._incidence[rows], []
         for r, region in enumerate(table.regions):
             for y, year in enumerate(table.years):
-                measured = self.flows[r, y]
-                own = [table.deviations.get((region, year, pair)) for pair in table.pairs]
-                stated = np.array([np.nan if each is None else each for each in own])
-                deviations = np.where(np.isnan(stated), UNCERTAIN * measured, stated)
-                found = _closest(measured, np.where(measured > 0, deviations, 0.0), balances)
-                if found is None:
-                    where = f"{region}, {year}" if region else str(year)
+                table_flow = self.flows[r, y]
+                given_deviations = [table.deviations.get((region, year, pair)) for pair in table.pairs]
+                stated_deviations = np.array(
+                    [np.nan if deviation is None else deviation for deviation in given_deviations]
+                )
+                deviations = np.where(np.isnan(stated_deviations), UNCERTAIN * table_flow, stated_deviations)
+                closest = _closest(table_flow, np.where(table_flow > 0, deviations, 0.0), balances)
+                if closest is None:
+                    place = f"{region}, {year}" if region else str(year)
                     remedy = "state how uncertain they are"
-                    raise CirlError(f"{table.name}: {where}: flows whose uncertainty is 0 do not balance; {remedy}")
-                for k in np.flatnonzero(np.abs(found - measured) > 1e-9 * measured.max()).tolist():
+                    raise CirlError(f"{table.name}: {place}: flows whose uncertainty is 0 do not balance; {remedy}")
+                for k in np.flatnonzero(np.abs(closest - table_flow) > 1e-9 * table_flow.max()).tolist():
                     pair = table.pairs[k]
-                    flows[region, year, pair] = float(found[k])
-                    changes.append(Change(region, year, pair, measured[k], float(found[k]), float(deviations[k])))
+                    flows[region, year, pair] = float(closest[k])
+                    changes.append(Change(region, year, pair, table_flow[k], float(closest[k]), float(deviations[k])))
         return replace(table, flows=flows), changes
 
     def stock_mistakes(self, stocks: Mapping[tuple[str, str, int], float]) -> dict[str, float]:
@@ -168,8 +170,8 @@ class Processes:
         for (region, name, year), stock in stocks.items():
             before = stocks.get((region, name, year - 1))
             if before is not None and year in table.years:
-                said = float(net[table.regions.index(region), table.years.index(year), self._place[name]])
-                worst[name] = max(worst.get(name, 0.0), abs(stock - before - said))
+                growth = float(net[table.regions.index(region), table.years.index(year), self._place[name]])
+                worst[name] = max(worst.get(name, 0.0), abs(stock - before - growth))
         return worst
 
     def _sums(self, sign: float) -> Floats:
@@ -182,27 +184,27 @@ class Processes:
         return np.asarray(ROUNDING * self.flows.max(axis=(1, 2)))
 
 
-def _closest(measured: Floats, deviations: Floats, balances: Floats) -> Floats | None:
+def _closest(table_flow: Floats, deviations: Floats, balances: Floats) -> Floats | None:
     """Return the x ≥ 0 with ``balances`` x = 0 that minimises Σ ((x − m)/σ)², by an active set; None if there is none.
 
     Where σ = 0 x is m.
     """
-    free, found = deviations > 0, measured.copy()
-    scale = float(measured.max(initial=0.0)) or 1.0
+    free, flow = deviations > 0, table_flow.copy()
+    scale = float(table_flow.max(initial=0.0)) or 1.0
     for _ in range(SWEEPS):
         weights = np.where(free, deviations**2, 0.0)
-        start = np.where(free | (deviations == 0), measured, 0.0)
+        start = np.where(free | (deviations == 0), table_flow, 0.0)
         system = (balances * weights) @ balances.T
         prices = np.linalg.lstsq(system, balances @ start, rcond=1e-13)[0]
-        found = start - weights * (balances.T @ prices)
-        if (found < -1e-12 * scale).any():
-            free &= found >= -1e-12 * scale
+        flow = start - weights * (balances.T @ prices)
+        if (flow < -1e-12 * scale).any():
+            free &= flow >= -1e-12 * scale
             continue
         # what would rise if it were let go
-        held = ~free & (deviations > 0)
-        pull = np.where(held, measured - deviations**2 * (balances.T @ prices), -np.inf)
+        at_zero = ~free & (deviations > 0)
+        pull = np.where(at_zero, table_flow - deviations**2 * (balances.T @ prices), -np.inf)
         if pull.max(initial=-np.inf) <= 1e-9 * scale:
             break
         free[int(pull.argmax())] = True
-    found = np.maximum(found, 0.0)
-    return found if np.abs(balances @ found).max(initial=0.0) <= 1e-7 * scale else None
+    flow = np.maximum(flow, 0.0)
+    return flow if np.abs(balances @ flow).max(initial=0.0) <= 1e-7 * scale else None

@@ -65,20 +65,20 @@ def identifier(text: str) -> str:
     'market_of_ingots_semis'
     """
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
-    found = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")
-    return found if found[:1].isalpha() else f"process_{found}".rstrip("_")
+    words = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")
+    return words if words[:1].isalpha() else f"process_{words}".rstrip("_")
 
 
 def identifiers(texts: Iterable[str]) -> dict[str, str]:
     """Return an identifier for each text, no two alike."""
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     for text in texts:
         first = identifier(text)
-        number, chosen = 2, first
-        while chosen in found.values():
-            number, chosen = number + 1, f"{first}_{number}"
-        found[text] = chosen
-    return found
+        number, name = 2, first
+        while name in result.values():
+            number, name = number + 1, f"{first}_{number}"
+        result[text] = name
+    return result
 
 
 def shares_of(flows: Floats) -> Floats:
@@ -88,13 +88,13 @@ def shares_of(flows: Floats) -> Floats:
     those of all regions and years together.
     """
     total = flows.sum(axis=2, keepdims=True)
-    pooled = flows.sum(axis=(0, 1)) / flows.sum()
-    shares = np.divide(flows, total, out=np.broadcast_to(pooled, flows.shape).copy(), where=total > 0)
+    overall = flows.sum(axis=(0, 1)) / flows.sum()
+    shares = np.divide(flows, total, out=np.broadcast_to(overall, flows.shape).copy(), where=total > 0)
     years = np.arange(flows.shape[1])
     for region, active in enumerate(total[:, :, 0] > 0):
         if active.any():
-            known = years[active]
-            nearest = known[np.abs(known[None] - years[:, None]).argmin(axis=1)]
+            active_years = years[active]
+            nearest = active_years[np.abs(active_years[None] - years[:, None]).argmin(axis=1)]
             shares[region] = shares[region, nearest]
     return np.asarray(shares)
 
@@ -161,23 +161,25 @@ class _Writer:
         """Return reference flow and stock of each region, to two digits."""
         largest = self._processes.flows.max(axis=(1, 2))
         return [
-            (_round_significant(each), _round_significant(each * len(self._table.years))) for each in largest.tolist()
+            (_round_significant(flow), _round_significant(flow * len(self._table.years))) for flow in largest.tolist()
         ]
 
     def _of_regions(self) -> list[list[object]]:
         """Return what differs from region to region and not from year to year, a row for each."""
         if not self._regional:
             return []
-        stored = [process for process in self._processes.of(ProcessKind.STORE) if self._first_stocks(process)]
-        rows: list[list[object]] = [["region", "flow", "stock", *(f"stock of {self._nodes[each]}" for each in stored)]]
+        stores = [process for process in self._processes.of(ProcessKind.STORE) if self._first_stocks(process)]
+        rows: list[list[object]] = [
+            ["region", "flow", "stock", *(f"stock of {self._nodes[store]}" for store in stores)]
+        ]
         for region, scales in zip(self._table.regions, self._references(), strict=True):
-            rows.append([region, *scales, *(self._first_stocks(each)[region] for each in stored)])
+            rows.append([region, *scales, *(self._first_stocks(store)[region] for store in stores)])
         return rows
 
-    def _scale(self, what: str, value: float, unit: str, source: str) -> str:
+    def _scale(self, column: str, value: float, unit: str, source: str) -> str:
         if not self._regional:
             return f"{{ value = {value:g}, unit = {_text(unit)}, source = {_text(source)} }}"
-        return f"{{ {self._of_region(what)}, unit = {_text(unit)}, source = {_text(source)} }}"
+        return f"{{ {self._of_region(column)}, unit = {_text(unit)}, source = {_text(source)} }}"
 
     def _of_region(self, column: str) -> str:
         return f'file = "{self._name}_regions.csv", column = "{column}", where = {{ region = "{{region}}" }}'
@@ -201,20 +203,20 @@ class _Writer:
 
     def _initial(self, process: str) -> str:
         """Return the initial stock of a store, if it is known."""
-        if not (known := self._first_stocks(process)):
+        if not (stocks := self._first_stocks(process)):
             return ""
-        told = f"unit = {_text(self._mass)}, source = {_text(self._source)}"
+        unit_and_source = f"unit = {_text(self._mass)}, source = {_text(self._source)}"
         if not self._regional:
-            return f"initial = {{ low = {known['']!r}, high = {known['']!r}, {told} }}"
-        return f"initial = {{ {self._of_region(f'stock of {self._nodes[process]}')}, {told} }}"
+            return f"initial = {{ low = {stocks['']!r}, high = {stocks['']!r}, {unit_and_source} }}"
+        return f"initial = {{ {self._of_region(f'stock of {self._nodes[process]}')}, {unit_and_source} }}"
 
     def _first_stocks(self, process: str) -> dict[str, float]:
         """Return the stock at the end of the year before the first by region; nothing if one is not known."""
         before = self._table.years[0] - 1
-        known = {region: self._stocks.get((region, process, before)) for region in self._table.regions}
+        stocks = {region: self._stocks.get((region, process, before)) for region in self._table.regions}
         return (
-            {region: stock for region, stock in known.items() if stock is not None}
-            if all(stock is not None for stock in known.values())
+            {region: stock for region, stock in stocks.items() if stock is not None}
+            if all(stock is not None for stock in stocks.values())
             else {}
         )
 
@@ -234,7 +236,7 @@ class _Writer:
     def _rest(self, pair: Connection) -> bool:
         """Whether the share of a pair is what the others leave: of the largest flow out of its process."""
         total = self._processes.flows.sum(axis=(0, 1))
-        of = [k for k, each in enumerate(self._table.pairs) if each.source == pair.source]
+        of = [k for k, arc in enumerate(self._table.pairs) if arc.source == pair.source]
         return self._table.pairs[max(of, key=lambda k: total[k])] == pair
 
     def _column(self, arc: str, unit: str) -> str:
@@ -247,8 +249,8 @@ class _Writer:
         table, flows = self._table, self._processes.flows
         values = flows.copy()
         for process in self._processes.of(ProcessKind.TRANSIT):
-            own = [k for k, pair in enumerate(table.pairs) if pair.source == process]
-            values[:, :, own] = shares_of(flows[:, :, own])
+            outflows = [k for k, pair in enumerate(table.pairs) if pair.source == process]
+            values[:, :, outflows] = shares_of(flows[:, :, outflows])
         rows: list[list[object]] = [[*(["region"] if self._regional else []), "year", *self._arcs.values()]]
         for region, of_region in zip(table.regions, values.tolist(), strict=True):
             for year, row in zip(table.years, of_region, strict=True):

@@ -77,8 +77,8 @@ class FlowTable:
         for region in regions:
             if region not in self.regions:
                 raise CirlError(f"{self.name}: {unknown('region', region, self.regions)}")
-        kept = {key: value for key, value in self.flows.items() if key[0] in regions}
-        return replace(self, flows=kept)
+        selection = {key: value for key, value in self.flows.items() if key[0] in regions}
+        return replace(self, flows=selection)
 
 
 @dataclass(slots=True)
@@ -91,15 +91,15 @@ class _Grid:
     places: dict[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
-        plain = [each.strip().lower() for each in self.header]
+        plain = [title.strip().lower() for title in self.header]
         self.places = {}
         for key, names in NAMES.items():
-            found = [i for i, each in enumerate(plain) if each in names]
-            if len(found) > 1:
-                both = " and ".join(f"'{self.header[i]}'" for i in found[:2])
-                raise CirlError(f"{self.name}, line 1: {both} both mean {key}; rename one")
-            if found:
-                self.places[key] = found[0]
+            columns = [i for i, title in enumerate(plain) if title in names]
+            if len(columns) > 1:
+                titles = " and ".join(f"'{self.header[i]}'" for i in columns[:2])
+                raise CirlError(f"{self.name}, line 1: {titles} both mean {key}; rename one")
+            if columns:
+                self.places[key] = columns[0]
 
     def at(self, row: Sequence[str], key: str) -> str:
         """Return a cell; nothing if there is no such column."""
@@ -111,16 +111,16 @@ class _Grid:
         Raises:
             CirlError: naming file, line, column and text, if it is none or below ``least``.
         """
-        told = f"{self.name}, line {line}, column '{column}'"
+        label = f"{self.name}, line {line}, column '{column}'"
         try:
             value = float(text.replace("_", "?"))
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise CirlError(f"{told}: '{text}' is no number; write one as in 1234.5, or leave out the row")
+            raise CirlError(f"{label}: '{text}' is no number; write one as in 1234.5, or leave out the row")
         if value < least:
-            turned = "; a flow runs from source to target: swap them" if least == 0.0 else ""
-            raise CirlError(f"{told}: {text} is negative{turned}")
+            hint = "; a flow runs from source to target: swap them" if least == 0.0 else ""
+            raise CirlError(f"{label}: {text} is negative{hint}")
         return value
 
     def year(self, line: int, text: str) -> int:
@@ -154,22 +154,22 @@ def read_flows(path: Path, *, sheet: str | None = None, unit: str | None = None,
     units: dict[str, str] = {}
     for grid in grids:
         long = {"source", "target"} <= grid.places.keys()
-        for line, key, value, said, deviation in _long(grid, year) if long else _matrix(grid, year):
-            where = f"{grid.name}, line {line}"
+        for line, key, value, unit_of_row, deviation in _long(grid, year) if long else _matrix(grid, year):
+            place = f"{grid.name}, line {line}"
             if key in flows:
-                both = f"{key[2]} in {key[1]}{f' in {key[0]}' if key[0] else ''}"
-                raise CirlError(f"{where}: {both} stands in {lines[key]} too; leave one out, or give them types")
+                flow_text = f"{key[2]} in {key[1]}{f' in {key[0]}' if key[0] else ''}"
+                raise CirlError(f"{place}: {flow_text} stands in {lines[key]} too; leave one out, or give them types")
             if key[2].source == key[2].target:
-                raise CirlError(f"{where}: {key[2]}: a flow needs two processes")
+                raise CirlError(f"{place}: {key[2]}: a flow needs two processes")
             flows[key], lines[key] = value, f"line {line}"
-            units.setdefault(said, where)
+            units.setdefault(unit_of_row, place)
             if deviation is not None:
                 deviations[key] = deviation
     if not flows:
         raise CirlError(f"{path}: has no flows")
-    found = FlowTable(path.name, _unit(path, units, unit), flows, deviations)
-    _check_years(found)
-    return found
+    table = FlowTable(path.name, _unit(path, units, unit), flows, deviations)
+    _check_years(table)
+    return table
 
 
 def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
@@ -195,49 +195,49 @@ def read_stocks(path: Path, unit: str) -> dict[tuple[str, str, int], float]:
 _Entry = tuple[int, tuple[str, int, Connection], float, str, float | None]
 
 
-def _long(grid: _Grid, given: int | None) -> Iterator[_Entry]:
+def _long(grid: _Grid, default_year: int | None) -> Iterator[_Entry]:
     """Yield line, key, value, unit and deviation of each row of a long table."""
     unit = ""
     if "value" not in grid.places:
-        known = set(grid.places.values())
-        named = [i for i, each in enumerate(grid.header) if i not in known and "_per_" in each.lower()]
-        if len(named) != 1:
+        used_columns = set(grid.places.values())
+        unit_columns = [i for i, title in enumerate(grid.header) if i not in used_columns and "_per_" in title.lower()]
+        if len(unit_columns) != 1:
             raise CirlError(
                 f"{grid.name}, line 1: no column of values; call it 'value', or by its unit, as 'kt_per_year'"
             )
-        grid.places["value"] = named[0]
-        unit = grid.header[named[0]].strip().lower().replace("_per_", "/")
-    if given is None:
+        grid.places["value"] = unit_columns[0]
+        unit = grid.header[unit_columns[0]].strip().lower().replace("_per_", "/")
+    if default_year is None:
         _needs(grid, ("year",))
     for line, row in grid.rows:
         pair = Connection(grid.at(row, "source"), grid.at(row, "target"), grid.at(row, "type"))
         if not pair.source or not pair.target:
             raise CirlError(f"{grid.name}, line {line}: a flow needs a source and a target")
-        year = given if "year" not in grid.places else grid.year(line, grid.at(row, "year"))
+        year = default_year if "year" not in grid.places else grid.year(line, grid.at(row, "year"))
         assert year is not None
         value = grid.number(line, grid.at(row, "value"), grid.header[grid.places["value"]])
         deviation = None
-        if told := grid.at(row, "uncertainty"):
+        if uncertainty := grid.at(row, "uncertainty"):
             column = grid.header[grid.places["uncertainty"]]
-            relative = told.endswith("%")
-            deviation = grid.number(line, told.rstrip("% "), column) * (value / 100 if relative else 1.0)
+            relative = uncertainty.endswith("%")
+            deviation = grid.number(line, uncertainty.rstrip("% "), column) * (value / 100 if relative else 1.0)
         yield line, (grid.at(row, "region"), year, pair), value, unit or grid.at(row, "unit"), deviation
 
 
-def _matrix(grid: _Grid, given: int | None) -> Iterator[_Entry]:
+def _matrix(grid: _Grid, default_year: int | None) -> Iterator[_Entry]:
     """Yield line, key, value, no unit and no deviation of each cell of a matrix of processes."""
-    named = grid.name.rpartition(", sheet '")[2].rstrip("'")
-    year = int(named) if _is_year(named) else given
+    sheet_name = grid.name.rpartition(", sheet '")[2].rstrip("'")
+    year = int(sheet_name) if _is_year(sheet_name) else default_year
     if year is None:
         raise CirlError(
             f"{grid.name}: is a matrix of processes, as it has no columns 'source' and 'target'; of which year? Give "
             "--year, or name its sheet by it"
         )
-    targets = [each.strip() for each in grid.header[1:]]
+    targets = [title.strip() for title in grid.header[1:]]
     for target in targets:
         if not target or targets.count(target) > 1:
-            said = f"names '{target}' twice" if target else "has a column without a name"
-            raise CirlError(f"{grid.name}, line 1: {said}; each column is a process that receives")
+            problem = f"names '{target}' twice" if target else "has a column without a name"
+            raise CirlError(f"{grid.name}, line 1: {problem}; each column is a process that receives")
     for line, row in grid.rows:
         source = row[0].strip()
         for target, text in zip(targets, row[1:], strict=True):
@@ -250,21 +250,21 @@ def _matrix(grid: _Grid, given: int | None) -> Iterator[_Entry]:
 def _needs(grid: _Grid, keys: Sequence[str]) -> None:
     for key in keys:
         if key not in grid.places:
-            told = f"column '{key}'; it has {', '.join(filter(None, grid.header)) or 'none'}"
-            raise CirlError(f"{grid.name}, line 1: needs a {told}. Separate columns with commas.")
+            need = f"column '{key}'; it has {', '.join(filter(None, grid.header)) or 'none'}"
+            raise CirlError(f"{grid.name}, line 1: needs a {need}. Separate columns with commas.")
 
 
-def _unit(path: Path, units: Mapping[str, str], given: str | None) -> str:
+def _unit(path: Path, units: Mapping[str, str], default_unit: str | None) -> str:
     """Return the unit of all flows, mass/time."""
-    said = [unit for unit in units if unit]
-    if len(said) > 1:
-        first, other = said[:2]
-        raise CirlError(f"{units[other]}: unit '{other}', but '{first}' in {units[first]}; give all in one unit")
-    if said and "" in units:
-        raise CirlError(f"{units['']}: states no unit, as others do; write '{said[0]}' if that is it")
-    if not said and given is None:
+    stated_units = [unit for unit in units if unit]
+    if len(stated_units) > 1:
+        first, second = stated_units[:2]
+        raise CirlError(f"{units[second]}: unit '{second}', but '{first}' in {units[first]}; give all in one unit")
+    if stated_units and "" in units:
+        raise CirlError(f"{units['']}: states no unit, as others do; write '{stated_units[0]}' if that is it")
+    if not stated_units and default_unit is None:
         raise CirlError(f"{path}: states no unit; give one with --unit, such as kt/year")
-    unit = said[0] if said else str(given)
+    unit = stated_units[0] if stated_units else str(default_unit)
     try:
         factor(unit, "kg/year")
         return unit
@@ -274,23 +274,23 @@ def _unit(path: Path, units: Mapping[str, str], given: str | None) -> str:
         return f"{unit}/year"
 
 
-def _factor(where: str, unit: str, target: str) -> float:
+def _factor(place: str, unit: str, target: str) -> float:
     try:
         return factor(unit, target)
     except CirlError as error:
-        raise CirlError(f"{where}: {error}") from error
+        raise CirlError(f"{place}: {error}") from error
 
 
 def _check_years(table: FlowTable) -> None:
     """Refuse a region without any flow in a year between the first and the last."""
-    known = {(region, year) for region, year, _ in table.flows}
+    with_flows = {(region, year) for region, year, _ in table.flows}
     for region in table.regions:
-        missing = [year for year in table.years if (region, year) not in known]
-        if missing:
-            whose = f"region '{region}'" if region else "the table"
-            said = ", ".join(map(str, missing[:5])) + (", …" if len(missing) > 5 else "")
+        gaps = [year for year in table.years if (region, year) not in with_flows]
+        if gaps:
+            owner = f"region '{region}'" if region else "the table"
+            listing = ", ".join(map(str, gaps[:5])) + (", …" if len(gaps) > 5 else "")
             remedy = "a flow that is not in the table is 0, but a year without any is missing. Add it, or leave it out"
-            raise CirlError(f"{table.name}: {whose} has no flow in {said}: {remedy} everywhere")
+            raise CirlError(f"{table.name}: {owner} has no flow in {listing}: {remedy} everywhere")
 
 
 def _grids(path: Path, sheet: str | None) -> Iterator[_Grid]:
@@ -305,10 +305,10 @@ def _grids(path: Path, sheet: str | None) -> Iterator[_Grid]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True)
-            numbered = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+            lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CirlError(f"{path}: is no CSV file in UTF-8: {error}") from error
-    yield _grid(path.name, numbered)
+    yield _grid(path.name, lines)
 
 
 def _sheets(path: Path, sheet: str | None) -> Iterator[_Grid]:
@@ -322,19 +322,19 @@ def _sheets(path: Path, sheet: str | None) -> Iterator[_Grid]:
     try:
         if sheet is not None and sheet not in book.sheetnames:
             raise CirlError(f"{path}: {unknown('sheet', sheet, book.sheetnames)}")
-        years = [each for each in book.sheetnames if _is_year(each)]
+        years = [text for text in book.sheetnames if _is_year(text)]
         for name in [sheet] if sheet is not None else years or book.sheetnames[:1]:
             rows = enumerate(book[name].iter_rows(values_only=True), start=1)
             texts = [(line, ["" if cell is None else str(cell) for cell in row]) for line, row in rows]
-            yield _grid(f"{path.name}, sheet '{name}'", [row for row in texts if any(each.strip() for each in row[1])])
+            yield _grid(f"{path.name}, sheet '{name}'", [row for row in texts if any(text.strip() for text in row[1])])
     finally:
         book.close()
 
 
-def _grid(name: str, numbered: Sequence[tuple[int, list[str]]]) -> _Grid:
-    if not numbered:
+def _grid(name: str, lines: Sequence[tuple[int, list[str]]]) -> _Grid:
+    if not lines:
         raise CirlError(f"{name}: is empty; its first line names the columns")
-    (_, header), *rows = numbered
+    (_, header), *rows = lines
     for line, row in rows:
         if len(row) != len(header):
             raise CirlError(f"{name}, line {line}: {len(row)} cells in {len(header)} columns")

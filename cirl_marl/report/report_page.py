@@ -167,7 +167,7 @@ def add_plan(
     level = None if env.uncertain else levels_to_demand(comparison.entries[0].rollout.episode_levels[0])
     optimum = Optimum(min_service=level, service_weight=SERVICE_FIRST if level is None else None)
     controller = ProgressController(optimum, progress)
-    outcome = rollout(env, controller, seed=comparison.first_seed, progress=controller.acted)
+    outcome = rollout(env, controller, seed=comparison.first_seed, progress=controller.report_steps)
     episode = _episode(PLAN, comparison.network, comparison.agents, _first_start(comparison), outcome)
     service, circularity = float(outcome.least_service[0]), float(outcome.episode_circularity[0])
     point = PlanePoint(PLAN, service, circularity, "of the first episode")

@@ -29,7 +29,7 @@ __all__ = ["ConformanceError", "check_parallel_env", "check_vector_env"]
 
 AnyEnv: TypeAlias = ParallelEnv[Any, Any, Any]
 RETURNS = ("observations", "rewards", "terminations", "truncations", "infos")
-REMEMBERED = 4
+MEMORY_STEPS = 4
 """How many steps back observations are watched for later change."""
 
 
@@ -54,19 +54,19 @@ def check_parallel_env(make: Callable[[], AnyEnv], *, steps: int = 200, seed: in
         ConformanceError: at the first breach.
     """
     first, second = make(), make()
-    watched = _Watched(first)
-    recorded = [watched.reset(seed)]
-    _compare(recorded[0], _Watched(second).reset(seed), "two environments after reset with the same seed", 0)
+    checked_env = _CheckedEnv(first)
+    history = [checked_env.reset(seed)]
+    _compare(history[0], _CheckedEnv(second).reset(seed), "two environments after reset with the same seed", 0)
     actions = _Actions(first, seed)
-    taken = []
+    action_history = []
     for step in range(1, steps + 1):
         if not first.agents:
             break
-        taken.append(actions.sample(recorded[-1]))
-        recorded.append(watched.step(taken[-1], step))
-        twin = _called(second, taken[-1])
-        _compare(recorded[-1], twin, "two environments with the same seed and actions", step)
-    _check_restart(watched, seed, recorded, taken)
+        action_history.append(actions.sample(history[-1]))
+        history.append(checked_env.step(action_history[-1], step))
+        twin = _step_copy(second, action_history[-1])
+        _compare(history[-1], twin, "two environments with the same seed and actions", step)
+    _check_restart(checked_env, seed, history, action_history)
     first.close()
     second.close()
 
@@ -79,28 +79,28 @@ def check_vector_env(make: Callable[[], MultiAgentVectorEnv], *, steps: int = 20
     _compare((observations,), (second.reset(seed),), "two environments after reset with the same seed", 0)
     _check_batch(first, observations, 0)
     for step in range(1, steps + 1):
-        kept = copy.deepcopy(observations)
+        before = copy.deepcopy(observations)
         shapes = {agent: (first.num_envs, *space.shape) for agent, space in first.action_spaces.items()}
-        drawn = {agent: generator.uniform(-1, 1, shape) for agent, shape in shapes.items()}
-        given = copy.deepcopy(drawn)
-        result = first.step(given)
-        same_or_raise(drawn, given, f"step {step}: the actions were changed")
-        same_or_raise(kept, observations, f"step {step}: observations returned at step {step - 1} changed")
-        _compare(result, second.step(drawn), "two environments with the same seed and actions", step)
+        sample = {agent: generator.uniform(-1, 1, shape) for agent, shape in shapes.items()}
+        actions = copy.deepcopy(sample)
+        result = first.step(actions)
+        same_or_raise(sample, actions, f"step {step}: the actions were changed")
+        same_or_raise(before, observations, f"step {step}: observations returned at step {step - 1} changed")
+        _compare(result, second.step(sample), "two environments with the same seed and actions", step)
         observations, rewards, terminations, truncations, infos = result
         _check_batch(first, observations, step)
         check_memory(observations, f"step {step}")
         for agent in first.agents:
-            where = f"agent {agent!r}, step {step}"
-            require(rewards[agent].shape == (first.num_envs,), f"{where}: rewards of shape {rewards[agent].shape}")
-            require(bool(np.isfinite(rewards[agent]).all()), f"{where}: reward {rewards[agent]} is not finite")
+            label = f"agent {agent!r}, step {step}"
+            require(rewards[agent].shape == (first.num_envs,), f"{label}: rewards of shape {rewards[agent].shape}")
+            require(bool(np.isfinite(rewards[agent]).all()), f"{label}: reward {rewards[agent]} is not finite")
             for name, ends in (("terminations", terminations[agent]), ("truncations", truncations[agent])):
-                require(ends.dtype == np.bool_, f"{where}: {name} have dtype {ends.dtype}, not bool")
-            ended = terminations[agent] | truncations[agent]
-            if ended.any():
+                require(ends.dtype == np.bool_, f"{label}: {name} have dtype {ends.dtype}, not bool")
+            done = terminations[agent] | truncations[agent]
+            if done.any():
                 final = infos[agent].get("final_obs")
-                require(final is not None, f"{where}: an episode ended without 'final_obs' in infos")
-                _check_rows(first, agent, final, f"{where}, final_obs")
+                require(final is not None, f"{label}: an episode ended without 'final_obs' in infos")
+                _check_rows(first, agent, final, f"{label}, final_obs")
 
 
 class _Actions:
@@ -111,26 +111,28 @@ class _Actions:
         for i, space in enumerate(self._spaces.values()):
             space.seed(seed + i)
 
-    def sample(self, returned: tuple[Any, ...]) -> dict[Any, Any]:
+    def sample(self, outcome: tuple[Any, ...]) -> dict[Any, Any]:
         """Draw one action for each agent that has an observation and is not done."""
-        observations, infos = returned[0], returned[-1]
-        ended = returned[2:4] if len(returned) == len(RETURNS) else ()
-        drawn = {}
-        for agent, seen in observations.items():
-            if any(flags[agent] for flags in ended):
+        observations, infos = outcome[0], outcome[-1]
+        flag_dicts = outcome[2:4] if len(outcome) == len(RETURNS) else ()
+        actions = {}
+        for agent, observation in observations.items():
+            if any(flags[agent] for flags in flag_dicts):
                 continue
-            mask = seen.get("action_mask") if isinstance(seen, Mapping) else infos[agent].get("action_mask")
-            drawn[agent] = self._spaces[agent].sample(mask)
-        return drawn
+            mask = (
+                observation.get("action_mask") if isinstance(observation, Mapping) else infos[agent].get("action_mask")
+            )
+            actions[agent] = self._spaces[agent].sample(mask)
+        return actions
 
 
-class _Watched:
+class _CheckedEnv:
     """An environment whose every return is checked."""
 
     def __init__(self, env: AnyEnv) -> None:
         self.env = env
         self._spaces: dict[Any, tuple[spaces.Space[Any], spaces.Space[Any]]] = {}
-        self._returned: list[tuple[int, Any, Any]] = []
+        self._recent: list[tuple[int, Any, Any]] = []
 
     def reset(self, seed: int | None = None) -> tuple[Any, Any]:
         env = self.env
@@ -145,30 +147,30 @@ class _Watched:
     def step(self, actions: Mapping[Any, Any], step: int) -> tuple[Any, ...]:
         env = self.env
         before = list(env.agents)
-        given = copy.deepcopy(dict(actions))
-        returned = env.step(given)
-        same_or_raise(dict(actions), given, f"step {step}: the actions were changed")
-        require(len(returned) == len(RETURNS), f"step {step}: returned {len(returned)} things, not {RETURNS}")
-        self._check_keys(dict(zip(RETURNS, returned, strict=True)), before, step)
-        observations, rewards, terminations, truncations, _ = returned
-        joined = [agent for agent in env.agents if agent not in before]
-        require(not joined, f"step {step}: agents {joined} joined in mid-episode")
+        handed_over = copy.deepcopy(dict(actions))
+        outcome = env.step(handed_over)
+        same_or_raise(dict(actions), handed_over, f"step {step}: the actions were changed")
+        require(len(outcome) == len(RETURNS), f"step {step}: returned {len(outcome)} things, not {RETURNS}")
+        self._check_keys(dict(zip(RETURNS, outcome, strict=True)), before, step)
+        observations, rewards, terminations, truncations, _ = outcome
+        newcomers = [agent for agent in env.agents if agent not in before]
+        require(not newcomers, f"step {step}: agents {newcomers} joined in mid-episode")
         for agent in before:
-            where = f"agent {agent!r}, step {step}"
-            _check_reward(rewards[agent], where)
+            label = f"agent {agent!r}, step {step}"
+            _check_reward(rewards[agent], label)
             for name, flag in (("termination", terminations[agent]), ("truncation", truncations[agent])):
-                require(isinstance(flag, bool | np.bool_), f"{where}: {name} {flag!r} is not a bool")
+                require(isinstance(flag, bool | np.bool_), f"{label}: {name} {flag!r} is not a bool")
             done = bool(terminations[agent] or truncations[agent])
-            require(done != (agent in env.agents), f"{where}: done is {done}, but env.agents is {env.agents}")
+            require(done != (agent in env.agents), f"{label}: done is {done}, but env.agents is {env.agents}")
         self._check_spaces(step)
         self._check_observations(observations, step)
-        return copy.deepcopy(returned)
+        return copy.deepcopy(outcome)
 
-    def _check_keys(self, returned: Mapping[str, Any], agents: list[Any], step: int) -> None:
-        for name, by_agent in returned.items():
+    def _check_keys(self, parts: Mapping[str, Any], agents: list[Any], step: int) -> None:
+        for name, by_agent in parts.items():
             require(isinstance(by_agent, dict), f"step {step}: {name} are a {type(by_agent).__name__}, not a dict")
-            same = set(by_agent) == set(agents)
-            require(same, f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}")
+            matches = set(by_agent) == set(agents)
+            require(matches, f"step {step}: {name} have keys {list(by_agent)}, agents are {agents}")
 
     def _check_spaces(self, step: int) -> None:
         env = self.env
@@ -178,56 +180,58 @@ class _Watched:
             for name, old, new in zip(("observation_space", "action_space"), before, now, strict=True):
                 require(old is new, f"agent {agent!r}, step {step}: {name} returned another object than before")
         if step == 0:
-            for (one, mine), (other, theirs) in combinations(self._spaces.items(), 2):
-                for name, a, b in zip(("observation", "action"), mine, theirs, strict=True):
-                    require(a is not b, f"agents {one!r} and {other!r} share one {name} space object")
+            for (agent_a, spaces_a), (agent_b, spaces_b) in combinations(self._spaces.items(), 2):
+                for name, a, b in zip(("observation", "action"), spaces_a, spaces_b, strict=True):
+                    require(a is not b, f"agents {agent_a!r} and {agent_b!r} share one {name} space object")
 
     def _check_observations(self, observations: Mapping[Any, Any], step: int) -> None:
-        for agent, seen in observations.items():
-            check_member(self._spaces[agent][0], seen, f"agent {agent!r}, step {step}: observation")
+        for agent, observation in observations.items():
+            check_member(self._spaces[agent][0], observation, f"agent {agent!r}, step {step}: observation")
         check_memory(observations, f"step {step}")
-        for earlier, original, kept in self._returned:
-            same_or_raise(kept, original, f"step {step}: observations returned at step {earlier} changed")
-        self._returned = [*self._returned[-REMEMBERED:], (step, observations, copy.deepcopy(observations))]
+        for earlier, original, snapshot in self._recent:
+            same_or_raise(snapshot, original, f"step {step}: observations returned at step {earlier} changed")
+        self._recent = [*self._recent[-MEMORY_STEPS:], (step, observations, copy.deepcopy(observations))]
 
 
-def _called(env: AnyEnv, actions: Mapping[Any, Any]) -> tuple[Any, ...]:
+def _step_copy(env: AnyEnv, actions: Mapping[Any, Any]) -> tuple[Any, ...]:
     return copy.deepcopy(env.step(copy.deepcopy(dict(actions))))
 
 
-def _check_restart(watched: _Watched, seed: int, recorded: list[tuple[Any, ...]], taken: list[dict[Any, Any]]) -> None:
+def _check_restart(
+    checked_env: _CheckedEnv, seed: int, history: list[tuple[Any, ...]], action_history: list[dict[Any, Any]]
+) -> None:
     """Reset in mid-episode, then repeat what was recorded."""
-    watched.reset(seed + 1)
-    actions = _Actions(watched.env, seed + 1)
-    returned: tuple[Any, ...] = watched.reset(None)
+    checked_env.reset(seed + 1)
+    actions = _Actions(checked_env.env, seed + 1)
+    outcome: tuple[Any, ...] = checked_env.reset(None)
     for step in (1, 2):
-        if watched.env.agents:
-            returned = watched.step(actions.sample(returned), step)
-    _compare(recorded[0], watched.reset(seed), "one environment reset twice with the same seed", 0)
-    for step, drawn in enumerate(taken, start=1):
-        again = watched.step(drawn, step)
-        _compare(recorded[step], again, "one environment run twice with the same seed and actions", step)
+        if checked_env.env.agents:
+            outcome = checked_env.step(actions.sample(outcome), step)
+    _compare(history[0], checked_env.reset(seed), "one environment reset twice with the same seed", 0)
+    for step, actions_then in enumerate(action_history, start=1):
+        again = checked_env.step(actions_then, step)
+        _compare(history[step], again, "one environment run twice with the same seed and actions", step)
 
 
 def _check_batch(env: MultiAgentVectorEnv, observations: Mapping[str, Any], step: int) -> None:
     require(list(observations) == list(env.agents), f"step {step}: observations have keys {list(observations)}")
-    for agent, seen in observations.items():
-        _check_rows(env, agent, seen, f"agent {agent!r}, step {step}: observation")
+    for agent, observation in observations.items():
+        _check_rows(env, agent, observation, f"agent {agent!r}, step {step}: observation")
 
 
-def _check_rows(env: MultiAgentVectorEnv, agent: str, seen: Any, where: str) -> None:
-    require(len(seen) == env.num_envs, f"{where}: {len(seen)} rows for {env.num_envs} copies")
-    for i, row in enumerate(seen):
-        check_member(env.observation_spaces[agent], row, f"{where} of copy {i}")
+def _check_rows(env: MultiAgentVectorEnv, agent: str, rows: Any, label: str) -> None:
+    require(len(rows) == env.num_envs, f"{label}: {len(rows)} rows for {env.num_envs} copies")
+    for i, row in enumerate(rows):
+        check_member(env.observation_spaces[agent], row, f"{label} of copy {i}")
 
 
-def _check_reward(reward: Any, where: str) -> None:
+def _check_reward(reward: Any, label: str) -> None:
     number = isinstance(reward, int | float | np.number) or (isinstance(reward, np.ndarray) and reward.shape == ())
-    require(number and not isinstance(reward, bool), f"{where}: reward {reward!r} is not a number")
-    require(bool(np.isfinite(reward)), f"{where}: reward {reward!r} is not finite")
+    require(number and not isinstance(reward, bool), f"{label}: reward {reward!r} is not a number")
+    require(bool(np.isfinite(reward)), f"{label}: reward {reward!r} is not finite")
 
 
-def _compare(one: tuple[Any, ...], other: tuple[Any, ...], what: str, step: int) -> None:
-    names = RETURNS if len(one) == len(RETURNS) else ("observations", "infos")
-    for name, a, b in zip(names, one, other, strict=False):
-        same_or_raise(a, b, f"step {step}: {what} differ in {name}")
+def _compare(first: tuple[Any, ...], second: tuple[Any, ...], subject: str, step: int) -> None:
+    names = RETURNS if len(first) == len(RETURNS) else ("observations", "infos")
+    for name, a, b in zip(names, first, second, strict=False):
+        same_or_raise(a, b, f"step {step}: {subject} differ in {name}")

@@ -14,41 +14,41 @@ class ConformanceError(AssertionError):
     """An environment breaks the contract; the message names agent, step and value."""
 
 
-def check_member(space: spaces.Space[Any], value: Any, where: str) -> None:
+def check_member(space: spaces.Space[Any], value: Any, label: str) -> None:
     """Require that ``value`` lies in ``space``, with exactly its dtype and shape, part by part."""
     if isinstance(space, spaces.Dict):
-        require(isinstance(value, Mapping), f"{where}: {value!r} is not a mapping")
-        require(set(value) == set(space.spaces), f"{where}: keys {list(value)}, expected {list(space.spaces)}")
+        require(isinstance(value, Mapping), f"{label}: {value!r} is not a mapping")
+        require(set(value) == set(space.spaces), f"{label}: keys {list(value)}, expected {list(space.spaces)}")
         for key, part in space.spaces.items():
-            check_member(part, value[key], f"{where}[{key!r}]")
+            check_member(part, value[key], f"{label}[{key!r}]")
         return
     if isinstance(space, spaces.Tuple):
         fits = isinstance(value, tuple) and len(value) == len(space.spaces)
-        require(fits, f"{where}: {value!r} does not fit {space}")
+        require(fits, f"{label}: {value!r} does not fit {space}")
         for i, part in enumerate(space.spaces):
-            check_member(part, value[i], f"{where}[{i}]")
+            check_member(part, value[i], f"{label}[{i}]")
         return
     if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
-        require(isinstance(value, np.ndarray), f"{where}: a {type(value).__name__}, not an array")
-        require(value.shape == space.shape, f"{where}: shape {value.shape}, expected {space.shape}")
-        require(value.dtype == space.dtype, f"{where}: dtype {value.dtype}, expected {space.dtype}")
+        require(isinstance(value, np.ndarray), f"{label}: a {type(value).__name__}, not an array")
+        require(value.shape == space.shape, f"{label}: shape {value.shape}, expected {space.shape}")
+        require(value.dtype == space.dtype, f"{label}: dtype {value.dtype}, expected {space.dtype}")
     if isinstance(space, spaces.Box):
         wrong = ~((value >= space.low) & (value <= space.high))
         if wrong.any():
             entry = tuple(int(i) for i in np.argwhere(wrong)[0])
             bounds = f"[{space.low[entry]}, {space.high[entry]}]"
-            raise ConformanceError(f"{where}: entry {entry} is {value[entry]}, outside {bounds}")
+            raise ConformanceError(f"{label}: entry {entry} is {value[entry]}, outside {bounds}")
     if not space.contains(value):
-        raise ConformanceError(f"{where}: {value!r} is not in {space}")
+        raise ConformanceError(f"{label}: {value!r} is not in {space}")
 
 
-def check_memory(observations: Mapping[Any, Any], where: str) -> None:
+def check_memory(observations: Mapping[Any, Any], label: str) -> None:
     """Require that no two agents see the same memory."""
-    arrays = [(agent, leaf) for agent, seen in observations.items() for leaf in _leaves(seen)]
-    for (one, mine), (other, theirs) in combinations(arrays, 2):
-        if one != other and np.may_share_memory(mine, theirs):
-            apart = not np.shares_memory(mine, theirs)
-            require(apart, f"{where}: agents {one!r} and {other!r} share an observation's memory")
+    arrays = [(agent, leaf) for agent, observation in observations.items() for leaf in _leaves(observation)]
+    for (agent_a, array_a), (agent_b, array_b) in combinations(arrays, 2):
+        if agent_a != agent_b and np.may_share_memory(array_a, array_b):
+            apart = not np.shares_memory(array_a, array_b)
+            require(apart, f"{label}: agents {agent_a!r} and {agent_b!r} share an observation's memory")
 
 
 def _leaves(value: Any) -> Iterator[np.ndarray[Any, Any]]:
@@ -59,27 +59,27 @@ def _leaves(value: Any) -> Iterator[np.ndarray[Any, Any]]:
             yield from _leaves(part)
 
 
-def same_or_raise(one: Any, other: Any, message: str) -> None:
+def same_or_raise(first: Any, second: Any, message: str) -> None:
     """Require that two nested values are equal bit for bit."""
-    for path, a, b in _differences(one, other, ""):
+    for path, a, b in _differences(first, second, ""):
         raise ConformanceError(f"{message}: at {path or 'the value itself'}, {a!r} and {b!r}")
 
 
-def _differences(one: Any, other: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
+def _differences(first: Any, second: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
     """Yield where two nested values differ, arrays and numbers compared bit for bit."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping) and set(one) == set(other):
-        for key in one:
-            yield from _differences(one[key], other[key], f"{path}[{key!r}]")
-    elif isinstance(one, list | tuple) and type(one) is type(other) and len(one) == len(other):
-        for i, (a, b) in enumerate(zip(one, other, strict=True)):
+    if isinstance(first, Mapping) and isinstance(second, Mapping) and set(first) == set(second):
+        for key in first:
+            yield from _differences(first[key], second[key], f"{path}[{key!r}]")
+    elif isinstance(first, list | tuple) and type(first) is type(second) and len(first) == len(second):
+        for i, (a, b) in enumerate(zip(first, second, strict=True)):
             yield from _differences(a, b, f"{path}[{i}]")
-    elif isinstance(one, np.ndarray | np.generic | float) and type(one) is type(other):
-        a, b = np.asarray(one), np.asarray(other)
-        same = a.dtype == b.dtype and a.shape == b.shape
-        if not same or (a.tobytes() != b.tobytes() if not a.dtype.hasobject else not np.array_equal(a, b)):
-            yield path, one, other
-    elif type(one) is not type(other) or (_comparable(one) and not bool(one == other)):
-        yield path, one, other
+    elif isinstance(first, np.ndarray | np.generic | float) and type(first) is type(second):
+        a, b = np.asarray(first), np.asarray(second)
+        alike = a.dtype == b.dtype and a.shape == b.shape
+        if not alike or (a.tobytes() != b.tobytes() if not a.dtype.hasobject else not np.array_equal(a, b)):
+            yield path, first, second
+    elif type(first) is not type(second) or (_comparable(first) and not bool(first == second)):
+        yield path, first, second
 
 
 def _comparable(value: Any) -> bool:
