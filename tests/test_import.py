@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -165,6 +166,14 @@ def test_a_workbook_is_the_same(tmp_path: Path) -> None:
     assert read_flows(tmp_path / "matrix.xlsx", unit="kt").unit == "kt/year"
     one = read_flows(tmp_path / "matrix.xlsx", sheet="2001", unit="kt/year")
     assert one.years == (2001,)
+
+
+def test_a_workbook_needs_openpyxl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few import workbooks, so that what reads them is an extra; the message says which."""
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    (tmp_path / "flows.xlsx").touch()
+    with pytest.raises(CirlError, match=r"pip install 'cirl-marl\[excel\]', or save it as CSV"):
+        read_flows(tmp_path / "flows.xlsx")
 
 
 def test_columns_may_be_named_by_their_unit(tmp_path: Path) -> None:
