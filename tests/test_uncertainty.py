@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import re
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -40,7 +42,7 @@ from cirl_marl.definitions.reader import write_network
 from cirl_marl.dynamics.laws import FlowLaws
 from cirl_marl.environments.state import Outcome
 from cirl_marl.evaluation import compare
-from cirl_marl.evaluation.sampling import sample_episodes, sensitivities
+from cirl_marl.evaluation.sampling import rbd_fast, sample_episodes, sensitivities
 from cirl_marl.learners import train
 from cirl_marl.network.uncertainty import DISTRIBUTIONS, Spread, draw_network
 from cirl_marl.optimum import bound
@@ -463,3 +465,10 @@ def test_the_command_writes_bands_and_causes(tmp_path: Path) -> None:
     assert not (tmp_path / "other").exists()
     with pytest.raises(CirlError, match="too few to tell"):
         sensitivities(sample_episodes(load_network(EXAMPLE).with_options(episode={"horizon": 2}), samples=3))
+
+
+def test_a_missing_library_is_named_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares of the spread need an extra."""
+    monkeypatch.setitem(sys.modules, "SALib.analyze.rbd_fast", None)
+    with pytest.raises(CirlError, match=re.escape('pip install "cirl-marl[sensitivity]"')):
+        rbd_fast()

@@ -108,7 +108,7 @@ def _sample(
     import numpy as np
 
     from cirl_marl.definitions.catalogue import load_network
-    from cirl_marl.evaluation.sampling import FEWEST, sample_episodes, sensitivities
+    from cirl_marl.evaluation.sampling import FEWEST, rbd_fast, sample_episodes, sensitivities
     from cirl_marl.report.samples import sensitivity_table, write_samples
 
     if len(scenarios) > 1 or len(controls) > 1:
@@ -116,6 +116,8 @@ def _sample(
     folder, network = folder_for(out or Path(), "--out"), load_network(name, scenario=scenarios[0])
     if steps is not None:
         network = network.with_options(episode={"horizon": steps})
+    if samples >= FEWEST:
+        rbd_fast()  # or an error, before anything is simulated
     with bar("sampling") as progress:
         found = sample_episodes(network, samples=samples, control=controls[0], seed=seed, progress=progress)
     causes = sensitivities(found) if samples >= FEWEST else []

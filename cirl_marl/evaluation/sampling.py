@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
 from typing import Annotated
 
 import numpy as np
@@ -85,6 +87,15 @@ def sample_episodes(
     return SampledEpisodes(network, tuple(network.uncertain), factors, run.circularity_mean, run.levels, stock, flow)
 
 
+def rbd_fast() -> ModuleType:
+    """Return ``SALib.analyze.rbd_fast``; a ``CirlError`` says what to install."""
+    try:
+        return import_module("SALib.analyze.rbd_fast")
+    except ImportError as missing:
+        advice = 'python -m pip install "cirl-marl[sensitivity]"'
+        raise CirlError(f"which uncertain number matters is told by SALib: {advice}") from missing
+
+
 def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
     """Return what causes the spread of λ̄, and of the mean level of each service.
 
@@ -92,10 +103,9 @@ def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
     correction of Tissot and Prieur (2012), as SALib has them. They sum to less than 1 where numbers act together.
 
     Raises:
-        CirlError: for fewer than 70 samples, from which nothing can be told.
+        CirlError: for fewer than 70 samples, from which nothing can be told, or if SALib is missing.
     """
-    from SALib.analyze import rbd_fast
-
+    analysis = rbd_fast()
     count = len(found.circularity)
     if count < FEWEST:
         raise CirlError(f"{count} samples are too few to tell which number matters; take {FEWEST} or more")
@@ -110,6 +120,6 @@ def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
             nothing = np.full(len(found.names), np.nan)
             told.append(Sensitivity(name, nothing, nothing))
             continue
-        solved = rbd_fast.analyze(problem, found.factors, values, num_resamples=RESAMPLES, seed=0)
+        solved = analysis.analyze(problem, found.factors, values, num_resamples=RESAMPLES, seed=0)
         told.append(Sensitivity(name, np.array(solved["S1"]), np.array(solved["S1_conf"])))
     return told
