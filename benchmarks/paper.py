@@ -23,8 +23,8 @@ from cirl_marl.errors import CirlError
 from cirl_marl.jobs import Standing, run_jobs
 from cirl_marl.paper.published import BOX_ALGORITHMS, GOAL_ALGORITHMS
 from cirl_marl.paper.results import PaperRow, Results
-from cirl_marl.paper.running import RowJob, outdated
-from cirl_marl.paper.selection import minutes, overview, planned
+from cirl_marl.paper.running import RowJob, reason_to_repeat
+from cirl_marl.paper.selection import minutes, overview, select_rows
 from cirl_marl.paper.table import result_line
 
 console = Console(width=None if sys.stdout.isatty() else 140)
@@ -64,7 +64,9 @@ def main(
         if only:
             choices = [_names(name) for name in only]
             found = (
-                row for names in choices for row in planned(*names, steps=steps, seeds=seeds or 1, settings=settings)
+                row
+                for names in choices
+                for row in select_rows(*names, steps=steps, seeds=seeds or 1, settings=settings)
             )
             rows = list(dict.fromkeys(found))
         else:
@@ -91,7 +93,7 @@ def study_rows(*, steps: int | None = None, seeds: int | None = None, settings: 
 
     A seed comes to its end on every environment before the next begins, so that the tables fill evenly.
     """
-    rows = planned(None, None, steps=steps, seeds=seeds or 3, settings=settings)
+    rows = select_rows(None, None, steps=steps, seeds=seeds or 3, settings=settings)
     groups = (*FAST, *(name for name in BOX_ALGORITHMS if name not in FAST), *GOAL_ALGORITHMS)
 
     def order(row: PaperRow) -> tuple[int, int, int]:
@@ -111,7 +113,7 @@ def run(results: Results, rows: Sequence[PaperRow], workers: int, episodes: int 
     """
     left = []
     for row in rows:
-        again = outdated(results.read(row), episodes) if results.has(row) else ""
+        again = reason_to_repeat(results.read(row), episodes) if results.has(row) else ""
         if again:
             say(f"{row}: once more, as {again}")
         if again or not results.has(row):

@@ -27,11 +27,11 @@ from cirl_marl.learners import Recipe, Training, load_recipe, train
 from cirl_marl.learners.algorithms import build
 from cirl_marl.paper import published, running, training
 from cirl_marl.paper.published import ALGORITHMS, ENVIRONMENTS, PaperEnvironment, Published
-from cirl_marl.paper.results import Evaluation, PaperRow, Result, Results, thinned
-from cirl_marl.paper.running import evaluate, outdated, run_row
-from cirl_marl.paper.selection import planned
+from cirl_marl.paper.results import Evaluation, PaperRow, Result, Results, thin_out
+from cirl_marl.paper.running import evaluate, reason_to_repeat, run_row
+from cirl_marl.paper.selection import select_rows
 from cirl_marl.paper.table import above_optimum, table_rows
-from cirl_marl.paper.training import PaperTraining, described, train_tuned
+from cirl_marl.paper.training import PaperTraining, describe, train_tuned
 
 COPPER = ENVIRONMENTS["CopperNet"]
 KEPT = Path(__file__).parent.parent / "benchmarks" / "results" / "paper"
@@ -182,7 +182,7 @@ def test_weights_that_become_nan_are_a_result(
     assert 100 < found.steps_done < 10_000
     assert found.episodes == found.steps_done // 50
     assert found.gain_per_step == found.gain / found.steps_done
-    assert not outdated(found)
+    assert not reason_to_repeat(found)
     line = next(line for line in markdown([found]).splitlines() if f"| {algorithm} | ours | 0 |" in line)
     assert f"seed 0: weights NaN after {found.steps_done:,} of 10,000 steps" in line
     assert "nan" not in line
@@ -223,8 +223,8 @@ def test_recipes_of_other_versions_are_outdated() -> None:
         result("PPO"), row=PaperRow(environment="CopperNet", algorithm="PPO", settings="tuned", steps=200_000)
     )
     recorded = load_recipe("paper_copper_net").model_dump(mode="json")
-    assert outdated(replace(found, settings={"recipe": recorded})) == ""
-    assert "another now" in outdated(replace(found, settings={"recipe": recorded | {"gone": 1}}))
+    assert reason_to_repeat(replace(found, settings={"recipe": recorded})) == ""
+    assert "another now" in reason_to_repeat(replace(found, settings={"recipe": recorded | {"gone": 1}}))
 
 
 def test_other_failures_of_a_training_are_no_result() -> None:
@@ -277,7 +277,7 @@ def test_gain_and_gain_per_step() -> None:
 def test_curves_are_thinned_to_means() -> None:
     """At most 500 points; their mean, weighted by length, is that of the episodes."""
     ends, returns = list(range(50, 50 * 1234, 50)), list(np.random.default_rng(0).normal(size=1233))
-    curve = thinned(ends, returns)
+    curve = thin_out(ends, returns)
     assert len(curve) == 500
     assert curve[-1][0] == ends[-1]
     assert curve[0][0] == 150
@@ -434,37 +434,41 @@ def test_study_runs_fast_learners_first() -> None:
 
 def test_names_choose_rows() -> None:
     """No environment means all, no algorithm means all that the paper ran there."""
-    assert len(planned(None, None)) == 39
-    assert [row.algorithm for row in planned("FetchWasteSorting", None)] == list(ENVIRONMENTS["FetchWasteSorting"].runs)
-    assert [row.seed for row in planned("CopperNet", "ARS", seeds=3)] == [0, 1, 2]
-    assert len(planned(None, "SAC")) == 7
-    assert [row.environment for row in planned(None, "SAC", settings="tuned")] == ["Reacher"]
-    assert [row.algorithm for row in planned("FetchWasteSorting", "TQC-HER", settings=None)] == ["TQC-HER"] * 2
+    assert len(select_rows(None, None)) == 39
+    assert [row.algorithm for row in select_rows("FetchWasteSorting", None)] == list(
+        ENVIRONMENTS["FetchWasteSorting"].runs
+    )
+    assert [row.seed for row in select_rows("CopperNet", "ARS", seeds=3)] == [0, 1, 2]
+    assert len(select_rows(None, "SAC")) == 7
+    assert [row.environment for row in select_rows(None, "SAC", settings="tuned")] == ["Reacher"]
+    assert [row.algorithm for row in select_rows("FetchWasteSorting", "TQC-HER", settings=None)] == ["TQC-HER"] * 2
     with pytest.raises(CirlError, match=r"unknown algorithm of the paper 'PP0'\. Did you mean 'PPO'"):
-        planned(None, "PP0", settings="tuned")
+        select_rows(None, "PP0", settings="tuned")
     with pytest.raises(CirlError, match=r"unknown algorithm of the paper 'ppo'\. Did you mean 'PPO'"):
-        planned("CopperNet", "ppo")
+        select_rows("CopperNet", "ppo")
     with pytest.raises(CirlError, match="A2C is an algorithm, which comes after an environment: Reacher, Tran"):
-        planned("A2C", None)
+        select_rows("A2C", None)
     with pytest.raises(CirlError, match=r"no tuned recipe .* for A2C"):
-        planned(None, "A2C", settings="tuned")
+        select_rows(None, "A2C", settings="tuned")
 
 
 def test_results_that_answer_another_question_are_outdated() -> None:
     """Other evaluation episodes, definitions or recipes are named; what is not on record is not held against it."""
     kept = result()
     assert kept.evaluation is not None
-    assert outdated(kept) == ""
-    assert "played 50 episodes, not 100" in outdated(replace(kept, evaluation=replace(kept.evaluation, episodes=50)))
-    assert "played 100 episodes, not 7" in outdated(kept, episodes=7)
-    now = described(COPPER)
-    assert outdated(replace(kept, settings=now)) == ""
-    assert "definition" in outdated(replace(kept, settings=now | {"definition_sha256": "0" * 64}))
+    assert reason_to_repeat(kept) == ""
+    assert "played 50 episodes, not 100" in reason_to_repeat(
+        replace(kept, evaluation=replace(kept.evaluation, episodes=50))
+    )
+    assert "played 100 episodes, not 7" in reason_to_repeat(kept, episodes=7)
+    now = describe(COPPER)
+    assert reason_to_repeat(replace(kept, settings=now)) == ""
+    assert "definition" in reason_to_repeat(replace(kept, settings=now | {"definition_sha256": "0" * 64}))
     row = PaperRow(environment="CopperNet", algorithm="PPO", settings="tuned", steps=200_000)
     plain = load_recipe("paper_copper_net").model_dump(mode="json")
-    assert outdated(replace(kept, row=row, settings=now | {"recipe": plain})) == ""
+    assert reason_to_repeat(replace(kept, row=row, settings=now | {"recipe": plain})) == ""
     longer = plain | {"run": {"steps": 1, "envs": 1}}
-    assert "the recipe 'paper_copper_net' is another now" in outdated(
+    assert "the recipe 'paper_copper_net' is another now" in reason_to_repeat(
         replace(kept, row=row, settings=now | {"recipe": longer})
     )
 
@@ -475,7 +479,7 @@ def test_every_kept_row_is_of_the_definitions_of_today() -> None:
     kept = Results(KEPT).all()
     assert len(kept) > 80
     assert sum("definition_sha256" not in result.settings for result in kept) == 16
-    assert [(str(result.row), why) for result in kept if (why := outdated(result))] == []
+    assert [(str(result.row), why) for result in kept if (why := reason_to_repeat(result))] == []
     text = markdown(kept, (KEPT / "comment.md").read_text(encoding="utf-8"))
     assert text == (Path(__file__).parent.parent / "docs" / "paper_tables.md").read_text(encoding="utf-8")
 

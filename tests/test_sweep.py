@@ -27,7 +27,7 @@ from cirl_marl.evaluation.statistics import over_episodes
 from cirl_marl.jobs import Standing
 from cirl_marl.learners import train
 from cirl_marl.network import Network
-from cirl_marl.sweeps import Cell, CellStanding, load_sweep, sweep
+from cirl_marl.sweeps import Cell, CellStatus, load_sweep, sweep
 from cirl_marl.sweeps.cells import cells_of
 
 RECIPE = """
@@ -170,7 +170,7 @@ def test_a_cell_is_a_training_and_its_evaluation(asked: Path) -> None:
     """With the bits of ``train`` and the figures of ``compare``; who watches sees steps and the gap to the bound."""
     changed(changed(asked, "seeds = [0, 1]", "seeds = 1"), "[0.2, 0.8]", "0.2")
     changed(asked, "bounds = false", "bounds = true")
-    seen: list[CellStanding] = []
+    seen: list[CellStatus] = []
     found = sweep(asked, on="here", watch=lambda standings: seen.extend(standings))
     (row,) = found.rows
     run = found.folder / "cells" / row["cell"] / "run"
@@ -342,9 +342,9 @@ def test_the_example_is_the_one_of_the_guide() -> None:
     assert (asked.networks, asked.seeds, asked.options.circularity_weight) == (["copper_net"], [0, 1], [0.5, 0.9])
 
 
-def standing(cell: Cell, name: str, state: Any, figures: dict[str, Any], gap: float | None) -> CellStanding:
+def standing(cell: Cell, name: str, state: Any, figures: dict[str, Any], gap: float | None) -> CellStatus:
     """Return how far a cell is."""
-    return CellStanding(cell, Standing(name, state, figures), gap)
+    return CellStatus(cell, Standing(name, state, figures), gap)
 
 
 def outcome(folder: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from cirl_marl.errors import CirlError
 if TYPE_CHECKING:
     from cirl_marl.network import Network
 
-NETWORKS, EPISODES, LEARNING, COMPARING = "Networks", "Episodes and plans", "Learners", "Comparisons"
+NETWORKS, EPISODES, LEARNERS, COMPARISONS = "Networks", "Episodes and plans", "Learners", "Comparisons"
 """Groups of commands in ``cirl --help``."""
 EXAMPLES = """
 For example: cirl new my.toml · cirl plan my.toml --control optimum --min-service 1 ·
@@ -41,8 +41,8 @@ console = Console(width=None if sys.stdout.isatty() else 140, emoji=False)
 errors = Console(stderr=True, emoji=False)
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(version: bool) -> None:
+    if version:
         from cirl_marl import __version__
 
         console.print(f"cirl_marl {__version__}", highlight=False)
@@ -70,7 +70,7 @@ NetworkName = Annotated[
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a training run.")]
 Scenario = Annotated[str | None, typer.Option(help="Scenario of the definition; default: the physical one.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of every random stream.")]
-StartSeed = Annotated[
+EpisodeSeed = Annotated[
     int | None,
     typer.Option(
         "--seed", min=0, help="Start as the first episode of this evaluation; default: the middle of all ranges."
@@ -97,7 +97,7 @@ def plain(error: BaseException) -> str:
     return str(error).replace("[", r"\[")
 
 
-def listed(text: str) -> list[str]:
+def comma_separated(text: str) -> list[str]:
     """Return what a comma-separated option names."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
@@ -141,19 +141,19 @@ def page_for(path: Path | None) -> Path | None:
     return path
 
 
-def _check_writable(path: Path, what: str) -> None:
-    folder = next(each for each in path.absolute().parents if each.exists())
+def _check_writable(path: Path, subject: str) -> None:
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
     if not folder.is_dir():
-        raise CirlError(f"{what}: {folder} is a file, not a folder")
+        raise CirlError(f"{subject}: {folder} is a file, not a folder")
     if not os.access(folder, os.W_OK):
-        raise CirlError(f"{what}: nothing can be written in {folder}")
+        raise CirlError(f"{subject}: nothing can be written in {folder}")
 
 
 @contextmanager
-def bar(what: str) -> Iterator[Callable[[float], None]]:
+def bar(task: str) -> Iterator[Callable[[float], None]]:
     """Progress bar; the yielded function takes the share that is done."""
-    with shares() as told:
-        yield lambda share: told(what, share)
+    with shares() as progress:
+        yield lambda share: progress(task, share)
 
 
 @contextmanager
@@ -164,7 +164,7 @@ def shares() -> Iterator[Callable[[str, float], None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("preparing", total=1.0)
-        yield lambda what, share: progress.update(task, description=what, completed=share)
+        yield lambda activity, share: progress.update(task, description=activity, completed=share)
 
 
 @contextmanager
@@ -184,7 +184,7 @@ def training_bar() -> Iterator[Any]:
     live = console.is_terminal
     with Progress(*columns, console=console, disable=not live) as progress:
         task = progress.add_task("training", total=None, speed=0.0, circularity="…", service="…")
-        shown = clock.perf_counter()
+        last_update = clock.perf_counter()
         state: Any = None
 
         def show() -> None:
@@ -195,13 +195,13 @@ def training_bar() -> Iterator[Any]:
                 console.print(f"{done:,}/{state.total:,} steps, {speed:,.0f} environment steps/s, {figures}")
 
         def update(now: Any) -> None:
-            nonlocal shown, state
+            nonlocal last_update, state
             state = now
             if now.episode:
                 circularity, service = f"{now.circularity:.4g}", f"{now.service_level:.3f}"
                 progress.update(task, circularity=circularity, service=service)
-            if clock.perf_counter() - shown > (0.2 if live else 10.0):
-                shown = clock.perf_counter()
+            if clock.perf_counter() - last_update > (0.2 if live else 10.0):
+                last_update = clock.perf_counter()
                 show()
 
         yield update

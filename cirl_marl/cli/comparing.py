@@ -9,7 +9,7 @@ import typer
 
 from cirl_marl.cli import common
 from cirl_marl.cli.common import (
-    COMPARING,
+    COMPARISONS,
     CONTROLLERS,
     EpisodeCount,
     Html,
@@ -26,7 +26,7 @@ from cirl_marl.cli.common import (
 from cirl_marl.jobs import PLACES
 
 
-@app.command(rich_help_panel=COMPARING)
+@app.command(rich_help_panel=COMPARISONS)
 def compare(
     runs: Annotated[
         list[Path] | None, typer.Argument(metavar="RUN...", help="Training runs of one environment; may be left out.")
@@ -58,25 +58,25 @@ def compare(
     from cirl_marl.evaluation import compare as compared
     from cirl_marl.report.tradeoffs import comparison_notes, comparison_table, write_comparison
 
-    names = common.listed(controllers)
+    names = common.comma_separated(controllers)
     folder, page = None if out is None else common.folder_for(out, "--out"), common.page_for(html)
-    asked: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service, "uncertain": uncertain}
+    options: dict[str, Any] = {"episodes": episodes, "seed": seed, "min_service": min_service, "uncertain": uncertain}
     with shares() as progress:
-        found = compared(runs or [], names, network=network, scenario=scenario, progress=progress, **asked)
-    console.print(comparison_table(found))
-    for note in comparison_notes(found):
+        comparison = compared(runs or [], names, network=network, scenario=scenario, progress=progress, **options)
+    console.print(comparison_table(comparison))
+    for note in comparison_notes(comparison):
         say(note)
     if folder is not None:
-        for path in write_comparison(found, folder, controllers=names, **asked):
+        for path in write_comparison(comparison, folder, controllers=names, **options):
             say(f"wrote {path}")
     if page is not None:
         from cirl_marl.report.page_html import write_page
         from cirl_marl.report.report_page import page_of_comparison
 
-        say(f"wrote {write_page(page, page_of_comparison(found))}")
+        say(f"wrote {write_page(page, page_of_comparison(comparison))}")
 
 
-@app.command(rich_help_panel=COMPARING)
+@app.command(rich_help_panel=COMPARISONS)
 def pareto(
     network: NetworkName,
     recipe: Annotated[
@@ -110,24 +110,24 @@ def pareto(
     folder = common.folder_for(
         out or Path("runs") / f"pareto-{common.stem(load_network(network, scenario=scenario))}", "--out"
     )
-    asked: dict[str, Any] = {"points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
+    options: dict[str, Any] = {"points": points, "seeds": seeds, "steps": steps, "episodes": episodes}
     try:
         with shares() as progress:
-            where: dict[str, Any] = {"directory": folder, "on": on, "workers": workers}
-            found = swept(network, recipe, scenario=scenario, progress=progress, **where, **asked)
+            place: dict[str, Any] = {"directory": folder, "on": on, "workers": workers}
+            front = swept(network, recipe, scenario=scenario, progress=progress, **place, **options)
     except KeyboardInterrupt:
         say(f"\nstopped; finished trainings are kept in {folder}. The same command goes on.")
         raise typer.Exit(130) from None
     for kind in ("bound", "plan", "trained", "neutral"):
-        for point in found.of(kind):
+        for point in front.of(kind):
             about = "" if point.weight is None else f"  (weight {point.weight:.3g}, seed {point.seed})"
-            say(f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {found.network.mass_unit}{about}")
-    if found.reason:
-        say(f"no bound: {found.reason}")
-    for path in write_front(found, folder, recipe=recipe, **asked):
+            say(f"{kind:8} service {point.service:.4f}  λ̄ {point.circularity:.5g} {front.network.mass_unit}{about}")
+    if front.reason:
+        say(f"no bound: {front.reason}")
+    for path in write_front(front, folder, recipe=recipe, **options):
         say(f"wrote {path}")
     if page is not None:
         from cirl_marl.report.page_html import write_page
         from cirl_marl.report.report_page import page_of_front
 
-        say(f"wrote {write_page(page, page_of_front(found))}")
+        say(f"wrote {write_page(page, page_of_front(front))}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cirl_marl.cli.common import LEARNING, app, folder_for, say, training_bar
+from cirl_marl.cli.common import LEARNERS, app, folder_for, say, training_bar
 from cirl_marl.cli.learning import evaluate_and_draw, what_is_kept
 from cirl_marl.errors import CirlError
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 NETWORK, RECIPE, STEPS = "copper_net", "independent_ars", 4_000_000
 EVALUATIONS, EPISODES = 20, 256
 """Of the training: fewer than the recipe's, which cost as much as a third of its steps."""
-COMPARED = 16
+COMPARISON_EPISODES = 16
 """Episodes in which the team is held against the bound."""
 PAGE = "report.html"
 
 
-@app.command(rich_help_panel=LEARNING)
+@app.command(rich_help_panel=LEARNERS)
 def demo(
     out: Annotated[Path, typer.Option(help="Run directory; one of this demo is taken up where it was left.")] = Path(
         "runs/demo"
@@ -43,9 +43,9 @@ def demo(
         say(f"\nstopped; {what_is_kept(out)}")
         raise typer.Exit(130) from None
     page = out / PAGE
-    evaluate_and_draw(out, COMPARED, 0, page)
-    shown = opens and has_display() and webbrowser.open(page.resolve().as_uri())
-    say(f"report: {page.resolve()}" + ("" if shown else "  (open it in a browser; it needs no server)"))
+    evaluate_and_draw(out, COMPARISON_EPISODES, 0, page)
+    is_open = opens and has_display() and webbrowser.open(page.resolve().as_uri())
+    say(f"report: {page.resolve()}" + ("" if is_open else "  (open it in a browser; it needs no server)"))
 
 
 def _train(out: Path, steps: int) -> None:
@@ -56,10 +56,10 @@ def _train(out: Path, steps: int) -> None:
 
     if (out / "config.json").is_file():
         run = RunDirectory(out)
-        found = (run.network().name, run.config.recipe.name)
-        if found != (load_network(NETWORK).name, RECIPE):
+        contents = (run.network().name, run.config.recipe.name)
+        if contents != (load_network(NETWORK).name, RECIPE):
             raise CirlError(
-                f"--out {out}: is a run of {found[1]} in {found[0]}, not of the demo; choose another folder"
+                f"--out {out}: is a run of {contents[1]} in {contents[0]}, not of the demo; choose another folder"
             )
         if run.status["state"] == "complete":
             say(f"{out} is trained already; remove it to begin anew")

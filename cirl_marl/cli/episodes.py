@@ -11,11 +11,11 @@ import typer
 from cirl_marl.cli.common import (
     CONTROLLERS,
     EPISODES,
+    EpisodeSeed,
     Html,
     MinService,
     NetworkName,
     Scenario,
-    StartSeed,
     app,
     bar,
     console,
@@ -44,7 +44,7 @@ def simulate(
         ),
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Control intervals; default: the horizon.")] = None,
-    seed: StartSeed = None,
+    seed: EpisodeSeed = None,
     scenario: Annotated[
         list[str] | None,
         typer.Option(help="Scenario of the definition; repeat it to compare several; default: the physical one."),
@@ -71,18 +71,18 @@ def simulate(
         return
     from cirl_marl.evaluation.simulations import simulate_alternatives
 
-    held, folder = _held(controls, set_ or []), folder_for(out or Path(), "--out")
+    constants, folder = _constants(controls, set_ or []), folder_for(out or Path(), "--out")
     with bar("simulating") as progress:
         found = simulate_alternatives(
             network,
             scenarios=scenario or [None],
             controls=controls,
-            held=held,
+            held=constants,
             steps=steps,
             seed=seed,
             progress=progress,
         )
-    files = {stem(each.network, each.control): each for each in found}
+    files = {stem(simulation.network, simulation.control): simulation for simulation in found}
     if len(found) == 1:
         _write_one(folder, files)
     else:
@@ -119,26 +119,26 @@ def _sample(
     if samples >= FEWEST:
         rbd_fast()  # or an error, before anything is simulated
     with bar("sampling") as progress:
-        found = sample_episodes(network, samples=samples, control=controls[0], seed=seed, progress=progress)
-    causes = sensitivities(found) if samples >= FEWEST else []
+        episodes = sample_episodes(network, samples=samples, control=controls[0], seed=seed, progress=progress)
+    causes = sensitivities(episodes) if samples >= FEWEST else []
     title = f"{network.title or network.name}, {controls[0]} control, {samples} samples"
-    written = write_samples(folder, stem(network, controls[0]), found, causes, title=title)
-    mean = found.circularity.mean(axis=1)
+    paths = write_samples(folder, stem(network, controls[0]), episodes, causes, title=title)
+    mean = episodes.circularity.mean(axis=1)
     low, high = np.quantile(mean, (0.025, 0.975)).tolist()
     say(f"λ̄ = {mean.mean():.5g} {network.mass_unit}, 95 % of samples in [{low:.5g}, {high:.5g}]")
-    for service, levels in zip(network.services, found.levels.mean(axis=2).T, strict=True):
+    for service, levels in zip(network.services, episodes.levels.mean(axis=2).T, strict=True):
         low, high = np.quantile(levels, (0.025, 0.975)).tolist()
         say(f"level of {service.id}: {levels.mean():.4f}, 95 % of samples in [{low:.4f}, {high:.4f}]")
     if causes:
-        console.print(sensitivity_table(found, causes))
+        console.print(sensitivity_table(episodes, causes))
     else:
         say(f"which number causes the spread is told from {FEWEST} samples on")
     if page is not None:
         from cirl_marl.report.page_html import write_page
         from cirl_marl.report.report_page import page_of_samples
 
-        written.append(write_page(page, page_of_samples(found, controls[0])))
-    say(f"wrote {', '.join(map(str, written))}")
+        paths.append(write_page(page, page_of_samples(episodes, controls[0])))
+    say(f"wrote {', '.join(map(str, paths))}")
 
 
 def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
@@ -146,9 +146,9 @@ def _write_one(folder: Path, files: Mapping[str, Simulation]) -> None:
 
     ((name, only),) = files.items()
     title = f"{only.network.title or only.network.name}, {only.control} control"
-    written = write_trajectory(folder, name, only, title)
+    paths = write_trajectory(folder, name, only, title)
     _say_lines(str(only))
-    say(f"wrote {', '.join(map(str, written))}")
+    say(f"wrote {', '.join(map(str, paths))}")
 
 
 def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
@@ -156,18 +156,18 @@ def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
     from cirl_marl.evaluation.quantities import rank_quantities
     from cirl_marl.report.differences import ROWS, differences_table, write_alternatives
 
-    found = list(files.values())
-    network, quantities = found[0].network, rank_quantities(found)
-    controls = list(dict.fromkeys(each.control for each in found))
+    simulations = list(files.values())
+    network, quantities = simulations[0].network, rank_quantities(simulations)
+    controls = list(dict.fromkeys(simulation.control for simulation in simulations))
     title = f"{network.name}, {controls[0]} control" if len(controls) == 1 else network.name
-    written = write_alternatives(folder, f"{network.name}_differences", files, quantities, title=title)
-    for each in found:
-        _say_lines(str(each), f"{each.name}: ")
-    if differing := [each for each in quantities if each.rank > 0]:
-        console.print(differences_table(found, differing))
+    paths = write_alternatives(folder, f"{network.name}_differences", files, quantities, title=title)
+    for simulation in simulations:
+        _say_lines(str(simulation), f"{simulation.name}: ")
+    if differing := [simulation for simulation in quantities if simulation.rank > 0]:
+        console.print(differences_table(simulations, differing))
     more = f", of which {ROWS} are shown" if len(differing) > ROWS else ""
-    say(f"{len(differing)} of {len(quantities)} quantities differ{more}; all are in {written[-2]}")
-    for path in written:
+    say(f"{len(differing)} of {len(quantities)} quantities differ{more}; all are in {paths[-2]}")
+    for path in paths:
         say(f"wrote {path}")
 
 
@@ -184,7 +184,7 @@ def plan(
         typer.Option(help="CSV file to write; default: plan_NETWORK[_SCENARIO]_CONTROL or plan_RUN."),
     ] = None,
     scenario: Scenario = None,
-    seed: StartSeed = None,
+    seed: EpisodeSeed = None,
     min_service: MinService = None,
     html: Html = None,
 ) -> None:
@@ -203,43 +203,43 @@ def plan(
         raise CirlError(f"--out {out}: needs the name of a .csv file")
     page = page_for(html)
     with bar("planning") as progress:
-        found = plans.plan(source, control, scenario=scenario, min_service=min_service, seed=seed, progress=progress)
-    network = found.network
+        schedule = plans.plan(source, control, scenario=scenario, min_service=min_service, seed=seed, progress=progress)
+    network = schedule.network
     who = Path(source).resolve().name if control is None else stem(network, control)
     path = Path(f"plan_{who}.csv") if out is None else out
     path.parent.mkdir(parents=True, exist_ok=True)
-    found.write(path)
-    beside = write_decisions(path, found, title=f"{network.title or network.name}: {control or 'what was learnt'}")
+    schedule.write(path)
+    beside = write_decisions(path, schedule, title=f"{network.title or network.name}: {control or 'what was learnt'}")
     if path.with_suffix(".xlsx") not in beside:
         say(NO_WORKBOOK)
     if page is not None:
         from cirl_marl.report.page_html import write_page
         from cirl_marl.report.report_page import page_of_schedule
 
-        beside.append(write_page(page, page_of_schedule(found)))
-    console.print(decisions_table(found))
-    console.print(savings_table(found))
-    _say_lines(str(found))
+        beside.append(write_page(page, page_of_schedule(schedule)))
+    console.print(decisions_table(schedule))
+    console.print(savings_table(schedule))
+    _say_lines(str(schedule))
     say(f"wrote {', '.join(map(str, (path, *beside)))}")
 
 
-def _say_lines(text: str, who: str = "") -> None:
-    """Print the lines of a text; ``who`` goes first in each."""
+def _say_lines(text: str, prefix: str = "") -> None:
+    """Print the lines of a text; ``prefix`` goes first in each."""
     for line in text.splitlines():
-        say(who + line)
+        say(prefix + line)
 
 
-def _held(controls: Sequence[str], settings: list[str]) -> dict[str, float]:
+def _constants(controls: Sequence[str], settings: list[str]) -> dict[str, float]:
     """Return the values of --set by agent."""
     from cirl_marl.optimum.registry import SETTABLE
 
     if settings and not set(controls) & set(SETTABLE):
         raise CirlError(f"--set goes with --control constant or scripted, not with {', '.join(controls)}")
-    held = {}
+    constants = {}
     for setting in settings:
         agent, _, value = setting.partition("=")
         try:
-            held[agent] = float(value)
+            constants[agent] = float(value)
         except ValueError:
             raise CirlError(f"--set {setting}: needs AGENT=VALUE with a number in [-1, 1]") from None
-    return held
+    return constants

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import typer
 
 from cirl_marl.cli import common
-from cirl_marl.cli.common import COMPARING, EpisodeCount, NetworkName, Scenario, Seed, app, console, say, shares
+from cirl_marl.cli.common import COMPARISONS, EpisodeCount, NetworkName, Scenario, Seed, app, console, say, shares
 from cirl_marl.errors import CirlError
 
 
-@app.command(rich_help_panel=COMPARING)
+@app.command(rich_help_panel=COMPARISONS)
 def explain(
     source: Annotated[
         str, typer.Argument(metavar="RUN | NETWORK", help="Training run; or a network, of which there are prices.")
@@ -55,15 +55,15 @@ def explain(
         stem = "" if is_run else common.stem(load_network(source, scenario=scenario))
         out = Path(source) / FOLDER if is_run else Path(f"reasons_{stem}")
     folder = common.writable_folder(out, "--out")
-    asked: dict[str, Any] = {"min_service": min_service, "episodes": episodes, "seed": seed, "top": top}
+    options: dict[str, Any] = {"min_service": min_service, "episodes": episodes, "seed": seed, "top": top}
     with shares() as progress:
         found = explained(
             source,
-            parts=None if parts is None else common.listed(parts),
+            parts=None if parts is None else common.comma_separated(parts),
             scenario=scenario,
             leaves=leaves,
             progress=progress,
-            **asked,
+            **options,
         )
     from cirl_marl.reasons.sentences import paragraphs
 
@@ -73,13 +73,13 @@ def explain(
         console.print(inputs_table(found))
     for heading, said in paragraphs(found):
         say(f"\n{heading}")
-        for each in said:
-            say(f"  {each}")
-    for path in write_reasons(found, folder, parts=parts, leaves=leaves, **asked):
+        for sentence in said:
+            say(f"  {sentence}")
+    for path in write_reasons(found, folder, parts=parts, leaves=leaves, **options):
         say(f"wrote {path}")
 
 
-@app.command(rich_help_panel=COMPARING)
+@app.command(rich_help_panel=COMPARISONS)
 def infer(
     network: NetworkName,
     plans: Annotated[
@@ -118,18 +118,18 @@ def infer(
             raise CirlError(f"--out {out}: is a folder, not a file")
         common.writable_folder(out.parent, "--out")
     with common.bar("weighing") as progress:
-        found = inferred(
+        weights = inferred(
             network,
             plans,
-            kinds=KINDS if terms is None else common.listed(terms),
+            kinds=KINDS if terms is None else common.comma_separated(terms),
             within=within,
             scenario=scenario,
             seed=seed,
             episodes=episodes,
             progress=progress,
         )
-    console.print(weights_table(found))
-    for each in weights_sentences(found):
-        say(each)
+    console.print(weights_table(weights))
+    for sentence in weights_sentences(weights):
+        say(sentence)
     if out is not None:
-        say(f"wrote {write_weights(found, out)}")
+        say(f"wrote {write_weights(weights, out)}")

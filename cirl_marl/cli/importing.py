@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cirl_marl.network.elements import Role
 
 Patterns = list[str] | None
-LISTED = 12
+CHANGES_SHOWN = 12
 """Most changes that are listed on screen."""
 
 
@@ -49,7 +49,7 @@ def import_(
     from cirl_marl.importing.assembly import import_flows
     from cirl_marl.importing.balances import ProcessKind
 
-    given = {
+    patterns = {
         "nonrenewable_reservoir": reservoir,
         "landfill": landfill,
         "incinerator": incinerator,
@@ -57,11 +57,11 @@ def import_(
         "technosphere": outside,
     }
     with bar("checking") as progress:
-        found = import_flows(
+        report = import_flows(
             flows,
             out,
             stocks,
-            roles={role: names for role, names in given.items() if names},
+            roles={role: names for role, names in patterns.items() if names},
             stores=store or (),
             regions=region or (),
             ask=_ask if sys.stdin.isatty() else None,
@@ -73,21 +73,21 @@ def import_(
             source=source,
             progress=progress,
         )
-    table = found.table
+    table = report.table
     for kind in ProcessKind:
-        if names := found.processes.of(kind):
+        if names := report.processes.of(kind):
             say(f"{KINDS[kind.value]}: {', '.join(names)}")
-    for name in found.processes.inferred_stores:
+    for name in report.processes.inferred_stores:
         say(f"'{name}' takes more than it gives, so that it became a store; without --store it was not said to be one")
-    if found.changes:
-        say(f"{len(found.changes)} flows were adjusted; the largest changes are")
-        for change in sorted(found.changes, key=lambda each: -abs(each.after - each.before))[:LISTED]:
-            where = f"{change.region}, {change.year}" if change.region else str(change.year)
-            say(f"  {change.pair} ({where}): {change.before:g} → {change.after:g} {table.unit}")
-    for name, apart in found.stock_mistakes.items():
+    if report.changes:
+        say(f"{len(report.changes)} flows were adjusted; the largest changes are")
+        for change in sorted(report.changes, key=lambda entry: -abs(entry.after - entry.before))[:CHANGES_SHOWN]:
+            place = f"{change.region}, {change.year}" if change.region else str(change.year)
+            say(f"  {change.pair} ({place}): {change.before:g} → {change.after:g} {table.unit}")
+    for name, apart in report.stock_mistakes.items():
         say(f"stocks of '{name}': their growth and the flows are up to {apart:g} {table.unit} apart")
-    say(f"simulated without agents, no flow is further than {found.largest_error:.2g} {table.unit} from the table")
-    say(f"wrote {', '.join(map(str, found.files))}")
+    say(f"simulated without agents, no flow is further than {report.largest_error:.2g} {table.unit} from the table")
+    say(f"wrote {', '.join(map(str, report.files))}")
 
 
 KINDS = {

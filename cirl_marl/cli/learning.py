@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cirl_marl.cli.common import (
-    LEARNING,
+    LEARNERS,
     OBSERVE,
     REWARDS,
     EpisodeCount,
@@ -19,8 +19,8 @@ from cirl_marl.cli.common import (
     Seed,
     Uncertain,
     app,
+    comma_separated,
     console,
-    listed,
     page_for,
     say,
     shares,
@@ -29,7 +29,7 @@ from cirl_marl.cli.common import (
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES, Standing, run_jobs
 
-EVALUATED = 0.6
+EVALUATION_SHARE = 0.6
 """Share of the evaluation in the work on a page; the rest is to plan."""
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from cirl_marl.paper.results import PaperRow, Results
 
 
-@app.command(rich_help_panel=LEARNING)
+@app.command(rich_help_panel=LEARNERS)
 def train(
     context: typer.Context,
     network: Annotated[
@@ -92,14 +92,14 @@ def train(
         _only_resume(context)
     options: dict[str, Any] = {"steps": steps, "envs": envs, "scenario": scenario, "reward": reward, "engine": engine}
     options |= {"min_service": min_service, "uncertain": uncertain, "checkpoint_every": checkpoint_every}
-    options |= {"observe": observe, "agents": None if agents is None else listed(agents), "device": device}
+    options |= {"observe": observe, "agents": None if agents is None else comma_separated(agents), "device": device}
     directories = [resume] if resume is not None else _directories(out, str(network), recipe, range(seed, seed + seeds))
     with training_bar() as report:
         options["report"] = report
         try:
             if resume is not None:
-                how: dict[str, Any] = {"device": device, "checkpoint_every": checkpoint_every}
-                learners.resume(resume, steps=steps, report=report, **how)
+                resume_options: dict[str, Any] = {"device": device, "checkpoint_every": checkpoint_every}
+                learners.resume(resume, steps=steps, report=report, **resume_options)
             elif seeds > 1:
                 parent = str(directories[0]).removesuffix(f"-seed{seed}")
                 learners.train_seeds(str(network), recipe, seeds=range(seed, seed + seeds), directory=parent, **options)
@@ -121,7 +121,7 @@ def _directories(out: Path | None, network: str, recipe: str, seeds: Sequence[in
     return [out] if out is not None and len(seeds) == 1 else [Path(f"{parent}-seed{seed}") for seed in seeds]
 
 
-@app.command(rich_help_panel=LEARNING)
+@app.command(rich_help_panel=LEARNERS)
 def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
     """Compare the trained policies with neutral and random control on fresh seeds, and with the best possible.
 
@@ -142,7 +142,7 @@ def evaluate(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0) -> None:
         say(f"gap to bound: {figures['no_bound']}")
 
 
-@app.command(rich_help_panel=LEARNING)
+@app.command(rich_help_panel=LEARNERS)
 def export(
     run: RunPath, out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
 ) -> None:
@@ -153,7 +153,7 @@ def export(
         say(f"{path}")
 
 
-@app.command(rich_help_panel=LEARNING)
+@app.command(rich_help_panel=LEARNERS)
 def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0, html: Html = None) -> None:
     """Evaluate a run and draw its pictures anew.
 
@@ -162,7 +162,7 @@ def report(run: RunPath, episodes: EpisodeCount = 64, seed: Seed = 0, html: Html
     evaluate_and_draw(run, episodes, seed, page_for(html))
 
 
-@app.command(rich_help_panel=LEARNING)
+@app.command(rich_help_panel=LEARNERS)
 def paper(
     environment: Annotated[str | None, typer.Argument(metavar="ENV", help="Such as CopperNet; default: all.")] = None,
     algorithm: Annotated[str | None, typer.Argument(metavar="ALGORITHM", help="Such as A2C; default: all.")] = None,
@@ -183,35 +183,39 @@ def paper(
     """Repeat the CiRL paper's training runs, half a day in all, and show their figures beside the published ones."""
     from cirl_marl.paper.published import ENVIRONMENTS
     from cirl_marl.paper.results import Results
-    from cirl_marl.paper.running import outdated
-    from cirl_marl.paper.selection import overview, planned
+    from cirl_marl.paper.running import reason_to_repeat
+    from cirl_marl.paper.selection import overview, select_rows
     from cirl_marl.paper.table import environment_table, result_line
     from cirl_marl.paper.training import check_registered
 
-    rows, results = planned(environment, algorithm, steps=steps, seeds=seeds, settings=settings), Results(out)
+    rows, results = select_rows(environment, algorithm, steps=steps, seeds=seeds, settings=settings), Results(out)
     environments = [ENVIRONMENTS[name] for name in dict.fromkeys(row.environment for row in rows)]
-    for found in environments:
-        check_registered(found)
+    for environment_data in environments:
+        check_registered(environment_data)
     results.prepare()
-    changed = {row: outdated(results.read(row), episodes) for row in rows if results.has(row)}
-    left = [row for row in rows if row not in changed or changed[row]]
-    say(f"{overview(rows, left)}; results in {results.path}")
+    reasons = {row: reason_to_repeat(results.read(row), episodes) for row in rows if results.has(row)}
+    remaining = [row for row in rows if row not in reasons or reasons[row]]
+    say(f"{overview(rows, remaining)}; results in {results.path}")
     for row in rows:
-        if changed.get(row):
-            say(f"{row}: once more, as {changed[row]}")
-        elif row in changed:
+        if reasons.get(row):
+            say(f"{row}: once more, as {reasons[row]}")
+        elif row in reasons:
             say(result_line(results.read(row)))
     try:
-        failed = _run_rows(left, results, episodes, on, workers)
+        has_failures = _run_rows(remaining, results, episodes, on, workers)
     except KeyboardInterrupt:
         say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
         raise typer.Exit(130) from None
-    kept, asked = results.all(), {(row.environment, row.algorithm, row.settings) for row in rows}
-    for found in environments:
-        fit = [r for r in kept if r.row in rows or (r.row.environment, r.row.algorithm, r.row.settings) not in asked]
-        console.print(environment_table(found, fit))
-    if failed:
+    stored, requests = results.all(), {_request(row) for row in rows}
+    for environment_data in environments:
+        fit = [result for result in stored if result.row in rows or _request(result.row) not in requests]
+        console.print(environment_table(environment_data, fit))
+    if has_failures:
         raise typer.Exit(1)
+
+
+def _request(row: PaperRow) -> tuple[str, str, str]:
+    return row.environment, row.algorithm, row.settings
 
 
 def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, on: str, workers: int | None) -> bool:
@@ -220,35 +224,35 @@ def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, 
     from cirl_marl.paper.table import result_line
 
     jobs = {row.stem: RowJob(row, results.path, episodes) for row in rows}
-    shown: set[str] = set()
-    with shares() as told:
+    printed: set[str] = set()
+    with shares() as progress:
 
         def watch(standings: Sequence[Standing]) -> None:
-            for each in standings:
-                if each.state == "done" and each.name not in shown:
-                    shown.add(each.name)
-                    say(result_line(results.read(jobs[each.name].row)))
-                elif each.state == "running":
-                    place = f"{len(shown) + 1} of {len(rows)}"
-                    told(f"{place}: {jobs[each.name].row}: {each.figures.get('what', '')}", each.share)
+            for standing in standings:
+                if standing.state == "done" and standing.name not in printed:
+                    printed.add(standing.name)
+                    say(result_line(results.read(jobs[standing.name].row)))
+                elif standing.state == "running":
+                    place = f"{len(printed) + 1} of {len(rows)}"
+                    progress(f"{place}: {jobs[standing.name].row}: {standing.figures.get('what', '')}", standing.share)
 
         failures = run_jobs([*jobs.values()], results.path / "logs", on=on, workers=workers, watch=watch)
     for failure in failures:
-        said = failure.error if isinstance(failure.error, CirlError) else failure.said
-        say(f"{jobs[failure.name].row}: failed: {said}")
+        message = failure.error if isinstance(failure.error, CirlError) else failure.said
+        say(f"{jobs[failure.name].row}: failed: {message}")
     return bool(failures)
 
 
 def _only_resume(context: typer.Context) -> None:
     """Refuse options beside --resume: a resumed run keeps its own."""
-    given = [
+    refused = [
         f"--{name}"
         for name in context.params
         if name not in ("resume", "network", "episodes", "steps", "device", "checkpoint_every")
         and getattr(context.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT"
     ]
-    if given:
-        raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(given)}")
+    if refused:
+        raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(refused)}")
 
 
 def what_is_kept(directory: Path) -> str:
@@ -289,14 +293,14 @@ def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | No
     from cirl_marl.report.run import draw_run, page_of_evaluation
     from cirl_marl.report.terminal import evaluation_table
 
-    share = 1.0 if page is None else EVALUATED
+    share = 1.0 if page is None else EVALUATION_SHARE
     with shares() as progress:
         evaluation = assessment.evaluate(
             directory,
             episodes=episodes,
             seed=seed,
             bounds=page is not None,
-            progress=lambda what, part: progress(what, share * part),
+            progress=lambda activity, part: progress(activity, share * part),
         )
         story = None if page is None else page_of_evaluation(evaluation, part_of(progress, PLAN, share, 1 - share))
     _write_figures(evaluation)
@@ -311,6 +315,6 @@ def evaluate_and_draw(directory: Path, episodes: int, seed: int, page: Path | No
         say(f"wrote {write_page(page, story)}")
     run = evaluation.run
     if not run.metrics()["env_steps"]:
-        needed = run.config.envs * evaluation.env.network.episode.horizon
-        say(f"no learning curves, as no episode ended: {run.config.envs} copies need {needed:,} steps")
+        minimum = run.config.envs * evaluation.env.network.episode.horizon
+        say(f"no learning curves, as no episode ended: {run.config.envs} copies need {minimum:,} steps")
     say(f"run: {directory}  (figures in evaluation.json; gap to the bound and more: cirl evaluate {directory})")

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cirl_marl.cli.common import NETWORKS, NetworkName, Scenario, StartSeed, app, bar, console, errors, plain, say, stem
+from cirl_marl.cli.common import (
+    NETWORKS,
+    EpisodeSeed,
+    NetworkName,
+    Scenario,
+    app,
+    bar,
+    console,
+    errors,
+    plain,
+    say,
+    stem,
+)
 from cirl_marl.errors import CirlError
 
 if TYPE_CHECKING:
@@ -23,13 +35,13 @@ def list_networks() -> None:
     from cirl_marl.definitions.catalogue import families, load_network, recipes
     from cirl_marl.report.terminal import networks_table
 
-    found, known = {}, families()
+    networks, names_by_family = {}, families()
     with bar("reading") as progress:
-        for i, (family, names) in enumerate(known.items()):
-            several = f"{family}_{{{', '.join(each.removeprefix(f'{family}_') for each in names)}}}"
-            found[names[0] if len(names) == 1 else several] = load_network(names[0])
-            progress((i + 1) / len(known))
-    console.print(networks_table(found))
+        for i, (family, names) in enumerate(names_by_family.items()):
+            label = f"{family}_{{{', '.join(name.removeprefix(f'{family}_') for name in names)}}}"
+            networks[names[0] if len(names) == 1 else label] = load_network(names[0])
+            progress((i + 1) / len(names_by_family))
+    console.print(networks_table(networks))
     console.print(f"recipes for --recipe: {', '.join(recipes())}")
 
 
@@ -53,8 +65,8 @@ def new(
     """
     from cirl_marl.definitions.template import FirstCycle, write_first
 
-    given = {"material": material, "mass": mass, "in_use": in_use, "lifetime": lifetime, "recycled": recycled}
-    write_first(FirstCycle(**given, growth=growth, start=start, years=years), file)  # type: ignore[arg-type]
+    answers = {"material": material, "mass": mass, "in_use": in_use, "lifetime": lifetime, "recycled": recycled}
+    write_first(FirstCycle(**answers, growth=growth, start=start, years=years), file)  # type: ignore[arg-type]
     say(f"wrote {file}; next: cirl plan {file} --control optimum --min-service 1, and cirl train {file}")
 
 
@@ -62,7 +74,7 @@ def new(
 def show(
     network: NetworkName,
     scenario: Scenario = None,
-    seed: StartSeed = None,
+    seed: EpisodeSeed = None,
     picture: Annotated[
         Path | None, typer.Option(help="Where to draw it; default: NETWORK[_SCENARIO].png here.")
     ] = None,
@@ -81,27 +93,29 @@ def show(
     from cirl_marl.network.series import Series, extremes
     from cirl_marl.report.terminal import arcs_table, nodes_table
 
-    found = load_network(network, scenario=scenario)
-    env = MultiAgentVectorEnv(found, num_envs=1)
-    begun = episode_start(env, seed)
-    begun.reset(env)
+    definition = load_network(network, scenario=scenario)
+    env = MultiAgentVectorEnv(definition, num_envs=1)
+    start = episode_start(env, seed)
+    start.reset(env)
     stock, flow = env.rows.stocks(env.physical.stock)[:, 0], env.physical.flow[:, 0]
-    shown = fold_copies(found, stock, flow, unfold or ())
-    console.print(nodes_table(shown[0], shown[1]))
-    console.print(arcs_table(shown[0], shown[2]))
-    for service in found.services:
+    folded_view = fold_copies(definition, stock, flow, unfold or ())
+    console.print(nodes_table(folded_view[0], folded_view[1]))
+    console.print(arcs_table(folded_view[0], folded_view[2]))
+    for service in definition.services:
         ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
         ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
-        changing = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
+        variation = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
         measured = f"{service.measure or service.quantity} of {' and '.join(service.providers)}"
-        console.print(f"service '{service.id}': {measured} {' and '.join(ends)}{changing}")
-    circularity = float(found.circularity(flow))
-    console.print(f"λ of the start state: {circularity:.5g} {found.mass_unit}")
-    say(f"start: {begun.description}")
-    path = picture or Path(f"{stem(found)}.png")
+        console.print(f"service '{service.id}': {measured} {' and '.join(ends)}{variation}")
+    circularity = float(definition.circularity(flow))
+    console.print(f"λ of the start state: {circularity:.5g} {definition.mass_unit}")
+    say(f"start: {start.description}")
+    path = picture or Path(f"{stem(definition)}.png")
     if path.suffix != ".png":
         raise CirlError(f"--picture {path}: needs the name of a .png file")
-    save_network(path, found, stock, flow, title=found.title, circularity=circularity, open_copies=unfold or ())
+    save_network(
+        path, definition, stock, flow, title=definition.title, circularity=circularity, open_copies=unfold or ()
+    )
     console.print(f"picture: {path}")
 
 
@@ -118,20 +132,20 @@ def check(
 
     What is no mistake but seldom meant is said as a remark. Nothing is trained.
     """
-    faulty, all_ = False, [each for given in sources for each in _with_regions(given)]
+    faulty, names = False, [name for argument in sources for name in _with_regions(argument)]
     with bar("checking") as progress:
-        for i, source in enumerate(all_):
+        for i, source in enumerate(names):
             try:
                 if _is_recipe(source):
                     _check_recipe(source, network)
                 elif network is None:
-                    _check_network(source, partial(_part, progress, i, len(all_)))
+                    _check_network(source, partial(_part, progress, i, len(names)))
                 else:
                     raise CirlError(f"check {source}: is no recipe; --network names the network that recipes must fit")
             except CirlError as error:
                 faulty = True
                 errors.print(plain(error), highlight=False, soft_wrap=True)
-            progress((i + 1) / len(all_))
+            progress((i + 1) / len(names))
     if faulty:
         raise typer.Exit(2)
 
@@ -185,7 +199,7 @@ def _idle_matches(source: str, recipe: Recipe, network: Network) -> list[str]:
     except CirlError as error:
         raise CirlError(f"{source} in {network.name}: {error}") from error
     busy = {id(learner.spec) for learner in learners}
-    return [where for where, learner in recipe.learners()[1:] if id(learner) not in busy]
+    return [match for match, learner in recipe.learners()[1:] if id(learner) not in busy]
 
 
 def _check_network(source: str, progress: Callable[[float], None]) -> None:
@@ -196,18 +210,18 @@ def _check_network(source: str, progress: Callable[[float], None]) -> None:
     network = load_network(source)
     assert network.source is not None
     definition(network.source).check(network.region)
-    for i, each in enumerate((network, *network.scenarios.values()), start=1):
+    for i, variant in enumerate((network, *network.scenarios.values()), start=1):
         try:
             MultiAgentVectorEnv(
-                each, num_envs=1
+                variant, num_envs=1
             )  # finds what only a network that is run says, as rates no solver can follow
             progress(i / (1 + len(network.scenarios)))
         except CirlError as error:
-            raise CirlError(f"{source}, scenario '{each.scenario_name}': {error}") from error
+            raise CirlError(f"{source}, scenario '{variant.scenario_name}': {error}") from error
     say(
         f"{source}: {len(network.compartments)} compartments, {len(network.agents)} agents, "
         f"scenarios {', '.join([network.scenario_name, *network.scenarios])}: no mistakes"
     )
-    for each in (network, *network.scenarios.values()):
-        for remark in lint_warnings(each):
-            say(f"{source}: remark on scenario '{each.scenario_name}': {remark}")
+    for variant in (network, *network.scenarios.values()):
+        for remark in lint_warnings(variant):
+            say(f"{source}: remark on scenario '{variant.scenario_name}': {remark}")

@@ -15,12 +15,12 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from cirl_marl.cli.common import COMPARING, app, console, errors, folder_for
+from cirl_marl.cli.common import COMPARISONS, app, console, errors, folder_for
 from cirl_marl.errors import CirlError
 from cirl_marl.jobs import PLACES
 
 if TYPE_CHECKING:
-    from cirl_marl.sweeps import CellStanding
+    from cirl_marl.sweeps import CellStatus
 
 ROWS = 30
 """Most rows of the live table; those at work come first."""
@@ -38,7 +38,7 @@ OPTIONS_SHOWN += ("circularity_weight", "horizon", "uncertain")
 """Columns of the results that are shown if they differ between cells of one recipe."""
 
 
-@app.command(rich_help_panel=COMPARING)
+@app.command(rich_help_panel=COMPARISONS)
 def sweep(
     file: Annotated[Path, typer.Argument(metavar="SWEEP", help="Sweep file: networks, scenarios, recipes, seeds.")],
     on: Annotated[str, typer.Option(help=f"Where the cells are trained: {', '.join(PLACES)}.")] = "local",
@@ -70,7 +70,7 @@ def sweep(
     options: dict[str, Any] = {"on": on, "workers": workers, "out": out, "settings": _settings(slurm or [])}
     try:
         with _live(as_json) as watch:
-            found = swept(
+            outcome = swept(
                 file,
                 **options,
                 checkpoint_every=checkpoint_every,
@@ -78,105 +78,105 @@ def sweep(
                 say=lambda line: printer.print(line, soft_wrap=True, highlight=False, markup=False),
             )
     except KeyboardInterrupt:
-        where = out or Path("runs") / f"sweep-{file.stem}"
-        said = f"\nstopped; everything learnt is kept in {where}. The same command goes on."
-        printer.print(said, soft_wrap=True, highlight=False)
+        place = out or Path("runs") / f"sweep-{file.stem}"
+        message = f"\nstopped; everything learnt is kept in {place}. The same command goes on."
+        printer.print(message, soft_wrap=True, highlight=False)
         raise typer.Exit(130) from None
     if as_json:
-        sys.stdout.write(json.dumps(found.rows, indent=2) + "\n")
+        sys.stdout.write(json.dumps(outcome.rows, indent=2) + "\n")
     else:
-        console.print(_results(found.rows))
-    done = sum(row["state"] == "done" for row in found.rows)
-    said = f"{done} of {len(found.rows)} cells done; table: {found.folder / 'sweep.csv'}"
-    printer.print(said, soft_wrap=True, highlight=False)
-    for failure in found.failures:
+        console.print(_results(outcome.rows))
+    done = sum(row["state"] == "done" for row in outcome.rows)
+    message = f"{done} of {len(outcome.rows)} cells done; table: {outcome.folder / 'sweep.csv'}"
+    printer.print(message, soft_wrap=True, highlight=False)
+    for failure in outcome.failures:
         errors.print(f"failed: {failure}", soft_wrap=True, highlight=False, markup=False)
-    if found.failures:
+    if outcome.failures:
         raise typer.Exit(1)
 
 
-def _settings(given: Sequence[str]) -> dict[str, str]:
+def _settings(assignments: Sequence[str]) -> dict[str, str]:
     """Return settings by name."""
-    for each in given:
-        if "=" not in each:
-            raise CirlError(f"--slurm {each}: must be NAME=VALUE, such as slurm_partition=long")
-    return {name: value for name, _, value in (each.partition("=") for each in given)}
+    for assignment in assignments:
+        if "=" not in assignment:
+            raise CirlError(f"--slurm {assignment}: must be NAME=VALUE, such as slurm_partition=long")
+    return {name: value for name, _, value in (assignment.partition("=") for assignment in assignments)}
 
 
 @contextmanager
-def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStanding]], None]]:
+def _live(on_stderr: bool) -> Iterator[Callable[[Sequence[CellStatus]], None]]:
     """Live table of all cells; where nobody looks on, a line for each cell that begins or ends."""
     printer = errors if on_stderr else console
     if printer.is_terminal:
-        begun: list[tuple[float, float]] = []
+        first: list[tuple[float, float]] = []
 
-        def update(standings: Sequence[CellStanding]) -> None:
+        def update(standings: Sequence[CellStatus]) -> None:
             now = clock.monotonic(), sum(map(share_done, standings)) / len(standings)
-            if not begun:
-                begun.append(now)
-            live.update(table_of(standings, time_left(begun[0], now)), refresh=True)
+            if not first:
+                first.append(now)
+            live.update(table_of(standings, time_left(first[0], now)), refresh=True)
 
         with Live(console=printer, transient=True, auto_refresh=False) as live:
             yield update
         return
     before: dict[str, str] = {}
 
-    def tell(standings: Sequence[CellStanding]) -> None:
-        for each in standings:
-            name, state = each.standing.name, each.standing.state
+    def tell(standings: Sequence[CellStatus]) -> None:
+        for cell in standings:
+            name, state = cell.standing.name, cell.standing.state
             if before.setdefault(name, "waiting") != state:
                 before[name] = state
                 line = f"{state}: {name}" + (
-                    f", gap {each.gap:.1%}" if state == "done" and each.gap is not None else ""
+                    f", gap {cell.gap:.1%}" if state == "done" and cell.gap is not None else ""
                 )
                 printer.print(line, soft_wrap=True, highlight=False, markup=False)
 
     yield tell
 
 
-def share_done(each: CellStanding) -> float:
+def share_done(cell: CellStatus) -> float:
     """Return the share of a cell's training that is done; what follows on it is short."""
-    what = str(each.standing.figures.get("what", ""))
-    if each.standing.state == "done" or what.startswith("evaluat"):
+    activity = str(cell.standing.figures.get("what", ""))
+    if cell.standing.state == "done" or activity.startswith("evaluat"):
         return 1.0
-    return each.standing.share if what == "training" else 0.0
+    return cell.standing.share if activity == "training" else 0.0
 
 
-def time_left(begun: tuple[float, float], now: tuple[float, float]) -> float | None:
-    """Return the seconds that are left if all goes on as since ``begun``; each is a time and a share that is done.
+def time_left(first: tuple[float, float], now: tuple[float, float]) -> float | None:
+    """Return the seconds that are left if all goes on as since ``first``; each is a time and a share that is done.
 
     None while nothing has been done since.
 
     >>> time_left((0.0, 0.5), (60.0, 0.75))
     60.0
     """
-    done = now[1] - begun[1]
-    return (now[0] - begun[0]) * (1.0 - now[1]) / done if done > 0 else None
+    done = now[1] - first[1]
+    return (now[0] - first[0]) * (1.0 - now[1]) / done if done > 0 else None
 
 
-def table_of(standings: Sequence[CellStanding], left: float | None = None) -> Table:
+def table_of(standings: Sequence[CellStatus], left: float | None = None) -> Table:
     """Draw who is how far, and about how many seconds are left."""
-    counts = {state: sum(each.standing.state == state for each in standings) for state in ORDER}
+    counts = {state: sum(cell.standing.state == state for cell in standings) for state in ORDER}
     title = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     if left:
         title += f"; about {timedelta(seconds=round(left))} left"
     table = Table("cell", "state", "steps", "gap to the bound", title=title)
-    ordered = sorted(standings, key=lambda each: ORDER.index(each.standing.state))
-    for each in ordered[:ROWS]:
-        about = "" if each.standing.state == "done" else "~"
-        gap = "" if each.gap is None else f"{about}{each.gap:.1%}"
-        table.add_row(each.standing.name, _doing(each), _steps(each), gap)
-    if len(ordered) > ROWS:
-        table.add_row(f"… and {len(ordered) - ROWS} more", "", "", "")
+    rows = sorted(standings, key=lambda cell: ORDER.index(cell.standing.state))
+    for cell in rows[:ROWS]:
+        about = "" if cell.standing.state == "done" else "~"
+        gap = "" if cell.gap is None else f"{about}{cell.gap:.1%}"
+        table.add_row(cell.standing.name, _activity(cell), _steps(cell), gap)
+    if len(rows) > ROWS:
+        table.add_row(f"… and {len(rows) - ROWS} more", "", "", "")
     return table
 
 
-def _doing(each: CellStanding) -> str:
-    doing = each.standing.figures.get("what", "") if each.standing.state in ("running", "elsewhere") else ""
-    return f"{each.standing.state} {doing}".strip()
+def _activity(cell: CellStatus) -> str:
+    activity = cell.standing.figures.get("what", "") if cell.standing.state in ("running", "elsewhere") else ""
+    return f"{cell.standing.state} {activity}".strip()
 
 
-def _steps(each: CellStanding) -> str:
+def _steps(each: CellStatus) -> str:
     figures, steps = each.standing.figures, f"{each.cell.steps:,}"
     if each.standing.state == "done" or figures.get("what", "").startswith("evaluat"):
         return f"{steps} of {steps}"
@@ -185,13 +185,16 @@ def _steps(each: CellStanding) -> str:
 
 def _results(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Draw the results, with those options that were swept."""
-    fixed = ("network", "scenario", "recipe", "seed")
+    identity = ("network", "scenario", "recipe", "seed")
     recipes = {row["recipe"] for row in rows}
-    shown = [*fixed, *(key for key in OPTIONS_SHOWN if len({(row["recipe"], row[key]) for row in rows}) > len(recipes))]
-    table = Table(*shown, "λ̄", "service", "gap to the bound")
+    columns = [
+        *identity,
+        *(key for key in OPTIONS_SHOWN if len({(row["recipe"], row[key]) for row in rows}) > len(recipes)),
+    ]
+    table = Table(*columns, "λ̄", "service", "gap to the bound")
     for row in rows:
         figures = (("circularity", "{:.5g}"), ("service", "{:.4f}"), ("gap", "{:.1%}"))
-        table.add_row(*(str(row[key]) for key in shown), *(_figure(row, key, form) for key, form in figures))
+        table.add_row(*(str(row[key]) for key in columns), *(_figure(row, key, form) for key, form in figures))
     return table
 
 

@@ -63,17 +63,17 @@ class Evaluation:
         The file in the run is left as it is if this evaluation has no bounds and the file is of the same checkpoint in
         the same episodes, as it may have them.
         """
-        kept = self.run.path / "evaluation.json"
-        if path is not None or self.bounded or not self._is_kept(kept):
-            write_json(kept if path is None else Path(path), self.figures)
-        return kept if path is None else Path(path)
+        own_path = self.run.path / "evaluation.json"
+        if path is not None or self.bounded or not self._is_kept(own_path):
+            write_json(own_path if path is None else Path(path), self.figures)
+        return own_path if path is None else Path(path)
 
     def _is_kept(self, path: Path) -> bool:
         try:
-            kept = json.loads(path.read_text()) if path.is_file() else {}
+            stored = json.loads(path.read_text()) if path.is_file() else {}
         except ValueError as error:
             raise RunError(f"{path}: cannot be read: {error}; delete it to evaluate anew") from error
-        return all(kept.get(name) == self.figures[name] for name in ("checkpoint", "episodes", "first_seed"))
+        return all(stored.get(name) == self.figures[name] for name in ("checkpoint", "episodes", "first_seed"))
 
 
 def evaluate(

@@ -68,22 +68,22 @@ def solve_baseline(
     near: Bound | None = None
     for row, service in enumerate(services):
 
-        def tell(solved: int, row: int = row) -> None:
-            progress((row + solved / SOLVES) / len(services))
+        def tell(count: int, row: int = row) -> None:
+            progress((row + count / SOLVES) / len(services))
 
         tell(0)
-        asked = levels_to_demand(service)
-        level = tuple(np.rint(asked.mean(axis=0) / STEP).astype(int).tolist())
+        demand = levels_to_demand(service)
+        level = tuple(np.rint(demand.mean(axis=0) / STEP).astype(int).tolist())
         if level not in members:
-            found = envelope(
-                network, starts, solves=SOLVES, min_service=asked, agents=agents or None, near=near, progress=tell
+            solution = envelope(
+                network, starts, solves=SOLVES, min_service=demand, agents=agents or None, near=near, progress=tell
             )
-            members[level] = found.members
-            near = found.members[0]
-    everyone = Envelope(tuple(each for level in sorted(members) for each in members[level]))
+            members[level] = solution.members
+            near = solution.members[0]
+    union = Envelope(tuple(member for level in sorted(members) for member in members[level]))
     least = [min(level, default=1.0 / STEP) for level in members]
     levels = STEP * np.linspace(min(least), max(least), FRONT)
-    return Baseline(everyone, np.stack([levels, everyone.at(starts.mean(axis=0), levels[:, None])], axis=1))
+    return Baseline(union, np.stack([levels, union.at(starts.mean(axis=0), levels[:, None])], axis=1))
 
 
 def bounds_of_draws(
@@ -113,14 +113,14 @@ def bounds_of_draws(
         NoCertificate: if the network has flows for which nothing is proved.
         CirlError: if the solver fails.
     """
-    found = np.empty((len(services), len(starts)))
+    proofs = np.empty((len(services), len(starts)))
     for i, (start, row) in enumerate(zip(starts, factors.tolist(), strict=True)):
         certain, near = draw_network(network, row), None
         for k, levels in enumerate(services):
             near = bound(certain, start, min_service=levels_to_demand(levels[i]), agents=agents or None, near=near)
-            found[k, i] = near.objective
+            proofs[k, i] = near.objective
             progress((i + (k + 1) / len(services)) / len(starts))
-    return [*found]
+    return [*proofs]
 
 
 def levels_to_demand(levels: Floats) -> Floats:

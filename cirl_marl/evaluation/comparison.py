@@ -26,7 +26,7 @@ FIGURES = ("circularity", "gain", "service", "bound", "gap")
 EVERYWHERE = (-np.inf, np.inf)
 LIMITS = {"service": SHARE, "gap": (0.0, np.inf)}
 """Within which figures lie: the bound is proved, so that no gap is below 0."""
-SOLVING = 0.7
+SOLVER_SHARE = 0.7
 """Share of solving programs in the work on bounds; the rest is to evaluate their multipliers for every episode."""
 ProgressReport = Callable[[str, float], None]
 """Takes what is being done and the share of all that is done."""
@@ -83,14 +83,14 @@ class Row:
         """Whether there are fewer training seeds than an interval over them should rest on."""
         return 0 < len(self.seeds) < ENOUGH_SEEDS
 
-    def figure(self, which: str) -> Aggregate | None:
+    def figure(self, name: str) -> Aggregate | None:
         """Return one of FIGURES: over seeds the IQM of means over episodes, else the mean over episodes."""
-        samples = [getattr(entry, which) for entry in self.entries]
-        if any(each is None for each in samples):
+        samples = [getattr(entry, name) for entry in self.entries]
+        if any(sample is None for sample in samples):
             return None
         if not self.seeds:
-            return over_episodes(samples[0], LIMITS.get(which, EVERYWHERE))
-        return over_seeds([[each.mean() for each in samples]])
+            return over_episodes(samples[0], LIMITS.get(name, EVERYWHERE))
+        return over_seeds([[sample.mean() for sample in samples]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,10 +114,10 @@ class Comparison:
     @property
     def rows(self) -> tuple[Row, ...]:
         """Entries by name: seeds of one recipe together."""
-        grouped: dict[str, list[Entry]] = {}
+        groups: dict[str, list[Entry]] = {}
         for entry in self.entries:
-            grouped.setdefault(entry.name, []).append(entry)
-        return tuple(Row(name, tuple(entries)) for name, entries in grouped.items())
+            groups.setdefault(entry.name, []).append(entry)
+        return tuple(Row(name, tuple(entries)) for name, entries in groups.items())
 
 
 def compare(
@@ -160,35 +160,43 @@ def compare(
         raise CirlError(f"episodes must be at least 2 for a confidence interval, got {episodes}")
     if network is None and scenario is not None:
         raise CirlError(f"scenario '{scenario}' goes with a network; runs have their own")
-    found = load_network(network) if isinstance(network, str | Path) else network
+    definition = load_network(network) if isinstance(network, str | Path) else network
     from cirl_marl.learners.interface import Trained  # it needs torch
 
-    asked = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
-    everyone = controllers if "neutral" in controllers else ["neutral", *controllers]
-    entered, env = contenders(
-        asked, everyone, None if found is None else found.scenario(scenario), min_service, uncertain
+    run_directories = [run if isinstance(run, RunDirectory) else RunDirectory(run) for run in runs]
+    controls = controllers if "neutral" in controllers else ["neutral", *controllers]
+    candidates, env = contenders(
+        run_directories,
+        controls,
+        None if definition is None else definition.scenario(scenario),
+        min_service,
+        uncertain,
     )
     first = first_seed(seed)
-    share = 1 / (len(entered) + (len({each.name for each in entered}) if bounds else 0))
+    share = 1 / (len(candidates) + (len({each.name for each in candidates}) if bounds else 0))
     rollouts, checkpoints = [], []
-    for place, contender in enumerate(entered):
+    for place, contender in enumerate(candidates):
         controller = contender.controller()
         checkpoints.append(controller.checkpoint.name if isinstance(controller, Trained) else "")
-        watched = ProgressController(controller, part_of(progress, contender.name, place * share, share))
-        rollouts.append(rollout(contender.env(episodes), watched, seed=first, progress=watched.report_steps))
-    measure, proved = _unproved(len(entered), "")
+        reporter = ProgressController(controller, part_of(progress, contender.name, place * share, share))
+        rollouts.append(rollout(contender.env(episodes), reporter, seed=first, progress=reporter.report_steps))
+    measure, bounds_by_entry = _without_bounds(len(candidates), "")
     if bounds:
-        first_env, done = entered[0].env(episodes), len(entered) * share
-        starts, names = starting_stocks(first_env, first), [each.name for each in entered]
-        told = part_of(progress, "bounds", done, 1 - done)
+        first_env, done = candidates[0].env(episodes), len(candidates) * share
+        starts, names = starting_stocks(first_env, first), [each.name for each in candidates]
+        report = part_of(progress, "bounds", done, 1 - done)
         if (factors := first_env.physical.factors_if_any) is None:
-            measure, proved = _measured(env, starts, names, rollouts, told)
+            measure, bounds_by_entry = _certain_bounds(env, starts, names, rollouts, report)
         else:
-            measure, proved = _measured_draws(env, starts, factors.T, rollouts, told)
-    neutral = next(run for who, run in zip(entered, rollouts, strict=True) if who.run is None and who.name == "neutral")
+            measure, bounds_by_entry = _bounds_with_draws(env, starts, factors.T, rollouts, report)
+    neutral = next(
+        run
+        for candidate, run in zip(candidates, rollouts, strict=True)
+        if candidate.run is None and candidate.name == "neutral"
+    )
     entries = tuple(
-        Entry(who.name, who.seed, who.run, checkpoint, run, gain(run, neutral), bound)
-        for who, checkpoint, run, bound in zip(entered, checkpoints, rollouts, proved, strict=True)
+        Entry(candidate.name, candidate.seed, candidate.run, checkpoint, run, gain(run, neutral), bound)
+        for candidate, checkpoint, run, bound in zip(candidates, checkpoints, rollouts, bounds_by_entry, strict=True)
     )
     return Comparison(env.network, env.agents, first, entries, measure)
 
@@ -199,7 +207,7 @@ def starting_stocks(env: MultiAgentVectorEnv, seed: int) -> Floats:
     return env.physical.stock[env.rows.nodes].T.copy()
 
 
-def _measured(
+def _certain_bounds(
     env: MultiAgentVectorEnv,
     starts: Floats,
     names: Sequence[str],
@@ -210,22 +218,22 @@ def _measured(
     services: dict[str, list[Floats]] = {}
     for name, run in zip(names, rollouts, strict=True):
         services.setdefault(name, []).append(run.episode_levels)
-    delivered = [np.mean(each, axis=0) for each in services.values()]
+    levels = [np.mean(samples, axis=0) for samples in services.values()]
     try:
         measure = solve_baseline(
-            env.network, env.agents, starts, delivered, progress=lambda share: progress(SOLVING * share)
+            env.network, env.agents, starts, levels, progress=lambda share: progress(SOLVER_SHARE * share)
         )
-        proved: list[Floats | None] = []
+        bounds: list[Floats | None] = []
         for run in rollouts:
-            proved.append(measure.at(starts, run.episode_levels))
-            progress(SOLVING + (1 - SOLVING) * len(proved) / len(rollouts))
-        return measure, proved
+            bounds.append(measure.at(starts, run.episode_levels))
+            progress(SOLVER_SHARE + (1 - SOLVER_SHARE) * len(bounds) / len(rollouts))
+        return measure, bounds
     except NoCertificate as missing:
         progress(1.0)
-        return _unproved(len(rollouts), str(missing))
+        return _without_bounds(len(rollouts), str(missing))
 
 
-def _measured_draws(
+def _bounds_with_draws(
     env: MultiAgentVectorEnv,
     starts: Floats,
     factors: Floats,
@@ -235,17 +243,17 @@ def _measured_draws(
     """Return the bounds of the episodes of each rollout, every episode with the numbers that it drew."""
     levels = [run.episode_levels for run in rollouts]
     try:
-        proved = bounds_of_draws(env.network, env.agents, starts, factors, levels, progress=progress)
+        bounds = bounds_of_draws(env.network, env.agents, starts, factors, levels, progress=progress)
     except NoCertificate as missing:
-        return _unproved(len(rollouts), str(missing))
-    return Baseline(None, np.empty((0, 2))), [*proved]
+        return _without_bounds(len(rollouts), str(missing))
+    return Baseline(None, np.empty((0, 2))), [*bounds]
 
 
-def _unproved(entries: int, reason: str) -> tuple[Baseline, list[Floats | None]]:
+def _without_bounds(entries: int, reason: str) -> tuple[Baseline, list[Floats | None]]:
     return Baseline(None, np.empty((0, 2)), reason), [None] * entries
 
 
-def part_of(progress: ProgressReport, what: str, done: float, share: float) -> Callable[[float], None]:
+def part_of(progress: ProgressReport, activity: str, done: float, share: float) -> Callable[[float], None]:
     """Return what takes the part that is done of something that makes up a ``share`` of all and follows on ``done``."""
-    progress(what, done)
-    return lambda part: progress(what, done + share * min(1.0, part))
+    progress(activity, done)
+    return lambda part: progress(activity, done + share * min(1.0, part))

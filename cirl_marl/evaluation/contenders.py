@@ -57,42 +57,47 @@ def contenders(
     if envs and envs[0].network.name == first.network.name:
         first = MultiAgentVectorEnv(first.network, num_envs=1, agents=envs[0].agents, uncertain=draws)
     for run, env in zip(runs, envs, strict=True):
-        where = "the network given" if network is not None else str(runs[0].path)
-        if found := list(differences(env, first)):
-            raise RunError(f"{run.path}: not the same environment as {where}: {'; '.join(found)}")
+        reference = "the network given" if network is not None else str(runs[0].path)
+        if mismatches := list(differences(env, first)):
+            raise RunError(f"{run.path}: not the same environment as {reference}: {'; '.join(mismatches)}")
 
-    def shared(copies: int) -> MultiAgentVectorEnv:
+    def common_env(copies: int) -> MultiAgentVectorEnv:
         if network is None:
             return runs[0].make_env(copies, uncertain=uncertain)
         return MultiAgentVectorEnv(network, num_envs=copies, agents=first.agents, uncertain=draws)
 
-    plain = [_untrained(name, shared, min_service) for name in controllers]
-    return [*_trained(runs, uncertain), *plain], first
+    plain = [_controller(name, common_env, min_service) for name in controllers]
+    return [*_policies(runs, uncertain), *plain], first
 
 
-def differences(env: MultiAgentVectorEnv, other: MultiAgentVectorEnv) -> Iterator[str]:
-    """Yield what makes an episode of ``env`` another than one of ``other``; observations and rewards do not count."""
-    ours, theirs = env.network, other.network
-    if ours.name != theirs.name:
-        yield f"network '{ours.name}', not '{theirs.name}'"
+def differences(env: MultiAgentVectorEnv, reference_env: MultiAgentVectorEnv) -> Iterator[str]:
+    """Yield what makes an episode of ``env`` another than one of ``reference_env``.
+
+    Observations and rewards do not count.
+    """
+    ours, reference_network = env.network, reference_env.network
+    if ours.name != reference_network.name:
+        yield f"network '{ours.name}', not '{reference_network.name}'"
         return
-    if env.agents != other.agents:
-        yield f"agents {list(env.agents)}, not {list(other.agents)}"
-    if env.uncertain != other.uncertain:
-        said = ("drawn", "not drawn") if env.uncertain else ("not drawn", "drawn")
-        yield f"uncertain numbers {said[0]}, there {said[1]}; say which with uncertain"
-    physics, reference = _physics(ours), _physics(theirs)
-    found = [
-        f"{what} {physics[what]!r}, not {reference[what]!r}" for what in physics if physics[what] != reference[what]
+    if env.agents != reference_env.agents:
+        yield f"agents {list(env.agents)}, not {list(reference_env.agents)}"
+    if env.uncertain != reference_env.uncertain:
+        words = ("drawn", "not drawn") if env.uncertain else ("not drawn", "drawn")
+        yield f"uncertain numbers {words[0]}, there {words[1]}; say which with uncertain"
+    physics, reference = _physics(ours), _physics(reference_network)
+    changes = [
+        f"{quantity} {physics[quantity]!r}, not {reference[quantity]!r}"
+        for quantity in physics
+        if physics[quantity] != reference[quantity]
     ]
-    parts, counterparts = _parts(ours), _parts(theirs)
-    changed = [f"'{key[1]}'" for key in parts | counterparts if parts.get(key) != counterparts.get(key)]
-    if changed:
-        found.append(f"the definition of {', '.join(changed[:5])}{' and others' if len(changed) > 5 else ''}")
-    if found and ours.scenario_name != theirs.scenario_name:
-        yield f"scenario '{ours.scenario_name}', not '{theirs.scenario_name}'"
+    parts, counterparts = _parts(ours), _parts(reference_network)
+    ids = [f"'{key[1]}'" for key in parts | counterparts if parts.get(key) != counterparts.get(key)]
+    if ids:
+        changes.append(f"the definition of {', '.join(ids[:5])}{' and others' if len(ids) > 5 else ''}")
+    if changes and ours.scenario_name != reference_network.scenario_name:
+        yield f"scenario '{ours.scenario_name}', not '{reference_network.scenario_name}'"
     else:
-        yield from found
+        yield from changes
 
 
 def _physics(network: Network) -> dict[str, Any]:
@@ -112,26 +117,26 @@ def _parts(network: Network) -> dict[tuple[str, str], object]:
     return parts | {("service", service.id): service for service in network.services}
 
 
-def _trained(runs: Sequence[RunDirectory], uncertain: bool | None) -> Iterator[Contender]:
+def _policies(runs: Sequence[RunDirectory], uncertain: bool | None) -> Iterator[Contender]:
     """Yield the policies; runs that differ in their seed alone have one name, and one that is not complete its own."""
     names: dict[str, str] = {}
-    seen: dict[tuple[str, int], RunDirectory] = {}
+    runs_by_seed: dict[tuple[str, int], RunDirectory] = {}
     for run in runs:
         config = run.config
         plain = config.model_dump(mode="json")
         status = run.status
-        asked = repr([plain[field] for field in ("recipe", "steps", "envs", "options")])
+        settings = repr([plain[field] for field in ("recipe", "steps", "envs", "options")])
         name = config.recipe.name
         if status["state"] != "complete":
             name += f", {status['state']} after {status['joint_steps'] * config.envs:,} of {config.steps:,} steps"
-            asked += str(run.path)
-        if asked not in names:
-            names[asked] = f"{name} ({run.path})" if name in (*names.values(), *CONTROLLERS) else name
-        twin = seen.setdefault((asked, config.seed), run)
+            settings += str(run.path)
+        if settings not in names:
+            names[settings] = f"{name} ({run.path})" if name in (*names.values(), *CONTROLLERS) else name
+        twin = runs_by_seed.setdefault((settings, config.seed), run)
         if twin is not run:
             raise RunError(f"{run.path}: the same recipe and seed {config.seed} as {twin.path}; give one of them")
         env = partial(run.make_env, uncertain=uncertain)
-        yield Contender(names[asked], config.seed, run, partial(_policy, run), env)
+        yield Contender(names[settings], config.seed, run, partial(_policy, run), env)
 
 
 def _policy(run: RunDirectory) -> Controller:
@@ -140,8 +145,8 @@ def _policy(run: RunDirectory) -> Controller:
     return Trained(run)
 
 
-def _untrained(name: str, env: Callable[[int], MultiAgentVectorEnv], min_service: ArrayLike | None) -> Contender:
-    demanded = min_service if name in ("mpc", "optimum") else None
-    controller = partial(named_controller, name, min_service=demanded)
+def _controller(name: str, env: Callable[[int], MultiAgentVectorEnv], min_service: ArrayLike | None) -> Contender:
+    service = min_service if name in ("mpc", "optimum") else None
+    controller = partial(named_controller, name, min_service=service)
     controller()  # an unknown name fails before anything is computed
     return Contender(name, None, None, controller, env)

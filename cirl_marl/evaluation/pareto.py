@@ -23,7 +23,7 @@ from cirl_marl.optimum import Bound, Envelope, NoCertificate, achieved, bound, i
 from cirl_marl.optimum.bounds import highest_service
 from cirl_marl.optimum.mpc import SERVICE_FIRST
 
-WEIGHED = ("mixed", "mixed_difference", "team")
+WEIGHTED_REWARDS = ("mixed", "mixed_difference", "team")
 """Reward modes in which the circularity weight has a part."""
 
 
@@ -77,7 +77,7 @@ def pareto_front(
     episodes: int = 16,
     on: str = "here",
     workers: int | None = None,
-    progress: ProgressReport = lambda what, share: None,
+    progress: ProgressReport = lambda activity, share: None,
 ) -> ParetoFront:
     """ParetoFront the weight between circularity and service.
 
@@ -107,41 +107,41 @@ def pareto_front(
     check_place(on, workers)
     if points < 2 or seeds < 1:
         raise CirlError(f"points must be at least 2 and seeds at least 1, got {points} and {seeds}")
-    found = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
-    chosen = _unpriced(load_recipe(recipe) if isinstance(recipe, str | Path) else recipe)
-    if chosen is not None:
-        _check_fit(found, chosen)
-    asked: list[_Asked] = []
-    if chosen is not None:
+    definition = (load_network(network) if isinstance(network, str | Path) else network).scenario(scenario)
+    recipe_ = _without_service_price(load_recipe(recipe) if isinstance(recipe, str | Path) else recipe)
+    if recipe_ is not None:
+        _check_fit(definition, recipe_)
+    jobs: list[_TrainingJob] = []
+    if recipe_ is not None:
         weights = [(place / (points - 1), seed) for place in range(points) for seed in range(seeds)]
-        asked = [_Asked(found, chosen, weight, seed, steps, directory / "runs") for weight, seed in weights]
-        for each in asked:
-            each.check()
-    share = points / (points + len(asked))
+        jobs = [_TrainingJob(definition, recipe_, weight, seed, steps, directory / "runs") for weight, seed in weights]
+        for job in jobs:
+            job.check()
+    share = points / (points + len(jobs))
     reason = ""
     possible: tuple[Point, ...] = ()
     front = np.empty((0, 2))
     try:
-        possible, front = _possible(found, points, lambda what, part: progress(what, part * share))
+        possible, front = _possible(definition, points, lambda activity, part: progress(activity, part * share))
     except NoCertificate as missing:
-        if chosen is None:
+        if recipe_ is None:
             raise
         reason, share = str(missing), 0.0
-    if chosen is None:
-        return ParetoFront(found, None, possible, front=front)
+    if recipe_ is None:
+        return ParetoFront(definition, None, possible, front=front)
 
     def watch(standings: Sequence[Standing]) -> None:
-        busy = [each.name for each in standings if each.state == "running"]
-        done = sum(each.share for each in standings) / len(standings)
+        busy = [job.name for job in standings if job.state == "running"]
+        done = sum(job.share for job in standings) / len(standings)
         progress(f"training {', '.join(busy)}", share + (1 - share) * done)
 
-    raise_first(run_jobs(asked, directory / "runs" / "jobs", on=on, workers=workers, watch=watch))
-    runs = [each.directory for each in asked]
-    return ParetoFront(found, chosen, (*possible, *_learnt(runs, episodes)), tuple(runs), reason, front)
+    raise_first(run_jobs(jobs, directory / "runs" / "jobs", on=on, workers=workers, watch=watch))
+    runs = [job.directory for job in jobs]
+    return ParetoFront(definition, recipe_, (*possible, *_policy_points(runs, episodes)), tuple(runs), reason, front)
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class _TrainingJob:
     """A training run of a sweep, as a job."""
 
     network: Network
@@ -189,20 +189,20 @@ class _Asked:
             return
         config = self.directory.config
         steps = self.recipe.run.steps if self.steps is None else self.steps
-        found = list(differences(self.directory.make_env(1), _env(self.network, self.recipe)))
-        found += [f"{config.steps} steps, not {steps}"] if config.steps != steps else []
-        found += ["another recipe of this name"] if config.recipe != self.recipe else []
-        if found:
+        mismatches = list(differences(self.directory.make_env(1), _env(self.network, self.recipe)))
+        mismatches += [f"{config.steps} steps, not {steps}"] if config.steps != steps else []
+        mismatches += ["another recipe of this name"] if config.recipe != self.recipe else []
+        if mismatches:
             path = self.directory.path
-            raise RunError(f"{path}: is of another sweep ({'; '.join(found)}); choose another folder")
+            raise RunError(f"{path}: is of another sweep ({'; '.join(mismatches)}); choose another folder")
 
 
-def _unpriced(recipe: Recipe | None) -> Recipe | None:
+def _without_service_price(recipe: Recipe | None) -> Recipe | None:
     """Return a recipe without a demanded service and its price, as what is swept must not move."""
     if recipe is None:
         return None
-    fixed = {"min_service": None, "price_rate": 0.0, "price_damping": 0.0}
-    return recipe.model_copy(update={"run": recipe.run.model_copy(update=fixed)})
+    overrides = {"min_service": None, "price_rate": 0.0, "price_damping": 0.0}
+    return recipe.model_copy(update={"run": recipe.run.model_copy(update=overrides)})
 
 
 def _env(network: Network, recipe: Recipe) -> MultiAgentVectorEnv:
@@ -211,37 +211,39 @@ def _env(network: Network, recipe: Recipe) -> MultiAgentVectorEnv:
 
 
 def _check_fit(network: Network, recipe: Recipe) -> None:
-    named = recipe.environment.get("scenario", network.scenario_name)
-    if named != network.scenario_name:
+    scenario = recipe.environment.get("scenario", network.scenario_name)
+    if scenario != network.scenario_name:
         raise CirlError(
-            f"recipe '{recipe.name}' is for scenario '{named}', the sweep for '{network.scenario_name}': ask for one"
+            f"recipe '{recipe.name}' is for scenario '{scenario}', the sweep for '{network.scenario_name}': ask for one"
         )
     env = _env(network, recipe)
     recipe.check_agents(env.agents)
-    if env.reward_mode not in WEIGHED:
+    if env.reward_mode not in WEIGHTED_REWARDS:
         raise CirlError(
             f"recipe '{recipe.name}' is paid by '{env.reward_mode}', in which the weight of circularity has no part; "
-            f"choose one that is paid by {', '.join(WEIGHED)}"
+            f"choose one that is paid by {', '.join(WEIGHTED_REWARDS)}"
         )
 
 
 def _possible(network: Network, points: int, progress: ProgressReport) -> tuple[tuple[Point, ...], Floats]:
     """Return bounds by demanded service, what their improved plans do in the simulator, and the front they prove."""
-    found: list[Point] = []
+    results: list[Point] = []
     bounds: list[Bound] = []
     progress("bounds and plans", 0.0)
     least = float(bound(network, service_weight=1 / SERVICE_FIRST).levels.min(initial=1.0))
     most = highest_service(network)
     for place, level in enumerate(_levels(least, most, points)):
-        solved = bound(network, min_service=level, near=bounds[-1] if bounds else None)
-        bounds.append(solved)
-        found.append(Point(kind="bound", service=level, circularity=solved.objective))
-        episode = achieved(improved(solved, progress=part_of(progress, "bounds and plans", place / points, 1 / points)))
+        solution = bound(network, min_service=level, near=bounds[-1] if bounds else None)
+        bounds.append(solution)
+        results.append(Point(kind="bound", service=level, circularity=solution.objective))
+        episode = achieved(
+            improved(solution, progress=part_of(progress, "bounds and plans", place / points, 1 / points))
+        )
         service, circularity = float(episode.least_service[0]), float(episode.episode_circularity[0])
-        found.append(Point(kind="plan", service=service, circularity=circularity))
+        results.append(Point(kind="plan", service=service, circularity=circularity))
         progress("bounds and plans", (place + 1) / points)
     levels = np.linspace(least, most, FRONT)
-    return tuple(found), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels[:, None])], axis=1)
+    return tuple(results), np.stack([levels, Envelope(tuple(bounds)).at(min_service=levels[:, None])], axis=1)
 
 
 def _levels(least: float, most: float, points: int) -> list[float]:
@@ -250,7 +252,7 @@ def _levels(least: float, most: float, points: int) -> list[float]:
     return sorted({math.floor(level * 1e4) / 1e4 for level in levels.tolist()})
 
 
-def _learnt(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
+def _policy_points(runs: Sequence[RunDirectory], episodes: int) -> Iterator[Point]:
     """Yield where the policies are, and neutral control."""
     for entry in compare(runs, ["neutral"], episodes=episodes, bounds=False).entries:
         yield Point(

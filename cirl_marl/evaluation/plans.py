@@ -53,8 +53,8 @@ def plan(
         RunError: if the run is incomplete.
     """
     env, controller = _environment_and_controller(source, control, scenario, min_service)
-    watched = ProgressController(controller, progress)
-    table = schedule(env, watched, seed=seed, progress=watched.report_steps)
+    reporter = ProgressController(controller, progress)
+    table = schedule(env, reporter, seed=seed, progress=reporter.report_steps)
     name = type(control).__name__ if isinstance(control, Controller) else control or ""
     return replace(table, control=name, note=controller.note)
 

@@ -65,7 +65,7 @@ class ComparedQuantity:
         return largest / max(abs(float(there[0])), self.round_off) if largest > self.round_off else 0.0
 
 
-def rank_quantities(found: Sequence[Simulation]) -> list[ComparedQuantity]:
+def rank_quantities(simulations: Sequence[Simulation]) -> list[ComparedQuantity]:
     """Return the figures of episodes of ``simulate_alternatives``, those first that differ most.
 
     They are λ̄, the mean level of each service, the mass that each arc moved in the episode, and the stock of each node
@@ -73,12 +73,12 @@ def rank_quantities(found: Sequence[Simulation]) -> list[ComparedQuantity]:
 
     The order is that of ``ComparedQuantity.rank``. Round-off is ``ROUND_OFF`` of the largest value of the same kind.
     """
-    figures = [_figures(each) for each in found]
+    figures = [_figures(figures_of_one) for figures_of_one in simulations]
     quantities: list[ComparedQuantity] = []
     for kind in NAMES:
-        ids = list(dict.fromkeys(id_ for each in figures for id_ in each[kind]))
-        values = np.array([[each[kind].get(id_, math.nan) for each in figures] for id_ in ids])
-        unit = "1" if kind == "service" else found[0].network.mass_unit
+        ids = list(dict.fromkeys(id_ for figures_of_one in figures for id_ in figures_of_one[kind]))
+        values = np.array([[figures_of_one[kind].get(id_, math.nan) for figures_of_one in figures] for id_ in ids])
+        unit = "1" if kind == "service" else simulations[0].network.mass_unit
         round_off = ROUND_OFF * float(np.abs(np.nan_to_num(values)).max(initial=0.0))
         quantities += (ComparedQuantity(kind, id_, unit, row, round_off) for id_, row in zip(ids, values, strict=True))
     return sorted(quantities, key=lambda quantity: -quantity.rank)
@@ -88,10 +88,10 @@ def _figures(alternative: Simulation) -> dict[QuantityKind, dict[str, float]]:
     """Return the figures of an episode by kind and id."""
     network, run = alternative.network, alternative.rollout
     duration = network.episode.horizon * network.episode.control_interval
-    levels, moved, stocks = run.episode_levels[0], run.mean_flow * duration, run.final_stock
+    levels, masses, stocks = run.episode_levels[0], run.mean_flow * duration, run.final_stock
     return {
         "circularity": {"": float(run.episode_circularity[0])},
         "service": dict(zip((service.id for service in network.services), levels.tolist(), strict=True)),
-        "flow": dict(zip((arc.id for arc in network.arcs), moved.tolist(), strict=True)),
+        "flow": dict(zip((arc.id for arc in network.arcs), masses.tolist(), strict=True)),
         "stock": dict(zip((node.id for node in network.stores), stocks.tolist(), strict=True)),
     }

@@ -96,7 +96,7 @@ def rbd_fast() -> ModuleType:
         raise CirlError(f"which uncertain number matters is told by SALib: {advice}") from missing
 
 
-def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
+def sensitivities(episodes: SampledEpisodes) -> list[Sensitivity]:
     """Return what causes the spread of λ̄, and of the mean level of each service.
 
     The indices are estimated from the samples themselves, by RBD-FAST (Tarantola, Gatelli and Mara 2006) with the
@@ -106,20 +106,24 @@ def sensitivities(found: SampledEpisodes) -> list[Sensitivity]:
         CirlError: for fewer than 70 samples, from which nothing can be told, or if SALib is missing.
     """
     analysis = rbd_fast()
-    count = len(found.circularity)
+    count = len(episodes.circularity)
     if count < FEWEST:
         raise CirlError(f"{count} samples are too few to tell which number matters; take {FEWEST} or more")
     # it takes the order of the draws alone
-    problem = {"num_vars": len(found.names), "names": list(found.names), "bounds": [[0.0, 1.0]] * len(found.names)}
-    figures = {"λ̄": found.circularity.mean(axis=1)}
-    levels = found.levels.mean(axis=2)
-    figures |= {f"level of {each.id}": levels[:, s] for s, each in enumerate(found.network.services)}
-    told = []
+    problem = {
+        "num_vars": len(episodes.names),
+        "names": list(episodes.names),
+        "bounds": [[0.0, 1.0]] * len(episodes.names),
+    }
+    figures = {"λ̄": episodes.circularity.mean(axis=1)}
+    levels = episodes.levels.mean(axis=2)
+    figures |= {f"level of {service.id}": levels[:, s] for s, service in enumerate(episodes.network.services)}
+    causes = []
     for name, values in figures.items():
         if np.ptp(values) <= 1e-12 * np.abs(values).max(initial=0.0):
-            nothing = np.full(len(found.names), np.nan)
-            told.append(Sensitivity(name, nothing, nothing))
+            undefined = np.full(len(episodes.names), np.nan)
+            causes.append(Sensitivity(name, undefined, undefined))
             continue
-        solved = analysis.analyze(problem, found.factors, values, num_resamples=RESAMPLES, seed=0)
-        told.append(Sensitivity(name, np.array(solved["S1"]), np.array(solved["S1_conf"])))
-    return told
+        indices = analysis.analyze(problem, episodes.factors, values, num_resamples=RESAMPLES, seed=0)
+        causes.append(Sensitivity(name, np.array(indices["S1"]), np.array(indices["S1_conf"])))
+    return causes

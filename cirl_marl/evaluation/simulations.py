@@ -59,19 +59,19 @@ class Simulation:
         stock, load = env.rows.stocks(start.stock)[:, 0], env.dynamics.batches.loads(start.stock)[:, 0]
         inner = start.inner[env.dynamics.inner.visible, 0]
         lambdas = (run.circularity[0], run.circularity_mean[0])
-        moved = (*run.flow.T, *env.network.throughput(run.flow.T))
+        flows = (*run.flow.T, *env.network.throughput(run.flow.T))
         ages = [pyramid.mean_age for pyramid in pyramids(env.network, run, stock)]
         columns = (
             *lambdas,
             run.service[0],
             *run.stock.T,
-            *moved,
+            *flows,
             *run.load.T,
             *run.inner.T,
             *(age[1:] for age in ages),
         )
-        held = [*load.tolist(), *inner.tolist(), *(float(age[0]) for age in ages)]
-        first = [*[None] * 3, *stock.tolist(), *[None] * len(moved), *held]
+        states = [*load.tolist(), *inner.tolist(), *(float(age[0]) for age in ages)]
+        first = [*[None] * 3, *stock.tolist(), *[None] * len(flows), *states]
         times = np.concatenate([[0.0], interval_ends(env.network)])
         clock = zip(times.tolist(), *labels(env.network, times)[1], strict=True)
         rows = [first, *zip(*(column.tolist() for column in columns), strict=True)]
@@ -102,7 +102,7 @@ def simulate(
     control: str | Controller = "neutral",
     *,
     scenario: str | None = None,
-    held: Mapping[str, float] | None = None,
+    constants: Mapping[str, float] | None = None,
     steps: int | None = None,
     seed: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
@@ -118,7 +118,7 @@ def simulate(
         network: catalogue name, path of a definition file, or a network.
         control: who acts: a name of CONTROLLERS, or a controller.
         scenario: of the definition; None is the default, physical one.
-        held: agent → constant value in [−1, 1], for constant or scripted control.
+        constants: agent → constant value in [−1, 1], for constant or scripted control.
         steps: control intervals of the episode; None takes the definition's.
         seed: of the evaluation whose first episode is simulated; None begins in the middle of all initial ranges.
         progress: called with the share of the work that is done.
@@ -128,10 +128,10 @@ def simulate(
         ``rollout``; ``write`` makes a CSV file of them.
 
     Raises:
-        CirlError: if scenario or controller is unknown, does not fit the network, or does not take ``held``.
+        CirlError: if scenario or controller is unknown, does not fit the network, or does not take ``constants``.
     """
     (only,) = simulate_alternatives(
-        network, scenarios=[scenario], controls=[control], held=held, steps=steps, seed=seed, progress=progress
+        network, scenarios=[scenario], controls=[control], held=constants, steps=steps, seed=seed, progress=progress
     )
     return only
 
@@ -179,18 +179,18 @@ def simulate_alternatives(
         for _ in envs
         for control in controls
     ]
-    simulated = []
+    simulations = []
     for i, ((env, control), controller) in enumerate(zip(cases, controllers, strict=True)):
         choices = ((env.network.scenario_name, envs), (control, names))
-        name = ", ".join(chosen for chosen, among in choices if len(among) > 1)
-        watched = ProgressController(controller, partial(_tell, progress, i, len(cases)))
+        name = ", ".join(choice for choice, among in choices if len(among) > 1)
+        reporter = ProgressController(controller, partial(_tell, progress, i, len(cases)))
         try:
-            simulated.append(_simulated(name, control, env, watched, seed))
+            simulations.append(_run(name, control, env, reporter, seed))
         except CirlError as error:
             if not name:
                 raise
             raise CirlError(f"{name}: {error}") from error
-    return simulated
+    return simulations
 
 
 def _controller(control: str | Controller, held: Mapping[str, float] | None) -> Controller:
@@ -199,7 +199,9 @@ def _controller(control: str | Controller, held: Mapping[str, float] | None) -> 
     return named_controller(control, constants=held if control in SETTABLE else None)
 
 
-def _refuse(envs: Sequence[MultiAgentVectorEnv], controls: Sequence[str], held: Mapping[str, float] | None) -> None:
+def _refuse(
+    envs: Sequence[MultiAgentVectorEnv], controls: Sequence[str], constants: Mapping[str, float] | None
+) -> None:
     """Raise what ``simulate_alternatives`` raises of scenarios and controllers that exist."""
     for kind, names in (("scenario", [env.network.scenario_name for env in envs]), ("control", controls)):
         if not names:
@@ -207,22 +209,24 @@ def _refuse(envs: Sequence[MultiAgentVectorEnv], controls: Sequence[str], held: 
         for name in names:
             if names.count(name) > 1:
                 raise CirlError(f"{kind} '{name}' is given {names.count(name)} times")
-    if held and not set(controls) & set(SETTABLE):
+    if constants and not set(controls) & set(SETTABLE):
         raise CirlError(f"values of single agents go with {' or '.join(SETTABLE)}, not with {', '.join(controls)}")
     for env in envs[1:]:
-        if found := list(_obstacles(envs[0].network, env.network)):
-            both = f"'{envs[0].network.scenario_name}' and '{env.network.scenario_name}'"
-            raise CirlError(f"network '{env.network.name}': scenarios {both} cannot be compared: {'; '.join(found)}")
+        if obstacles := list(_obstacles(envs[0].network, env.network)):
+            pair = f"'{envs[0].network.scenario_name}' and '{env.network.scenario_name}'"
+            raise CirlError(
+                f"network '{env.network.name}': scenarios {pair} cannot be compared: {'; '.join(obstacles)}"
+            )
 
 
-def _simulated(
-    name: str, control: str, env: MultiAgentVectorEnv, watched: ProgressController, seed: int | None
+def _run(
+    name: str, control: str, env: MultiAgentVectorEnv, reporter: ProgressController, seed: int | None
 ) -> Simulation:
-    begun = episode_start(env, seed)
-    begun.reset(env)
+    start_state = episode_start(env, seed)
+    start_state.reset(env)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
-    run = rollout(env, watched, seed=begun.seed, start=begun.initial_state, progress=watched.report_steps)
-    return Simulation(name, control, env, begun, start, run)
+    run = rollout(env, reporter, seed=start_state.seed, start=start_state.initial_state, progress=reporter.report_steps)
+    return Simulation(name, control, env, start_state, start, run)
 
 
 def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -> None:
@@ -230,21 +234,26 @@ def _tell(progress: Callable[[float], None], done: int, of: int, share: float) -
     progress((done + share) / of)
 
 
-def _obstacles(one: Network, other: Network) -> Iterator[str]:
+def _obstacles(first: Network, second: Network) -> Iterator[str]:
     """Yield what keeps episodes of two scenarios from being compared, with the values of both."""
-    units = {"mass": (one.mass_unit, other.mass_unit), "time": (one.time_unit, other.time_unit)}
-    yield from (f"unit of {what} {mine} and {its}" for what, (mine, its) in units.items() if mine != its)
-    if one.time_unit != other.time_unit:
+    units = {"mass": (first.mass_unit, second.mass_unit), "time": (first.time_unit, second.time_unit)}
+    yield from (
+        f"unit of {quantity} {value_1} and {value_2}"
+        for quantity, (value_1, value_2) in units.items()
+        if value_1 != value_2
+    )
+    if first.time_unit != second.time_unit:
         return  # times would differ even where they are the same
-    intervals = (one.objective.reference_interval, other.objective.reference_interval)
+    intervals = (first.objective.reference_interval, second.objective.reference_interval)
     if intervals[0] != intervals[1]:
-        yield f"reference interval of λ {intervals[0]:g} and {intervals[1]:g} {one.time_unit}"
-    ours, theirs = one.episode, other.episode
-    if ours.start != theirs.start:
-        yield f"start on the calendar {ours.start or 'none'} and {theirs.start or 'none'}"
-    if not math.isclose(ours.horizon * ours.control_interval, theirs.horizon * theirs.control_interval):
-        mine, its = (
-            f"{each.horizon} intervals of {each.control_interval:g} {one.time_unit}" for each in (ours, theirs)
+        yield f"reference interval of λ {intervals[0]:g} and {intervals[1]:g} {first.time_unit}"
+    episode_1, episode_2 = first.episode, second.episode
+    if episode_1.start != episode_2.start:
+        yield f"start on the calendar {episode_1.start or 'none'} and {episode_2.start or 'none'}"
+    if not math.isclose(episode_1.horizon * episode_1.control_interval, episode_2.horizon * episode_2.control_interval):
+        value_1, value_2 = (
+            f"{each.horizon} intervals of {each.control_interval:g} {first.time_unit}"
+            for each in (episode_1, episode_2)
         )
-        advice = "; give a number of steps for both" if ours.control_interval == theirs.control_interval else ""
-        yield f"horizon {mine} and {its}{advice}"
+        advice = "; give a number of steps for both" if episode_1.control_interval == episode_2.control_interval else ""
+        yield f"horizon {value_1} and {value_2}{advice}"

@@ -22,7 +22,7 @@ from cirl_marl.network import Floats
 
 ENOUGH_SEEDS = 5
 """Fewest training seeds whose interval is reported without a mark."""
-TRIMMED = 0.25
+TRIM_SHARE = 0.25
 """Share of the scores that the interquartile mean leaves out at either end."""
 RESAMPLES = 10_000
 
@@ -37,7 +37,7 @@ class Aggregate:
 
     def as_dict(self) -> dict[str, float | None]:
         """Return the three numbers by name; None stands for one that is not defined."""
-        return {name: defined(getattr(self, name)) for name in ("value", "low", "high")}
+        return {name: finite_or_none(getattr(self, name)) for name in ("value", "low", "high")}
 
 
 SHARE = (0.0, 1.0)
@@ -69,7 +69,7 @@ def interquartile_mean(scores: ArrayLike) -> float:
     >>> interquartile_mean([0.0, 1.0, 2.0, 3.0, 100.0])
     2.0
     """
-    return float(stats.trim_mean(np.asarray(scores, dtype=float).ravel(), TRIMMED))
+    return float(stats.trim_mean(np.asarray(scores, dtype=float).ravel(), TRIM_SHARE))
 
 
 def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Aggregate:
@@ -81,9 +81,9 @@ def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed:
     Raises:
         CirlError: if there are no scores, or a network has another number of seeds than the first.
     """
-    strata = [np.asarray(each, dtype=float) for each in scores]
+    strata = [np.asarray(sample, dtype=float) for sample in scores]
     seeds = strata[0].size if strata else 0
-    if not seeds or any(each.shape != (seeds,) for each in strata):
+    if not seeds or any(sample.shape != (seeds,) for sample in strata):
         raise CirlError(f"scores must be one sequence for each network, equally long; got {[s.shape for s in strata]}")
     value = interquartile_mean(strata)
     if seeds == 1 or not np.isfinite(value):
@@ -94,11 +94,11 @@ def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed:
     return Aggregate(value, float(interval.low), float(interval.high))
 
 
-def defined(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
     """Return a number as JSON has it: None if it is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
 def _joint_mean(*strata: Floats, axis: int = -1) -> Floats:
-    mean: Floats = stats.trim_mean(np.concatenate(strata, axis=axis), TRIMMED, axis=axis)
+    mean: Floats = stats.trim_mean(np.concatenate(strata, axis=axis), TRIM_SHARE, axis=axis)
     return mean

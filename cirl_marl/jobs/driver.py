@@ -143,8 +143,8 @@ class _Driver:
     def goes_on(self, place: Workplace | None) -> bool:
         """Look after those at work, start others, and return whether anything is left to be done."""
         for job, worker in list(self._running.values()):
-            if (how := worker.ended()) is not None:
-                self._take_back(job, how)
+            if (state := worker.ended()) is not None:
+                self._take_back(job, state)
         for job in list(self._waiting):
             if place is not None and len(self._running) >= place.workers:
                 break
@@ -159,9 +159,9 @@ class _Driver:
                 self._states[job.name] = "running"
                 self._told.pop(job.name, None)
                 self._running[job.name] = job, place.start(self._work(job))
-        left = bool(self._waiting or self._running)
-        self._look(at_once=not left)
-        return left
+        remaining = bool(self._waiting or self._running)
+        self._look(at_once=not remaining)
+        return remaining
 
     def stop(self) -> None:
         """Tell all who are at work to stop, and wait for what they save."""
@@ -171,20 +171,20 @@ class _Driver:
         while any(worker.ended() is None for _, worker in self._running.values()) and time.monotonic() < late:
             time.sleep(POLL)
 
-    def _take_back(self, job: Job, how: str) -> None:
+    def _take_back(self, job: Job, state: str) -> None:
         """Note how a worker ended: the job is done, has failed, or was somebody else's."""
         del self._running[job.name]
         files = self._files[job.name]
         if job.is_done():
             self._settle(job, "done")
-        elif not how:
+        elif not state:
             self._waiting.append(job)
             self._states[job.name] = "elsewhere"
         else:
-            said = files.figures().get("said") or ": ".join(
-                filter(None, (how, files.last_words() or "it said nothing"))
+            message = files.figures().get("said") or ": ".join(
+                filter(None, (state, files.last_words() or "it said nothing"))
             )
-            self._settle(job, "failed", Failure(job.name, said, files.log))
+            self._settle(job, "failed", Failure(job.name, message, files.log))
 
     def _do_here(self, job: Job) -> None:
         """Do a job in this process, unless somebody was faster to claim it."""
@@ -196,8 +196,8 @@ class _Driver:
         except Timeout:
             self._states[job.name] = "elsewhere"
         except Exception as error:  # of whatever kind: the others go on, and it is reported
-            said = f"{type(error).__name__}: {error}"
-            self._settle(job, "failed", Failure(job.name, said, files.log, error))
+            message = f"{type(error).__name__}: {error}"
+            self._settle(job, "failed", Failure(job.name, message, files.log, error))
         else:
             self._settle(job, "done")
 

@@ -104,12 +104,12 @@ def _in_process(work: Work) -> None:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Let processes that are started in the block compute on one thread each, unless the user said otherwise."""
-    given = "OMP_NUM_THREADS" in os.environ
+    before = "OMP_NUM_THREADS" in os.environ
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
         yield
     finally:
-        if not given:
+        if not before:
             del os.environ["OMP_NUM_THREADS"]
 
 
@@ -145,16 +145,16 @@ class Ray:
         Raises:
             CirlError: if Ray is not installed, or there is no cluster at the address.
         """
-        self._ray = _wanted("ray")
+        self._ray = _capacity("ray")
         if not self._ray.is_initialized():
             try:
                 dashboard = False if not _address() else None
                 self._ray.init(log_to_driver=False, logging_level="error", include_dashboard=dashboard)
             except (ConnectionError, ValueError) as error:
                 raise CirlError(f"no Ray at RAY_ADDRESS={_address()}: {_last_line(error)}") from error
-        found = int(self._ray.cluster_resources().get("CPU", 1))
-        self.workers = workers or found
-        self.said = f"{self.workers} at a time on the Ray cluster, which has {found} processors"
+        module = int(self._ray.cluster_resources().get("CPU", 1))
+        self.workers = workers or module
+        self.said = f"{self.workers} at a time on the Ray cluster, which has {module} processors"
         self._do = self._ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_in_task)
 
     def start(self, work: Work) -> RayTask:
@@ -173,7 +173,7 @@ def _address() -> str:
     return os.environ.get("RAY_ADDRESS", "")
 
 
-def _wanted(package: str) -> Any:
+def _capacity(package: str) -> Any:
     """Import what a place needs."""
     try:
         return import_module(package)
@@ -216,7 +216,7 @@ def check_place(on: str, workers: int | None = None, settings: Mapping[str, str]
         sbatch_options(settings or {})
     for package, extra in EXTRAS.items():
         if on == extra:
-            _wanted(package)
+            _capacity(package)
 
 
 def place_of(on: str, folder: Path, workers: int | None, settings: Mapping[str, str]) -> Workplace | None:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from cirl_marl.errors import CirlError, RunError
-from cirl_marl.jobs.work import STOPPED, Work
+from cirl_marl.jobs.work import EXIT_STOPPED, Work
 
 MINUTES = 24 * 60
 """Longest that a job may take unless something else is asked for; what is cut off goes on in another one."""
@@ -109,7 +109,7 @@ class SlurmJob:
         words = _lines(out.read_text(errors="replace"))[-1:] if out.is_file() else []
         for file in (self._file, out):
             file.unlink(missing_ok=True)
-        if state in CUT_OFF or state == f"FAILED {STOPPED}":
+        if state in CUT_OFF or state == f"FAILED {EXIT_STOPPED}":
             if _progress(self._work) != self._progress:
                 return ""
             return f"came no further in a whole job ({state}): give it more time, --slurm timeout_min=…"
@@ -176,8 +176,8 @@ class Queue:
         answer = subprocess.run(
             ["scontrol", "--oneliner", "show", "job", number], capture_output=True, text=True, check=False
         )
-        if not answer.returncode and (found := re.search(r"JobState=(\w+).* ExitCode=(\d+:\d+)", answer.stdout)):
-            return _with_code(*found.groups())
+        if not answer.returncode and (jobs := re.search(r"JobState=(\w+).* ExitCode=(\d+:\d+)", answer.stdout)):
+            return _with_code(*jobs.groups())
         answer = subprocess.run(
             ["sacct", "--noheader", "--parsable2", "--allocations", "--format=State,ExitCode", "--jobs", number],
             capture_output=True,
@@ -208,19 +208,19 @@ def sbatch_options(settings: Mapping[str, str]) -> list[str]:
     return [f"--{name}={value}" for name, value in options.items()]
 
 
-def _run(command: Sequence[str], what: str, text: str = "", environment: Mapping[str, str] | None = None) -> str:
+def _run(command: Sequence[str], purpose: str, text: str = "", environment: Mapping[str, str] | None = None) -> str:
     try:
         answer = subprocess.run(command, input=text, capture_output=True, text=True, check=False, env=environment)
     except FileNotFoundError:
         raise CirlError(f"--on slurm: there is no Slurm here (no {command[0]}); use --on local") from None
     if answer.returncode:
-        raise CirlError(f"{what}: Slurm says: {(_lines(answer.stderr) or ['nothing'])[0]}")
+        raise CirlError(f"{purpose}: Slurm says: {(_lines(answer.stderr) or ['nothing'])[0]}")
     return answer.stdout
 
 
 def _refusal(settings: Mapping[str, str]) -> str:
-    given = " ".join(f"{name}={value}" for name, value in settings.items())
-    return f"--slurm {given}" if given else "--on slurm"
+    output = " ".join(f"{name}={value}" for name, value in settings.items())
+    return f"--slurm {output}" if output else "--on slurm"
 
 
 def _progress(work: Work) -> tuple[Any, ...]:

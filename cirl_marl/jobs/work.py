@@ -23,7 +23,7 @@ from cirl_marl.records.files import write_json
 
 APART = 1.0
 """Seconds between two reports of a job."""
-STOPPED = 75
+EXIT_STOPPED = 75
 """Exit code of a worker that was told to stop, and whose work goes on in another one."""
 
 
@@ -31,7 +31,7 @@ class Tell(Protocol):
     """Takes what a job is doing, how much of it is done, and figures that are known so far."""
 
     def __call__(
-        self, what: str, done: float, total: float, figures: Callable[[], Mapping[str, Any]] = lambda: {}
+        self, activity: str, done: float, total: float, figures: Callable[[], Mapping[str, Any]] = lambda: {}
     ) -> None:
         """Say how far the job is; it may be called as often as one likes, and asks for ``figures`` now and then."""
 
@@ -86,15 +86,15 @@ class JobFiles:
             RunError: if the file is something else than what a job tells.
         """
         try:
-            found = json.loads(self.told.read_text())
+            content = json.loads(self.told.read_text())
         except FileNotFoundError:
             return {}
         except ValueError as error:
             raise RunError(f"{self.told}: is not what a job told: {error}") from error
         numbers = ("done", "total", "cpu_seconds")
-        if not isinstance(found, dict) or any(type(found.get(name, 0)) not in (int, float) for name in numbers):
-            raise RunError(f"{self.told}: is not what a job told: {found!r:.80}")
-        return found
+        if not isinstance(content, dict) or any(type(content.get(name, 0)) not in (int, float) for name in numbers):
+            raise RunError(f"{self.told}: is not what a job told: {content!r:.80}")
+        return content
 
     def last_words(self) -> str:
         """Return the last line of the log; empty if there is none."""
@@ -125,7 +125,7 @@ class Work:
         """
         os.chdir(self.directory)
         try:
-            with self.files.lock(), _redirected(self.files.log):
+            with self.files.lock(), _redirect_output(self.files.log):
                 with code_allowed(self.allow_code):
                     do(self.job, self.files, lambda: None)
         except Timeout:
@@ -139,17 +139,17 @@ def do(job: Job, files: JobFiles, listen: Callable[[], None]) -> None:
     Raises:
         Exception: what the job raised, when it is in the log and among what was told.
     """
-    told = files.figures()
-    earlier, began, last = float(told.get("cpu_seconds", 0.0)), time.process_time(), -APART
+    progress = files.figures()
+    earlier, began, last = float(progress.get("cpu_seconds", 0.0)), time.process_time(), -APART
 
-    def tell(what: str, done: float, total: float, figures: Callable[[], Mapping[str, Any]] = lambda: {}) -> None:
-        nonlocal last, told
-        if what == told.get("what") and time.monotonic() - last < APART:
+    def tell(activity: str, done: float, total: float, figures: Callable[[], Mapping[str, Any]] = lambda: {}) -> None:
+        nonlocal last, progress
+        if activity == progress.get("what") and time.monotonic() - last < APART:
             return
         last = time.monotonic()
-        now = {"what": what, "done": done, "total": total, "said": "", "host": platform.node(), "pid": os.getpid()}
-        told = {**told, **figures(), **now, "cpu_seconds": earlier + time.process_time() - began}
-        write_json(files.told, told)
+        now = {"what": activity, "done": done, "total": total, "said": "", "host": platform.node(), "pid": os.getpid()}
+        progress = {**progress, **figures(), **now, "cpu_seconds": earlier + time.process_time() - began}
+        write_json(files.told, progress)
         listen()
 
     try:
@@ -160,12 +160,12 @@ def do(job: Job, files: JobFiles, listen: Callable[[], None]) -> None:
             raise RunError(f"{job.name}: came to its end without being done")
         tell("done", 1, 1)
     except Exception as error:
-        write_json(files.told, told | {"said": f"{type(error).__name__}: {error}"})
+        write_json(files.told, progress | {"said": f"{type(error).__name__}: {error}"})
         raise
 
 
 @contextmanager
-def _redirected(log: Path) -> Iterator[None]:
+def _redirect_output(log: Path) -> Iterator[None]:
     """Let all that this process says, also from outside of Python, stand in its log."""
     with log.open("w", buffering=1) as file:
         for stream, descriptor in ((sys.stdout, 1), (sys.stderr, 2)):

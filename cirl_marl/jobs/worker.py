@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from cirl_marl.errors import RunError
-from cirl_marl.jobs.work import STOPPED, Work
+from cirl_marl.jobs.work import EXIT_STOPPED, Work
 
 
 def main(file: Path, sha256: str) -> None:
@@ -27,7 +27,7 @@ def main(file: Path, sha256: str) -> None:
     try:
         work()
     except KeyboardInterrupt:
-        sys.exit(STOPPED)
+        sys.exit(EXIT_STOPPED)
 
 
 def _stop(number: int, frame: object) -> NoReturn:

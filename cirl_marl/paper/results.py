@@ -178,7 +178,7 @@ def _read(path: Path) -> Result:
         raise RunError(f"{path}: is not the result of a row: {error!r}; delete it to run the row again") from error
 
 
-def thinned(ends: Sequence[int], returns: Sequence[float]) -> list[tuple[int, float]]:
+def thin_out(ends: Sequence[int], returns: Sequence[float]) -> list[tuple[int, float]]:
     """Return at most 500 points of a learning curve: means of consecutive episodes, at the step where the last ended.
 
     >>> thinned([50, 100], [-2.0, -1.0])

@@ -22,9 +22,9 @@ from cirl_marl.jobs import Tell
 from cirl_marl.learners.recipe import Recipe, load_recipe
 from cirl_marl.learners.trainer import one_torch_thread
 from cirl_marl.paper.published import PaperEnvironment, environment_of
-from cirl_marl.paper.results import WINDOW, Evaluation, PaperRow, Result, Results, thinned
+from cirl_marl.paper.results import WINDOW, Evaluation, PaperRow, Result, Results, thin_out
 from cirl_marl.paper.selection import tuned_recipe
-from cirl_marl.paper.training import Predict, Report, check_registered, described, train_published, train_tuned
+from cirl_marl.paper.training import Predict, Report, check_registered, describe, train_published, train_tuned
 from cirl_marl.records.machine import processor, versions
 
 PACKAGES = ("gymnasium-robotics", "mujoco")
@@ -45,34 +45,34 @@ def run_row(row: PaperRow, *, report: Report = lambda what, done, total: None, e
         _check_success(environment)
     with one_torch_thread():
         train = train_published if row.settings == "published" else train_tuned
-        trained = train(environment, row, report)
-        if not trained.returns:
+        training = train(environment, row, report)
+        if not training.returns:
             raise CirlError(f"{row}: no training episode ended; use more steps")
         episodes = _evaluation_episodes(environment, episodes)
         seed = EVALUATION_SEEDS + SEED_SPACING * row.seed
         evaluation = published_ends = None
-        if trained.predict is not None:
-            evaluation = evaluate(environment.id, trained.predict, episodes, seed, report, trained.options)
+        if training.predict is not None:
+            evaluation = evaluate(environment.id, training.predict, episodes, seed, report, training.options)
             if environment.published_ends:
-                options = trained.options | {"legacy_episode": True}  # its first episode is longer than all others
-                published_ends = evaluate(environment.id, trained.predict, episodes, seed, report, options, warm_up=1)
+                options = training.options | {"legacy_episode": True}  # its first episode is longer than all others
+                published_ends = evaluate(environment.id, training.predict, episodes, seed, report, options, warm_up=1)
         threads = torch.get_num_threads()
     machine = {"cpus": os.cpu_count(), "model": processor(), "torch_threads": threads, "device": "cpu"}
-    window = max(1, min(WINDOW, len(trained.returns) // 2))
+    window = max(1, min(WINDOW, len(training.returns) // 2))
     return Result(
         row=row,
-        steps_done=trained.steps,
-        seconds=trained.seconds,
-        episodes=len(trained.returns),
-        start_return=float(np.mean(trained.returns[:window])),
-        end_return=float(np.mean(trained.returns[-window:])),
-        curve=thinned(trained.ends, trained.returns),
+        steps_done=training.steps,
+        seconds=training.seconds,
+        episodes=len(training.returns),
+        start_return=float(np.mean(training.returns[:window])),
+        end_return=float(np.mean(training.returns[-window:])),
+        curve=thin_out(training.ends, training.returns),
         evaluation=evaluation,
-        settings=trained.settings,
+        settings=training.settings,
         versions=versions() | {package: metadata.version(package) for package in PACKAGES},
         machine=machine | {"load": os.getloadavg()[0]},
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
-        cpu_seconds=trained.cpu_seconds,
+        cpu_seconds=training.cpu_seconds,
         published_ends=published_ends,
     )
 
@@ -93,34 +93,34 @@ class RowJob:
     def is_done(self) -> bool:
         """Return whether a result is kept that ``run_row`` would give today."""
         results = Results(self.folder)
-        return results.has(self.row) and not outdated(results.read(self.row), self.episodes)
+        return results.has(self.row) and not reason_to_repeat(results.read(self.row), self.episodes)
 
     def run(self, tell: Tell) -> None:
         """Train and evaluate from the beginning, and keep the result."""
         Results(self.folder).write(run_row(self.row, report=tell, episodes=self.episodes))
 
 
-def outdated(result: Result, episodes: int | None = None) -> str:
+def reason_to_repeat(result: Result, episodes: int | None = None) -> str:
     """Return in what a result differs from what ``run_row`` would give today; empty if in nothing that is known."""
     environment, settings = environment_of(result.row.environment), result.settings
-    wanted = _evaluation_episodes(environment, episodes)
-    if result.evaluation is not None and result.evaluation.episodes != wanted:
-        return f"its policy played {result.evaluation.episodes} episodes, not {wanted}"
-    recorded = settings.get("definition_sha256")
-    if recorded is not None and recorded != described(environment).get("definition_sha256"):
+    expected = _evaluation_episodes(environment, episodes)
+    if result.evaluation is not None and result.evaluation.episodes != expected:
+        return f"its policy played {result.evaluation.episodes} episodes, not {expected}"
+    stored = settings.get("definition_sha256")
+    if stored is not None and stored != describe(environment).get("definition_sha256"):
         return "the definition of the environment is another now"
     if result.row.settings == "tuned" and (name := tuned_recipe(environment.name)) is not None:
         try:
-            same = Recipe.model_validate(settings["recipe"]) == load_recipe(name)
+            is_equal = Recipe.model_validate(settings["recipe"]) == load_recipe(name)
         except ValidationError:  # it has keys that recipes no longer have
-            same = False
-        return "" if same else f"the recipe '{name}' is another now"
+            is_equal = False
+        return "" if is_equal else f"the recipe '{name}' is another now"
     return ""
 
 
-def _evaluation_episodes(environment: PaperEnvironment, asked: int | None) -> int:
-    """Return how many episodes a final policy plays: as many as ``asked``, else 100, or the paper's that succeed."""
-    return asked or environment.success_episodes or EVALUATION_EPISODES
+def _evaluation_episodes(environment: PaperEnvironment, episodes: int | None) -> int:
+    """Return how many episodes a final policy plays: as many as ``episodes``, else 100, or the paper's that succeed."""
+    return episodes or environment.success_episodes or EVALUATION_EPISODES
 
 
 def _check_success(environment: PaperEnvironment) -> None:
@@ -145,22 +145,22 @@ def evaluate(
     env = DummyVecEnv([lambda: Monitor(gymnasium.make(id_, **options))] * copies)
     env.seed(seed)
     quota = np.array([(episodes + copy) // copies for copy in range(copies)])
-    played = np.full(copies, -warm_up)
+    episodes_done = np.full(copies, -warm_up)
     reached, starts = np.zeros(copies, dtype=bool), np.ones(copies, dtype=bool)
     returns: list[float] = []
     successes: list[bool] = []
     knows_success, state, observation = False, None, env.reset()
-    while (played < quota).any():
+    while (episodes_done < quota).any():
         actions, state = predict(observation, state, starts)
         observation, _, starts, infos = env.step(actions)
         for copy, info in enumerate(infos):
             knows_success |= "success" in info
             reached[copy] |= bool(info.get("success", False))
             if starts[copy]:
-                if 0 <= played[copy] < quota[copy]:
+                if 0 <= episodes_done[copy] < quota[copy]:
                     returns.append(float(info["episode"]["r"]))
                     successes.append(bool(reached[copy]))
-                played[copy] += 1
+                episodes_done[copy] += 1
                 reached[copy] = False
         report("evaluating", len(returns), episodes)
     env.close()

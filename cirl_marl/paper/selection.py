@@ -12,7 +12,7 @@ from cirl_marl.paper.results import PaperRow
 SETTINGS = ("published", "tuned")
 
 
-def planned(
+def select_rows(
     environment: str | None,
     algorithm: str | None,
     *,
@@ -33,15 +33,21 @@ def planned(
         raise CirlError(f"{environment} is an algorithm, which comes after an environment: {', '.join(ENVIRONMENTS)}")
     if algorithm is not None and algorithm not in ALGORITHMS:
         raise CirlError(unknown("algorithm of the paper", algorithm, ALGORITHMS))
-    asked = [] if settings == "tuned" else [(*run, "published") for run in _published(environment, algorithm)]
+    names = [] if settings == "tuned" else [(*run, "published") for run in _published_rows(environment, algorithm)]
     if settings != "published":
         only = environment is not None and settings == "tuned"
-        asked += [(*run, "tuned") for run in _tuned(environment, algorithm, must_fit=only)]
-    if not asked:
+        names += [(*run, "tuned") for run in _tuned_rows(environment, algorithm, must_fit=only)]
+    if not names:
         raise CirlError(f"there is no tuned recipe agents/paper_*.toml for {environment or algorithm or 'any'}")
     return [
-        PaperRow(environment=found.name, algorithm=name, settings=how, steps=steps or found.steps, seed=seed)
-        for found, name, how in asked
+        PaperRow(
+            environment=paper_environment.name,
+            algorithm=name,
+            settings=kind,
+            steps=steps or paper_environment.steps,
+            seed=seed,
+        )
+        for paper_environment, name, kind in names
         for seed in range(seeds)
     ]
 
@@ -50,23 +56,25 @@ def _environments(name: str | None) -> list[PaperEnvironment]:
     return list(ENVIRONMENTS.values()) if name is None else [environment_of(name)]
 
 
-def _published(environment: str | None, algorithm: str | None) -> Iterator[tuple[PaperEnvironment, str]]:
+def _published_rows(environment: str | None, algorithm: str | None) -> Iterator[tuple[PaperEnvironment, str]]:
     """Yield the paper's own runs."""
-    for found in _environments(environment):
-        if environment is not None and algorithm not in (None, *found.runs):
-            raise CirlError(f"the paper did not run {algorithm} on {found.name}; it ran {', '.join(found.runs)}")
-        yield from ((found, name) for name in found.runs if algorithm in (None, name))
+    for rows in _environments(environment):
+        if environment is not None and algorithm not in (None, *rows.runs):
+            raise CirlError(f"the paper did not run {algorithm} on {rows.name}; it ran {', '.join(rows.runs)}")
+        yield from ((rows, name) for name in rows.runs if algorithm in (None, name))
 
 
-def _tuned(environment: str | None, algorithm: str | None, *, must_fit: bool) -> Iterator[tuple[PaperEnvironment, str]]:
+def _tuned_rows(
+    environment: str | None, algorithm: str | None, *, must_fit: bool
+) -> Iterator[tuple[PaperEnvironment, str]]:
     """Yield what there are tuned recipes for, with the algorithms that these use."""
     from cirl_marl.learners.recipe import load_recipe
 
-    for found in _environments(environment):
-        if (name := tuned_recipe(found.name)) is not None:
-            learner = load_recipe(name).learner.algorithm + ("-HER" if found.has_goals else "")
+    for rows in _environments(environment):
+        if (name := tuned_recipe(rows.name)) is not None:
+            learner = load_recipe(name).learner.algorithm + ("-HER" if rows.has_goals else "")
             if algorithm in (None, learner):
-                yield found, learner
+                yield rows, learner
             elif must_fit:
                 raise CirlError(f"the tuned recipe '{name}' uses {learner}, not {algorithm}")
 
@@ -74,22 +82,22 @@ def _tuned(environment: str | None, algorithm: str | None, *, must_fit: bool) ->
 def minutes(row: PaperRow) -> float:
     """Guess how long a row takes: as long as it took the authors, of a tuned one two minutes."""
     environment = environment_of(row.environment)
-    published = environment.runs.get(row.algorithm)
-    whole = 2.0 if row.settings == "tuned" else (published.minutes if published else None) or 40.0
+    reference = environment.runs.get(row.algorithm)
+    whole = 2.0 if row.settings == "tuned" else (reference.minutes if reference else None) or 40.0
     return whole * row.steps / environment.steps
 
 
-def overview(rows: Sequence[PaperRow], left: Sequence[PaperRow]) -> str:
-    """Say how many rows there are, how many of them are done, and how long those that are ``left`` may take.
+def overview(rows: Sequence[PaperRow], remaining: Sequence[PaperRow]) -> str:
+    """Say how many rows there are, how many of them are done, and how long those that are ``remaining`` may take.
 
     >>> rows = [PaperRow(environment="Reacher", algorithm=name, steps=100_000, seed=0) for name in ("SAC", "PPO")]
     >>> overview(rows, rows[:1])
     "rows: 2, done: 1, to go by the paper's training times: 22 min"
     """
-    to_go = sum(map(minutes, left))
+    to_go = sum(map(minutes, remaining))
     takes = f"{to_go:.0f} min" if to_go < 120 else f"{to_go / 60:.0f} h"
-    done = f"rows: {len(rows)}, done: {len(rows) - len(left)}"
-    return f"{done}, to go by the paper's training times: {takes}" if left else done
+    done = f"rows: {len(rows)}, done: {len(rows) - len(remaining)}"
+    return f"{done}, to go by the paper's training times: {takes}" if remaining else done
 
 
 def tuned_recipe(environment: str) -> str | None:

@@ -39,13 +39,13 @@ def environment_table(environment: PaperEnvironment, results: Sequence[Result]) 
 def table_rows(environment: PaperEnvironment, results: Iterable[Result]) -> list[tuple[str, ...]]:
     """Return the cells of one environment: for each algorithm the paper's row and ours, then the tuned rows."""
     own = [result for result in results if result.row.environment == environment.name]
-    kept = {kind: [r for r in own if r.row.settings == kind] for kind in ("published", "tuned")}
+    stored = {kind: [r for r in own if r.row.settings == kind] for kind in ("published", "tuned")}
     rows = []
-    for name, published in environment.runs.items():
-        found = [result for result in kept["published"] if result.row.algorithm == name]
-        rows += [_paper_row(environment, name, published), _our_row(environment, name, "ours", found)]
-    for name in dict.fromkeys(result.row.algorithm for result in kept["tuned"]) or ("",):
-        found = [result for result in kept["tuned"] if result.row.algorithm == name]
+    for name, references in environment.runs.items():
+        found = [result for result in stored["published"] if result.row.algorithm == name]
+        rows += [_paper_row(environment, name, references), _our_row(environment, name, "ours", found)]
+    for name in dict.fromkeys(result.row.algorithm for result in stored["tuned"]) or ("",):
+        found = [result for result in stored["tuned"] if result.row.algorithm == name]
         rows.append(_our_row(environment, name, "tuned", found))
     return rows
 
@@ -58,7 +58,7 @@ def number(value: float | None) -> str:
     """
     if value is None:
         return ""
-    mantissa, exponent = _scaled(value)
+    mantissa, exponent = _scale(value)
     return f"{value:.4g}" if exponent == 0 else f"{mantissa:.2f}e{exponent}"
 
 
@@ -72,7 +72,7 @@ def over_seeds(values: Sequence[float]) -> str:
     if len(values) == 1:
         return number(mean)
     deviation = float(np.std(values, ddof=1))
-    exponent = _scaled(mean)[1]
+    exponent = _scale(mean)[1]
     if exponent:
         return f"{number(mean)} ± {deviation / 10.0**exponent:.2f}e{exponent}"
     return f"{mean:.4g} ± {number(deviation)}"
@@ -80,14 +80,14 @@ def over_seeds(values: Sequence[float]) -> str:
 
 def above_optimum(environment: PaperEnvironment, value: float | None) -> bool:
     """Return whether a figure, as it is written, is above the optimum, which is a mean over the starts."""
-    return bool(environment.optima) and value is not None and _written(value) > _written(environment.optima[0].value)
+    return bool(environment.optima) and value is not None and _text(value) > _text(environment.optima[0].value)
 
 
-def _written(value: float) -> float:
+def _text(value: float) -> float:
     return float(number(value))
 
 
-def _scaled(value: float) -> tuple[float, int]:
+def _scale(value: float) -> tuple[float, int]:
     """Split large and tiny figures into mantissa and exponent; the exponent of others is 0."""
     if value == 0 or not math.isfinite(value) or 1e-3 <= abs(value) < 1e4:
         return value, 0
@@ -106,8 +106,8 @@ def _paper_row(environment: PaperEnvironment, algorithm: str, run: Published) ->
 
 def _above(environment: PaperEnvironment, figures: Mapping[str, float | None]) -> str:
     """Name the figures above the optimum."""
-    found = [name for name, value in figures.items() if above_optimum(environment, value)]
-    return f"{', '.join(found)} above the optimum" if found else ""
+    match = [name for name, value in figures.items() if above_optimum(environment, value)]
+    return f"{', '.join(match)} above the optimum" if match else ""
 
 
 def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Sequence[Result]) -> tuple[str, ...]:
@@ -121,8 +121,8 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
     def cell(figure: Callable[[Result], float]) -> str:
         return over_seeds([figure(result) for result in seeds])
 
-    played = [result.evaluation for result in seeds if result.evaluation is not None]
-    successes = [evaluation.success for evaluation in played if evaluation.success is not None]
+    episodes = [result.evaluation for result in seeds if result.evaluation is not None]
+    successes = [evaluation.success for evaluation in episodes if evaluation.success is not None]
     cpu = [result.cpu_seconds for result in seeds if result.cpu_seconds is not None]
     return (
         algorithm,
@@ -133,7 +133,7 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
         cell(lambda result: result.gain),
         cell(lambda result: result.gain_per_step),
         over_seeds(successes) if successes else "",
-        over_seeds([evaluation.mean for evaluation in played]) if played else "",
+        over_seeds([evaluation.mean for evaluation in episodes]) if episodes else "",
         f"{np.mean([result.seconds for result in seeds]) / 60:.1f}",
         f"{np.mean(cpu) / 60:.1f}" if cpu else "",
         "; ".join(_remarks(environment, seeds)),
@@ -143,21 +143,21 @@ def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Seq
 def _remarks(environment: PaperEnvironment, seeds: Sequence[Result]) -> Iterator[str]:
     """Say what sets a row apart: fewer steps or episodes than the paper's, weights that broke, a start shown, luck."""
     result = seeds[0]
-    few = min(seed.window for seed in seeds)
-    if few < WINDOW:
-        yield f"r_s and r_e over {few} episodes"
+    count = min(seed.window for seed in seeds)
+    if count < WINDOW:
+        yield f"r_s and r_e over {count} episodes"
     if result.row.steps != environment.steps:
         more = f", {result.steps_done:,} done" if result.steps_done > result.row.steps else ""
         yield f"{result.row.steps:,} of {environment.steps:,} steps{more}"
     for seed in seeds:
         if seed.diverged:
             yield f"seed {seed.row.seed}: {_broke(seed)}, r_e is of the last episodes before"
-    shown = result.settings.get("recipe", {}).get("learner", {}).get("demonstrations")
-    if shown:
-        yield f"the first {shown['steps']:,} steps, and r_s with them, are shown by {shown['controller']} control"
-    played = [seed.evaluation.mean for seed in seeds if seed.evaluation is not None]
+    words = result.settings.get("recipe", {}).get("learner", {}).get("demonstrations")
+    if words:
+        yield f"the first {words['steps']:,} steps, and r_s with them, are shown by {words['controller']} control"
+    episodes = [seed.evaluation.mean for seed in seeds if seed.evaluation is not None]
     figures = {"r_s": [seed.start_return for seed in seeds], "r_e": [seed.end_return for seed in seeds]}
-    means = {name: float(np.mean(values)) for name, values in (figures | {"final policy": played}).items() if values}
+    means = {name: float(np.mean(values)) for name, values in (figures | {"final policy": episodes}).items() if values}
     if above := _above(environment, means):
         yield f"{above}: chance"
 
@@ -170,15 +170,15 @@ def notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
     """Say what final policies played and how much episodes vary, what is the best possible, and what differs."""
     best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
     mine = [result for result in results if result.row.environment == environment.name]
-    tuned = [result for result in mine if result.row.settings == "tuned"]
+    recipes = [result for result in mine if result.row.settings == "tuned"]
     sentences = []
     if episodes := distinct(result.evaluation.episodes for result in mine if result.evaluation is not None):
-        spread = [result.evaluation for result in tuned if result.evaluation is not None]
+        spread = [result.evaluation for result in recipes if result.evaluation is not None]
         varied = f"; {_spread(spread)}" if spread else ""
         sentences.append(f"Final policy: {' or '.join(episodes)} episodes a seed{varied}.")
-    ended = [result.published_ends.mean for result in tuned if result.published_ends is not None]
-    if ended:
-        sentences.append(f"Tuned ones where episodes end as the published class ends them: {over_seeds(ended)}.")
+    endings = [result.published_ends.mean for result in recipes if result.published_ends is not None]
+    if endings:
+        sentences.append(f"Tuned ones where episodes end as the published class ends them: {over_seeds(endings)}.")
     return " ".join([*sentences, f"Optimum: {best}.", environment.remark]).rstrip()
 
 

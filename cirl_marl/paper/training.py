@@ -64,14 +64,14 @@ def check_registered(environment: PaperEnvironment) -> gymnasium.envs.registrati
     return gymnasium.registry[environment.id]
 
 
-def described(environment: PaperEnvironment) -> dict[str, Any]:
+def describe(environment: PaperEnvironment) -> dict[str, Any]:
     """Return id, arguments and fingerprint of the definition of an environment, for the record."""
     spec = check_registered(environment)
-    found = {"environment": spec.id, "arguments": {key: str(value) for key, value in spec.kwargs.items()}}
+    text = {"environment": spec.id, "arguments": {key: str(value) for key, value in spec.kwargs.items()}}
     if "network" in spec.kwargs:
         network = load_network(spec.kwargs["network"], scenario=spec.kwargs.get("scenario"))
-        found["definition_sha256"] = fingerprint(network)
-    return found
+        text["definition_sha256"] = fingerprint(network)
+    return text
 
 
 def train_published(environment: PaperEnvironment, row: PaperRow, report: Report) -> PaperTraining:
@@ -106,22 +106,24 @@ def train_tuned(
         if name is None:
             raise CirlError(f"there is no tuned recipe agents/paper_*.toml for {environment.name}")
         recipe = load_recipe(name)
-    learner, named = recipe.learner, f"recipe '{recipe.name}'"
+    learner, agents = recipe.learner, f"recipe '{recipe.name}'"
     if learner.algorithm != row.algorithm.removesuffix("-HER"):
-        raise RecipeError(f"{named} uses {learner.algorithm}, but the row says {row.algorithm}")
-    if changed := [key for key in recipe.environment if key != "observe"]:  # which is on record in the result
-        raise RecipeError(f"{named}: a tuned recipe keeps the paper's problem; leave out {changed}")
+        raise RecipeError(f"{agents} uses {learner.algorithm}, but the row says {row.algorithm}")
+    if overrides := [key for key in recipe.environment if key != "observe"]:  # which is on record in the result
+        raise RecipeError(f"{agents}: a tuned recipe keeps the paper's problem; leave out {overrides}")
     if recipe.match:
-        raise RecipeError(f"{named}: one agent learns, so [[match]] has no place")
+        raise RecipeError(f"{agents}: one agent learns, so [[match]] has no place")
     recipe.check(row.steps)
     settings: dict[str, Any] = {"recipe": recipe.model_dump(mode="json")}
     if not environment.has_goals and "network" in check_registered(environment).kwargs:
         return _train_network(environment, recipe, row, report, settings)
     plain = LearnerSettings(algorithm=learner.algorithm)
-    unused = ["environment"] if recipe.environment else []
-    unused += [key for key in ("scheme", "share_of_steps", "bootstrap") if getattr(learner, key) != getattr(plain, key)]
-    if unused:
-        raise RecipeError(f"{named}: {environment.name} learns in copies: leave out {', '.join(unused)}")
+    surplus = ["environment"] if recipe.environment else []
+    surplus += [
+        key for key in ("scheme", "share_of_steps", "bootstrap") if getattr(learner, key) != getattr(plain, key)
+    ]
+    if surplus:
+        raise RecipeError(f"{agents}: {environment.name} learns in copies: leave out {', '.join(surplus)}")
     if environment.has_goals:
         settings["replay_buffer_class"] = "HerReplayBuffer"
     return _train_copies(environment, learner, recipe.run.envs, row, report, settings)
@@ -155,7 +157,7 @@ def _train_network(
         steps=training.joint_steps * copies,
         seconds=seconds,
         cpu_seconds=cpu_seconds,
-        settings={"copies": copies, **settings, **described(environment)},
+        settings={"copies": copies, **settings, **describe(environment)},
         options=recipe.environment,
     )
 
@@ -193,9 +195,9 @@ def _train_copies(
             return act()
 
         demonstrate(model, learner.demonstrations.steps, act_and_tell)
-    left, fresh = row.steps - model.num_timesteps, model.num_timesteps == 0
+    remaining, fresh = row.steps - model.num_timesteps, model.num_timesteps == 0
     try:
-        model.learn(left, callback=tell, reset_num_timesteps=fresh)
+        model.learn(remaining, callback=tell, reset_num_timesteps=fresh)
     except (CirlError, ValueError):  # what torch's distributions and the environments say of NaN
         if _is_finite(model):
             raise
@@ -209,7 +211,7 @@ def _train_copies(
         steps=model.num_timesteps,
         seconds=seconds,
         cpu_seconds=cpu_seconds,
-        settings={"copies": copies, **settings, **described(environment)},
+        settings={"copies": copies, **settings, **describe(environment)},
         options={},
     )
 
@@ -233,12 +235,12 @@ def _episodes_of(monitors: list[Monitor[Any, Any]]) -> tuple[list[int], list[flo
 
     What the monitor of each copy saw counts, as ARS keeps its episodes from callbacks.
     """
-    found = sorted(
+    episodes = sorted(
         (int(end) * len(monitors), copy, value)
         for copy, monitor in enumerate(monitors)
         for end, value in zip(np.cumsum(monitor.get_episode_lengths()), monitor.get_episode_rewards(), strict=True)
     )
-    return [end for end, _, _ in found], [value for _, _, value in found]
+    return [end for end, _, _ in episodes], [value for _, _, value in episodes]
 
 
 def _stopwatch() -> Callable[[], tuple[float, float]]:

@@ -15,7 +15,7 @@ from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import DASHES, SERIES, axis_time, readable
 from cirl_marl.evaluation.quantities import ComparedQuantity
 from cirl_marl.evaluation.simulations import Simulation
-from cirl_marl.evaluation.statistics import defined
+from cirl_marl.evaluation.statistics import finite_or_none
 from cirl_marl.network import Floats
 from cirl_marl.records.files import publish_folder, write_table
 from cirl_marl.report.panels import LEVELS, PANELS, Panel, save_panels
@@ -69,7 +69,7 @@ def write_alternatives(
 
 def _row(quantity: ComparedQuantity) -> list[object]:
     columns = np.column_stack([quantity.values, quantity.differences, quantity.relative_differences])
-    figures = [defined(figure) for figure in columns.ravel().tolist()]
+    figures = [finite_or_none(figure) for figure in columns.ravel().tolist()]
     return [quantity.name, quantity.unit, figures[0], *figures[columns.shape[1] :]]
 
 

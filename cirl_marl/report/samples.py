@@ -14,7 +14,7 @@ from rich.table import Table
 from cirl_marl.controllers.rollout import interval_ends
 from cirl_marl.drawing.style import SERIES, axis_time, readable
 from cirl_marl.evaluation.sampling import SampledEpisodes, Sensitivity
-from cirl_marl.evaluation.statistics import defined
+from cirl_marl.evaluation.statistics import finite_or_none
 from cirl_marl.network import Floats
 from cirl_marl.records.files import publish_folder, write_table
 from cirl_marl.report.panels import LEVELS, PANELS, Panel, save_panels
@@ -80,7 +80,7 @@ def _draws(samples: SampledEpisodes) -> tuple[list[str], list[list[object]]]:
 def _causes(samples: SampledEpisodes, causes: Sequence[Sensitivity]) -> tuple[list[str], list[list[object]]]:
     header = ["number", *(part for cause in causes for part in (f"share of {cause.figure}", "half-width"))]
     return header, [
-        [samples.names[i], *(defined(float(x)) for cause in causes for x in (cause.shares[i], cause.margins[i]))]
+        [samples.names[i], *(finite_or_none(float(x)) for cause in causes for x in (cause.shares[i], cause.margins[i]))]
         for i in _order(causes)
     ]
 

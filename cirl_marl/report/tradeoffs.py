@@ -13,7 +13,7 @@ from rich.table import Table
 from cirl_marl.evaluation.comparison import FIGURES, Comparison
 from cirl_marl.evaluation.figures import provenance
 from cirl_marl.evaluation.pareto import ParetoFront
-from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, defined, interquartile_mean
+from cirl_marl.evaluation.statistics import ENOUGH_SEEDS, Aggregate, finite_or_none, interquartile_mean
 from cirl_marl.records.files import publish_folder, write_json, write_table
 from cirl_marl.report.curves import PointSeries, save_fronts
 from cirl_marl.report.terminal import text_table
@@ -129,7 +129,7 @@ def _episode_rows(comparison: Comparison) -> Iterator[list[object]]:
         columns = [getattr(entry, name) for name in FIGURES]
         run = None if entry.run is None else entry.run.path
         for episode in range(comparison.episodes):
-            figures = [None if column is None else defined(column[episode]) for column in columns]
+            figures = [None if column is None else finite_or_none(column[episode]) for column in columns]
             yield [entry.name, entry.seed, run, episode, *figures, comparison.first_seed + episode]
 
 

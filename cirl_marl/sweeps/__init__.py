@@ -2,6 +2,6 @@
 
 from cirl_marl.sweeps.cells import Cell
 from cirl_marl.sweeps.reading import SweepFile, load_sweep
-from cirl_marl.sweeps.running import CellStanding, Swept, sweep
+from cirl_marl.sweeps.running import CellStatus, SweepOutcome, sweep
 
-__all__ = ["Cell", "CellStanding", "SweepFile", "Swept", "load_sweep", "sweep"]
+__all__ = ["Cell", "CellStatus", "SweepFile", "SweepOutcome", "load_sweep", "sweep"]

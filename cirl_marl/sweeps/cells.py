@@ -85,7 +85,7 @@ class Cell:
         return f"{plain_name(words)}-{hashlib.sha256(text.encode()).hexdigest()[:DIGITS]}"
 
 
-def cells_of(asked: SweepFile) -> list[Cell]:
+def cells_of(file: SweepFile) -> list[Cell]:
     """Return the cells of a sweep: seeds vary last, so that what is compared comes to its end together.
 
     Raises:
@@ -93,23 +93,23 @@ def cells_of(asked: SweepFile) -> list[Cell]:
     """
     from cirl_marl.learners.interface import prepare  # it needs torch
 
-    found = []
-    recipes = [load_recipe(name) for name in asked.recipes]
-    lists = {key: values for key, values in asked.options.model_dump().items() if values is not None}
-    scenarios: list[str | None] = [*asked.scenarios] if asked.scenarios is not None else [None]
+    cells = []
+    recipes = [load_recipe(name) for name in file.recipes]
+    lists = {key: values for key, values in file.options.model_dump().items() if values is not None}
+    scenarios: list[str | None] = [*file.scenarios] if file.scenarios is not None else [None]
     for seed, address, scenario, recipe, *values in itertools.product(
-        asked.seeds, asked.networks, scenarios, recipes, *lists.values()
+        file.seeds, file.networks, scenarios, recipes, *lists.values()
     ):
         options = dict(zip(lists, values, strict=True))
-        named = scenario or recipe.environment.get("scenario")
-        network = load_network(address, scenario=named)
+        names = scenario or recipe.environment.get("scenario")
+        network = load_network(address, scenario=names)
         begins = any(learner.start is not None for _, learner in recipe.learners())
         origins = ""
-        if begins or seed == asked.seeds[0]:
+        if begins or seed == file.seeds[0]:
             config = prepare(address, recipe, seed=seed, scenario=network.scenario_name, **options).config
             read = {name: origin.sha256 for name, origin in config.origins.items()}
             origins = hashlib.sha256(json.dumps(read, sort_keys=True).encode()).hexdigest() if read else ""
-        found.append(
+        cells.append(
             Cell(
                 address=address,
                 network=network.name,
@@ -121,7 +121,7 @@ def cells_of(asked: SweepFile) -> list[Cell]:
                 origins=origins,
             )
         )
-    return found
+    return cells
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,15 +171,17 @@ class CellJob:
             **dict(cell.options),
         )
         asked = self.evaluation.model_dump()
-        compared = compare([run], ["neutral"], **asked, progress=lambda what, share: tell("evaluating", share, 1.0))
-        entry = next(each for each in compared.entries if each.run is not None)
+        comparison = compare(
+            [run], ["neutral"], **asked, progress=lambda activity, share: tell("evaluating", share, 1.0)
+        )
+        entry = next(each for each in comparison.entries if each.run is not None)
         gap = None if entry.gap is None else over_episodes(entry.gap, (0.0, np.inf)).as_dict()
         figures = {
             "circularity": over_episodes(entry.circularity).as_dict(),
             "service": over_episodes(entry.service, SHARE).as_dict(),
             "gap": gap,
-            "no_bound": compared.baseline.reason,
-            "unit": compared.network.mass_unit,
+            "no_bound": comparison.baseline.reason,
+            "unit": comparison.network.mass_unit,
             "checkpoint": entry.checkpoint,
             "evaluation": asked,
         }
@@ -190,8 +192,8 @@ class CellJob:
         """Return what tells how far the training is, and what the policies reach that are the best so far."""
         steps = self.cell.steps
 
-        def reached() -> dict[str, float]:
+        def checkpoint() -> dict[str, float]:
             best = self.run_directory.status["best"]
             return {} if best is None else {name: best["figures"][name] for name in ("circularity", "service")}
 
-        return lambda now: tell("training", steps - now.total + now.env_steps, steps, reached)
+        return lambda now: tell("training", steps - now.total + now.env_steps, steps, checkpoint)

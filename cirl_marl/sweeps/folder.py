@@ -26,7 +26,7 @@ from cirl_marl.sweeps.cells import Cell, CellJob
 from cirl_marl.sweeps.reading import SweepFile
 
 INTERVALS = ("circularity", "service", "gap")
-SHOWN = 5
+MISMATCHES_SHOWN = 5
 """Differences between two sweeps that are named."""
 
 
@@ -36,7 +36,7 @@ class SweepFolder:
 
     path: Path
 
-    def claim(self, asked: SweepFile, cells: Sequence[Cell]) -> None:
+    def claim(self, request: SweepFile, cells: Sequence[Cell]) -> None:
         """Say what the folder is for, if it is new, or was for a part of this sweep.
 
         Raises:
@@ -45,10 +45,10 @@ class SweepFolder:
         if self.path.exists() and not self.path.is_dir():
             raise RunError(f"{self.path}: is a file, not a folder")
         if self.path.is_dir() and not self._asked.is_file() and any(self._strangers()):
-            found = ", ".join(sorted(self._strangers())[:SHOWN])
-            raise RunError(f"{self.path}: holds something else than a sweep ({found}); choose another folder")
+            stored = ", ".join(sorted(self._strangers())[:MISMATCHES_SHOWN])
+            raise RunError(f"{self.path}: holds something else than a sweep ({stored}); choose another folder")
         refuse_links(self.path)
-        now = self._described(asked, cells)
+        now = self._described(request, cells)
         self.path.mkdir(parents=True, exist_ok=True)
         with FileLock(self.path / ".asked.lock"):
             if self._asked.is_file():
@@ -96,17 +96,21 @@ class SweepFolder:
         run, environment = content["recipe"]["run"], content["recipe"]["environment"]
         file = self.cell(name) / "result.json"
         result = _json(file) if file.is_file() else {}
-        told = self.jobs / f"{name}.json"
+        figures = self.jobs / f"{name}.json"
         row: dict[str, Any] = {"cell": name, "state": "done" if result else "missing"}
         row |= {key: content[key] for key in ("network", "scenario")}
         row |= {"recipe": content["recipe"]["name"], "seed": content["seed"]}
         row |= {key: run[key] for key in ("steps", "envs", "engine", "min_service")}
         row |= {column: environment.get(key) for key, column in _ENVIRONMENT.items()}
         for figure in INTERVALS:
-            found = result.get(figure) or {}
-            row |= {figure: found.get("value"), f"{figure}_low": found.get("low"), f"{figure}_high": found.get("high")}
+            interval = result.get(figure) or {}
+            row |= {
+                figure: interval.get("value"),
+                f"{figure}_low": interval.get("low"),
+                f"{figure}_high": interval.get("high"),
+            }
         row |= {key: result.get(key) or None for key in ("unit", "no_bound", "checkpoint")}
-        return row | {"cpu_seconds": _json(told).get("cpu_seconds") if told.is_file() else None}
+        return row | {"cpu_seconds": _json(figures).get("cpu_seconds") if figures.is_file() else None}
 
     @property
     def _asked(self) -> Path:
@@ -116,28 +120,28 @@ class SweepFolder:
         return _json(self._asked)
 
     def _strangers(self) -> Iterator[str]:
-        own = {"cells", "bounds", "jobs", ".asked.lock", ".asked.partial.json"}
-        return (each.name for each in self.path.iterdir() if each.name not in own)
+        names = {"cells", "bounds", "jobs", ".asked.lock", ".asked.partial.json"}
+        return (each.name for each in self.path.iterdir() if each.name not in names)
 
-    def _described(self, asked: SweepFile, cells: Sequence[Cell]) -> dict[str, Any]:
+    def _described(self, request: SweepFile, cells: Sequence[Cell]) -> dict[str, Any]:
         """Return what is asked for as JSON has it."""
-        plain = asked.model_dump(mode="json")
+        plain = request.model_dump(mode="json")
         plain["options"] = {key: values for key, values in plain["options"].items() if values is not None}
         plain["networks"] = list(dict.fromkeys(cell.network for cell in cells))
         plain["definitions"] = {f"{cell.network}, {cell.scenario}": cell.definition_sha256 for cell in cells}
         plain["recipes"] = {cell.recipe.name: cell.recipe.model_dump(mode="json") for cell in cells}
         return {**plain, "cells": [cell.name for cell in cells]}
 
-    def _check(self, now: dict[str, Any], kept: dict[str, Any]) -> None:
+    def _check(self, now: dict[str, Any], stored: dict[str, Any]) -> None:
         """Refuse to make another sweep of the one that is kept; one may add cells to it."""
-        lost = set(kept["cells"]) - set(now["cells"])
-        if not lost and now["evaluation"] == kept["evaluation"]:
+        missing_cells = set(stored["cells"]) - set(now["cells"])
+        if not missing_cells and now["evaluation"] == stored["evaluation"]:
             return
-        found = [each for key in now if key != "cells" for each in _differences(now[key], kept.get(key), key)]
-        more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+        mismatches = [name for key in now if key != "cells" for name in _differences(now[key], stored.get(key), key)]
+        more = f" and {len(mismatches) - MISMATCHES_SHOWN} more" if len(mismatches) > MISMATCHES_SHOWN else ""
         raise RunError(
-            f"{self.path}: holds another sweep ({'; '.join(found[:SHOWN])}{more}), of which {len(lost)} of "
-            f"{len(kept['cells'])} cells are none of this one; choose another folder. Nothing was changed"
+            f"{self.path}: holds another sweep ({'; '.join(mismatches[:MISMATCHES_SHOWN])}{more}), of which "
+            f"{len(missing_cells)} of {len(stored['cells'])} cells are none of this one; choose another folder. Nothing was changed"
         )
 
 
@@ -145,23 +149,25 @@ _ENVIRONMENT = {key: key for key in ("reward", "observe", "circularity_weight", 
 _ENVIRONMENT |= {"circularity": "circularity_in_reward"}  # circularity itself is a result
 
 
-def jobs_of(cells: Sequence[Cell], asked: SweepFile, folder: SweepFolder, every: float | None) -> list[CellJob]:
+def jobs_of(
+    cells: Sequence[Cell], request: SweepFile, folder: SweepFolder, checkpoint_every: float | None
+) -> list[CellJob]:
     """Return the work on the cells."""
-    return [CellJob(cell, folder.cell(cell.name), asked.evaluation, every) for cell in cells]
+    return [CellJob(cell, folder.cell(cell.name), request.evaluation, checkpoint_every) for cell in cells]
 
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
+        content: dict[str, Any] = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: cannot be read: {error}") from error
-    return found
+    return content
 
 
-def _differences(asked: Any, kept: Any, where: str) -> Iterator[str]:
+def _differences(request: Any, stored: Any, where: str) -> Iterator[str]:
     """Yield where two JSON values differ."""
-    if isinstance(asked, dict) and isinstance(kept, dict):
-        for key in dict.fromkeys((*asked, *kept)):
-            yield from _differences(asked.get(key), kept.get(key), f"{where}.{key}")
-    elif asked != kept:
-        yield f"{where}: {json.dumps(asked)}, there {json.dumps(kept)}"
+    if isinstance(request, dict) and isinstance(stored, dict):
+        for key in dict.fromkeys((*request, *stored)):
+            yield from _differences(request.get(key), stored.get(key), f"{where}.{key}")
+    elif request != stored:
+        yield f"{where}: {json.dumps(request)}, there {json.dumps(stored)}"

@@ -65,14 +65,14 @@ class FrontJob:
         try:
             most = highest_service(network)
             tell("bound", 1, 3)
-            found = bound(network, min_service=DEMAND * most)
+            solution = bound(network, min_service=DEMAND * most)
             tell("bound", 2, 3)
             levels = np.linspace(0.0, most, 3)
-            proved = found.at(min_service=levels[:, None])
+            points = solution.at(min_service=levels[:, None])
         except NoCertificate as missing:
             write_json(self.file, {"levels": [], "proved": [], "reason": str(missing)})
             return
-        write_json(self.file, {"levels": levels.tolist(), "proved": proved.tolist(), "reason": ""})
+        write_json(self.file, {"levels": levels.tolist(), "proved": points.tolist(), "reason": ""})
 
     def gap(self, figures: Mapping[str, Any]) -> float | None:
         """Return how far policies with these figures are from the front, about; None if that is not known."""
@@ -81,5 +81,5 @@ class FrontJob:
         front = json.loads(self.file.read_text())
         if not front["levels"]:
             return None
-        proved = np.interp(figures["service"], front["levels"], front["proved"])
-        return max(0.0, float(gap(proved, figures["circularity"])))
+        points = np.interp(figures["service"], front["levels"], front["proved"])
+        return max(0.0, float(gap(points, figures["circularity"])))

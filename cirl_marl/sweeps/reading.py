@@ -18,38 +18,38 @@ from cirl_marl.learners.recipe import Count, EngineName, Recipe, Settings, load_
 from cirl_marl.network import Network
 from cirl_marl.network.elements import Moment, Observe, Reward
 
-Listed = TypeVar("Listed")
+OneOrMore = TypeVar("OneOrMore")
 Level = Annotated[Number, Field(ge=0, le=1)]
 SeedNumber = Annotated[StrictInt, Field(ge=0)]
 
 
-def _several(value: Any) -> Any:
+def _as_list(value: Any) -> Any:
     """Return a value as the list of one that it stands for; of what is listed, nothing may stand there twice."""
-    listed = value if isinstance(value, list) else [value]
-    if not listed:
+    entries = value if isinstance(value, list) else [value]
+    if not entries:
         raise PydanticCustomError("nothing", "lists nothing")
-    twice = [each for i, each in enumerate(listed) if each in listed[:i]]
+    twice = [entry for i, entry in enumerate(entries) if entry in entries[:i]]
     if twice:
         raise PydanticCustomError("twice", "lists {value} twice", {"value": repr(twice[0])})
-    return listed
+    return entries
 
 
-Several = Annotated[list[Listed], BeforeValidator(_several)]
+NonEmptyList = Annotated[list[OneOrMore], BeforeValidator(_as_list)]
 
 
 class SweepOptions(Settings):
     """Options of ``train`` for all cells; a list of several values is multiplied out. None takes the recipe's."""
 
-    steps: Several[Count] | None = None
-    envs: Several[Count] | None = None
-    engine: Several[EngineName] | None = None
-    min_service: Several[Level] | None = None
-    reward: Several[Reward] | None = None
-    observe: Several[Observe] | None = None
-    circularity: Several[Moment] | None = None
-    circularity_weight: Several[Level] | None = None
-    horizon: Several[Count] | None = None
-    uncertain: Several[StrictBool] | None = None
+    steps: NonEmptyList[Count] | None = None
+    envs: NonEmptyList[Count] | None = None
+    engine: NonEmptyList[EngineName] | None = None
+    min_service: NonEmptyList[Level] | None = None
+    reward: NonEmptyList[Reward] | None = None
+    observe: NonEmptyList[Observe] | None = None
+    circularity: NonEmptyList[Moment] | None = None
+    circularity_weight: NonEmptyList[Level] | None = None
+    horizon: NonEmptyList[Count] | None = None
+    uncertain: NonEmptyList[StrictBool] | None = None
 
 
 class SweepEvaluation(Settings):
@@ -69,10 +69,10 @@ class SweepFile(Settings):
         scenarios: of every network; None takes the recipe's, else the default one.
     """
 
-    networks: Several[StrictStr]
-    recipes: Several[StrictStr] = Field(["independent_ars"])
-    scenarios: Several[StrictStr] | None = None
-    seeds: Several[SeedNumber] = Field([0])
+    networks: NonEmptyList[StrictStr]
+    recipes: NonEmptyList[StrictStr] = Field(["independent_ars"])
+    scenarios: NonEmptyList[StrictStr] | None = None
+    seeds: NonEmptyList[SeedNumber] = Field([0])
     options: SweepOptions = SweepOptions()
     evaluation: SweepEvaluation = SweepEvaluation()
 
@@ -91,7 +91,7 @@ def load_sweep(path: Path) -> SweepFile:
     except ValidationError as error:
         mistakes += validation_mistakes(error, SweepFile)
         faulty = {str(item["loc"][0]) for item in error.errors()}
-    sound = {key: _several(value) for key, value in document.items() if key in _NAMES and key not in faulty}
+    sound = {key: _as_list(value) for key, value in document.items() if key in _NAMES and key not in faulty}
     sound = {key: [_from(path.parent, str(name)) for name in names] for key, names in sound.items()}
     mistakes += _unknown_names(sound)
     if mistakes:
@@ -109,28 +109,28 @@ def _from(folder: Path, name: str) -> str:
 
 def _unknown_names(sound: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Yield what is wrong with networks, scenarios and recipes, each by itself."""
-    found: list[Network] = []
-    for key, read, known in (("networks", load_network, networks), ("recipes", load_recipe, recipes)):
+    unknown_names: list[Network] = []
+    for key, read, names in (("networks", load_network, networks), ("recipes", load_recipe, recipes)):
         for name in sound.get(key, ()):
             try:
-                each = _read(read, known, key[:-1], name)
+                each = _read(read, names, key[:-1], name)
             except DefinitionError as error:
                 yield from (f"{key}: {problem}" for problem in str(error).splitlines())
             except CirlError as error:
                 yield f"{key}: {error}"
             else:
-                found += [each] if isinstance(each, Network) else []
-    for network in found:
-        there = [network.scenario_name, *network.scenarios]
+                unknown_names += [each] if isinstance(each, Network) else []
+    for network in unknown_names:
+        present = [network.scenario_name, *network.scenarios]
         for name in sound.get("scenarios", ()):
-            if name not in there:
-                yield f"scenarios: network '{network.name}': {unknown('scenario', name, there)}"
+            if name not in present:
+                yield f"scenarios: network '{network.name}': {unknown('scenario', name, present)}"
 
 
 def _read(
-    read: Callable[[str], Network | Recipe], known: Callable[[], list[str]], kind: str, name: str
+    read: Callable[[str], Network | Recipe], names: Callable[[], list[str]], kind: str, name: str
 ) -> Network | Recipe:
     """Read a network or recipe; one without a name at all is refused in the same words as an unknown one."""
     if not name.strip():
-        raise CirlError(unknown(kind, name, known()))
+        raise CirlError(unknown(kind, name, names()))
     return read(name)

@@ -15,7 +15,7 @@ from cirl_marl.sweeps.reading import load_sweep
 
 
 @dataclass(frozen=True, slots=True)
-class CellStanding:
+class CellStatus:
     """How far a cell is.
 
     Attributes:
@@ -29,7 +29,7 @@ class CellStanding:
 
 
 @dataclass(frozen=True, slots=True)
-class Swept:
+class SweepOutcome:
     """What came of a sweep.
 
     Attributes:
@@ -50,9 +50,9 @@ def sweep(
     out: str | Path | None = None,
     settings: Mapping[str, str] | None = None,
     checkpoint_every: float | None = None,
-    watch: Callable[[Sequence[CellStanding]], None] = lambda standings: None,
+    watch: Callable[[Sequence[CellStatus]], None] = lambda standings: None,
     say: Callable[[str], None] = lambda line: None,
-) -> Swept:
+) -> SweepOutcome:
     """Train and evaluate all cells of a sweep file that are not done: networks x scenarios x recipes x options x seeds.
 
     Each cell has a folder named by the hash of its content, so the same call does what is missing and goes on with what
@@ -75,24 +75,24 @@ def sweep(
     """
     check_place(on, workers, settings)
     path = Path(file)
-    asked = load_sweep(path)
-    cells = cells_of(asked)
+    request = load_sweep(path)
+    cells = cells_of(request)
     folder = SweepFolder(Path("runs") / f"sweep-{path.stem}" if out is None else Path(out))
-    folder.claim(asked, cells)
-    work = {job.name: job for job in jobs_of(cells, asked, folder, checkpoint_every)}
-    fronts = {cell.name: FrontJob.of(cell, folder.bounds) for cell in cells} if asked.evaluation.bounds else {}
-    missing = {fronts[name].name: fronts[name] for name, job in work.items() if name in fronts and not job.is_done()}
+    folder.claim(request, cells)
+    work = {job.name: job for job in jobs_of(cells, request, folder, checkpoint_every)}
+    fronts = {cell.name: FrontJob.of(cell, folder.bounds) for cell in cells} if request.evaluation.bounds else {}
+    remaining = {fronts[name].name: fronts[name] for name, job in work.items() if name in fronts and not job.is_done()}
 
-    def told(standings: Sequence[Standing]) -> None:
-        known = {each.name: each for each in standings}
-        watch([_standing(work[name].cell, known[name], fronts.get(name)) for name in work])
+    def report(standings: Sequence[Standing]) -> None:
+        statuses = {status.name: status for status in standings}
+        watch([_cell_status(work[name].cell, statuses[name], fronts.get(name)) for name in work])
 
-    jobs: list[Job] = [*missing.values(), *work.values()]
-    failures = run_jobs(jobs, folder.jobs, on=on, workers=workers, settings=settings, watch=told, say=say)
-    return Swept(folder.path, tuple(folder.write_table()), tuple(failures))
+    jobs: list[Job] = [*remaining.values(), *work.values()]
+    failures = run_jobs(jobs, folder.jobs, on=on, workers=workers, settings=settings, watch=report, say=say)
+    return SweepOutcome(folder.path, tuple(folder.write_table()), tuple(failures))
 
 
-def _standing(cell: Cell, standing: Standing, front: FrontJob | None) -> CellStanding:
+def _cell_status(cell: Cell, standing: Standing, front: FrontJob | None) -> CellStatus:
     if standing.state == "done":
-        return CellStanding(cell, standing, standing.figures.get("gap"))
-    return CellStanding(cell, standing, None if front is None else front.gap(standing.figures))
+        return CellStatus(cell, standing, standing.figures.get("gap"))
+    return CellStatus(cell, standing, None if front is None else front.gap(standing.figures))
