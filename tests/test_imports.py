@@ -11,7 +11,8 @@ from imports import PACKAGE, arrows, circles, drawing, floors, imported, modules
 
 CHECKOUT = Path(__file__).parent.parent
 LAYERS = (
-    ("errors", "records"),
+    ("errors",),
+    ("records",),
     ("network",),
     ("compartments", "drawing"),
     ("definitions",),

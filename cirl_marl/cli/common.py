@@ -7,6 +7,7 @@ import sys
 import time as clock
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,9 +44,7 @@ errors = Console(stderr=True, emoji=False)
 
 def _print_version(version: bool) -> None:
     if version:
-        from cirl_marl import __version__
-
-        console.print(f"cirl_marl {__version__}", highlight=False)
+        console.print(f"cirl_marl {metadata.version('cirl-marl')}", highlight=False)
         raise typer.Exit
 
 

@@ -141,7 +141,8 @@ class SweepFolder:
         more = f" and {len(mismatches) - MISMATCHES_SHOWN} more" if len(mismatches) > MISMATCHES_SHOWN else ""
         raise RunError(
             f"{self.path}: holds another sweep ({'; '.join(mismatches[:MISMATCHES_SHOWN])}{more}), of which "
-            f"{len(missing_cells)} of {len(stored['cells'])} cells are none of this one; choose another folder. Nothing was changed"
+            f"{len(missing_cells)} of {len(stored['cells'])} cells are none of this one; "
+            "choose another folder. Nothing was changed"
         )
 
 
