@@ -12,7 +12,7 @@ from cirl_marl.learners.trainer import one_torch_thread
 from cirl_marl.paper.published import HARDWARE, environment_of
 from cirl_marl.paper.results import WINDOW, PaperRow
 from cirl_marl.paper.table import number
-from cirl_marl.paper.training import PaperTraining, Report, train_published, train_tuned
+from cirl_marl.paper.training import Report, TrainingRecord, train_published, train_tuned
 
 ENVIRONMENT = "CopperNet"
 RECIPES = (("A2C", "independent_a2c"), ("PPO", "independent_ppo"), ("PPO", "paper_copper_net"))
@@ -45,8 +45,8 @@ class Timing:
     algorithm: str
     recipe: str
     copies: int
-    published: PaperTraining
-    ours: PaperTraining
+    published: TrainingRecord
+    ours: TrainingRecord
 
     @property
     def wall_ratio(self) -> float:
@@ -62,7 +62,7 @@ class Timing:
 def compare(steps: int, report: Report) -> list[Timing]:
     """Train A2C and PPO on CopperNet both ways, one after the other."""
     environment = environment_of(ENVIRONMENT)
-    published: dict[str, PaperTraining] = {}
+    published: dict[str, TrainingRecord] = {}
     found = []
     with one_torch_thread():
         for algorithm, name in RECIPES:
@@ -101,7 +101,7 @@ def _line(row: Timing) -> tuple[str, ...]:
     )
 
 
-def _run(trained: PaperTraining) -> str:
+def _run(trained: TrainingRecord) -> str:
     end = float(np.mean(trained.returns[-WINDOW:]))
     return (
         f"{trained.seconds:.1f} s ({trained.cpu_seconds:.1f} s processor), {trained.steps:,} steps, r_e {number(end)}"

@@ -223,7 +223,7 @@ def test_intervals_may_differ_if_episodes_last_alike(definition: Path) -> None:
 
 def test_only_controllers_that_take_values_hold_them(definition: Path) -> None:
     """The others act as they do."""
-    found = simulate_alternatives(definition, controls=["neutral", "constant"], held={"quarry": -1.0})
+    found = simulate_alternatives(definition, controls=["neutral", "constant"], constants={"quarry": -1.0})
     flows = [each.rollout.flow[:, each.network.arc_index["glassworks"]] for each in found]
     assert (flows[0] > 4).all() and (flows[1] == 0).all()
 
@@ -243,7 +243,10 @@ def test_progress_is_that_of_all(definition: Path) -> None:
         ({"scenarios": []}, "no scenario is given"),
         ({"controls": []}, "no control is given"),
         ({"scenarios": [None, "default"]}, "scenario 'default' is given 2 times"),
-        ({"controls": ["random", "neutral"], "held": {"quarry": 1.0}}, "go with constant or scripted, not with random"),
+        (
+            {"controls": ["random", "neutral"], "constants": {"quarry": 1.0}},
+            "go with constant or scripted, not with random",
+        ),
     ],
 )
 def test_alternatives_that_make_no_sense(options: dict[str, list[str]], message: str, definition: Path) -> None:

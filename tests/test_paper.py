@@ -31,7 +31,7 @@ from cirl_marl.paper.results import Evaluation, PaperRow, Result, Results, thin_
 from cirl_marl.paper.running import evaluate, reason_to_repeat, run_row
 from cirl_marl.paper.selection import select_rows
 from cirl_marl.paper.table import above_optimum, table_rows
-from cirl_marl.paper.training import PaperTraining, describe, train_tuned
+from cirl_marl.paper.training import TrainingRecord, describe, train_tuned
 
 COPPER = ENVIRONMENTS["CopperNet"]
 KEPT = Path(__file__).parent.parent / "benchmarks" / "results" / "paper"
@@ -576,7 +576,7 @@ def test_final_policies_play_their_quota_on_episodes_of_their_own() -> None:
 def test_first_and_last_episodes_do_not_overlap(episodes: int, window: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """r_s and r_e are means over 100 episodes each, or over half of those that there were."""
     returns = list(np.random.default_rng(0).normal(size=episodes))
-    done = PaperTraining(
+    done = TrainingRecord(
         predict=lambda *_: (np.zeros((20, 1), dtype=np.float32), None),
         ends=[50 * (i + 1) for i in range(episodes)],
         returns=returns,

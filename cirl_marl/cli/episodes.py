@@ -77,7 +77,7 @@ def simulate(
             network,
             scenarios=scenario or [None],
             controls=controls,
-            held=constants,
+            constants=constants,
             steps=steps,
             seed=seed,
             progress=progress,
@@ -163,10 +163,10 @@ def _write_several(folder: Path, files: Mapping[str, Simulation]) -> None:
     paths = write_alternatives(folder, f"{network.name}_differences", files, quantities, title=title)
     for simulation in simulations:
         _say_lines(str(simulation), f"{simulation.name}: ")
-    if differing := [simulation for simulation in quantities if simulation.rank > 0]:
-        console.print(differences_table(simulations, differing))
-    more = f", of which {ROWS} are shown" if len(differing) > ROWS else ""
-    say(f"{len(differing)} of {len(quantities)} quantities differ{more}; all are in {paths[-2]}")
+    if unequal := [simulation for simulation in quantities if simulation.rank > 0]:
+        console.print(differences_table(simulations, unequal))
+    more = f", of which {ROWS} are shown" if len(unequal) > ROWS else ""
+    say(f"{len(unequal)} of {len(quantities)} quantities differ{more}; all are in {paths[-2]}")
     for path in paths:
         say(f"wrote {path}")
 
@@ -205,8 +205,8 @@ def plan(
     with bar("planning") as progress:
         schedule = plans.plan(source, control, scenario=scenario, min_service=min_service, seed=seed, progress=progress)
     network = schedule.network
-    who = Path(source).resolve().name if control is None else stem(network, control)
-    path = Path(f"plan_{who}.csv") if out is None else out
+    stem_of_file = Path(source).resolve().name if control is None else stem(network, control)
+    path = Path(f"plan_{stem_of_file}.csv") if out is None else out
     path.parent.mkdir(parents=True, exist_ok=True)
     schedule.write(path)
     beside = write_decisions(path, schedule, title=f"{network.title or network.name}: {control or 'what was learnt'}")

@@ -57,7 +57,7 @@ def explain(
     folder = common.writable_folder(out, "--out")
     options: dict[str, Any] = {"min_service": min_service, "episodes": episodes, "seed": seed, "top": top}
     with shares() as progress:
-        found = explained(
+        explanation_ = explained(
             source,
             parts=None if parts is None else common.comma_separated(parts),
             scenario=scenario,
@@ -67,15 +67,15 @@ def explain(
         )
     from cirl_marl.reasons.sentences import paragraphs
 
-    if found.prices is not None:
-        console.print(prices_table(found.prices))
-    if found.inputs:
-        console.print(inputs_table(found))
-    for heading, said in paragraphs(found):
+    if explanation_.prices is not None:
+        console.print(prices_table(explanation_.prices))
+    if explanation_.inputs:
+        console.print(inputs_table(explanation_))
+    for heading, texts in paragraphs(explanation_):
         say(f"\n{heading}")
-        for sentence in said:
+        for sentence in texts:
             say(f"  {sentence}")
-    for path in write_reasons(found, folder, parts=parts, leaves=leaves, **options):
+    for path in write_reasons(explanation_, folder, parts=parts, leaves=leaves, **options):
         say(f"wrote {path}")
 
 

@@ -194,21 +194,21 @@ def paper(
         check_registered(environment_data)
     results.prepare()
     reasons = {row: reason_to_repeat(results.read(row), episodes) for row in rows if results.has(row)}
-    remaining = [row for row in rows if row not in reasons or reasons[row]]
-    say(f"{overview(rows, remaining)}; results in {results.path}")
+    rest = [row for row in rows if row not in reasons or reasons[row]]
+    say(f"{overview(rows, rest)}; results in {results.path}")
     for row in rows:
         if reasons.get(row):
             say(f"{row}: once more, as {reasons[row]}")
         elif row in reasons:
             say(result_line(results.read(row)))
     try:
-        has_failures = _run_rows(remaining, results, episodes, on, workers)
+        has_failures = _run_rows(rest, results, episodes, on, workers)
     except KeyboardInterrupt:
         say(f"\nstopped; finished rows are kept in {out}. The same command goes on.")
         raise typer.Exit(130) from None
-    stored, requests = results.all(), {_request(row) for row in rows}
+    results_on_disk, requests = results.all(), {_request(row) for row in rows}
     for environment_data in environments:
-        fit = [result for result in stored if result.row in rows or _request(result.row) not in requests]
+        fit = [result for result in results_on_disk if result.row in rows or _request(result.row) not in requests]
         console.print(environment_table(environment_data, fit))
     if has_failures:
         raise typer.Exit(1)
@@ -224,17 +224,17 @@ def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, 
     from cirl_marl.paper.table import result_line
 
     jobs = {row.stem: RowJob(row, results.path, episodes) for row in rows}
-    printed: set[str] = set()
+    names_shown: set[str] = set()
     with shares() as progress:
 
         def watch(standings: Sequence[Standing]) -> None:
-            for standing in standings:
-                if standing.state == "done" and standing.name not in printed:
-                    printed.add(standing.name)
-                    say(result_line(results.read(jobs[standing.name].row)))
-                elif standing.state == "running":
-                    place = f"{len(printed) + 1} of {len(rows)}"
-                    progress(f"{place}: {jobs[standing.name].row}: {standing.figures.get('what', '')}", standing.share)
+            for status in standings:
+                if status.state == "done" and status.name not in names_shown:
+                    names_shown.add(status.name)
+                    say(result_line(results.read(jobs[status.name].row)))
+                elif status.state == "running":
+                    place = f"{len(names_shown) + 1} of {len(rows)}"
+                    progress(f"{place}: {jobs[status.name].row}: {status.figures.get('what', '')}", status.share)
 
         failures = run_jobs([*jobs.values()], results.path / "logs", on=on, workers=workers, watch=watch)
     for failure in failures:
@@ -245,14 +245,14 @@ def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, 
 
 def _only_resume(context: typer.Context) -> None:
     """Refuse options beside --resume: a resumed run keeps its own."""
-    refused = [
+    surplus = [
         f"--{name}"
         for name in context.params
         if name not in ("resume", "network", "episodes", "steps", "device", "checkpoint_every")
         and getattr(context.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT"
     ]
-    if refused:
-        raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(refused)}")
+    if surplus:
+        raise CirlError(f"--resume goes on with the run as it was configured; leave out {', '.join(surplus)}")
 
 
 def what_is_kept(directory: Path) -> str:

@@ -105,8 +105,8 @@ def show(
         ends = [f"at least {service.low:g}"] if extremes(service.low)[1] > 0 else []
         ends += [] if np.isinf(extremes(service.high)[0]) else [f"at most {service.high:g}"]
         variation = ", changing in time" if isinstance(service.low, Series) or isinstance(service.high, Series) else ""
-        measured = f"{service.measure or service.quantity} of {' and '.join(service.providers)}"
-        console.print(f"service '{service.id}': {measured} {' and '.join(ends)}{variation}")
+        subject = f"{service.measure or service.quantity} of {' and '.join(service.providers)}"
+        console.print(f"service '{service.id}': {subject} {' and '.join(ends)}{variation}")
     circularity = float(definition.circularity(flow))
     console.print(f"λ of the start state: {circularity:.5g} {definition.mass_unit}")
     say(f"start: {start.description}")

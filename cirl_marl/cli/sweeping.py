@@ -154,12 +154,12 @@ def time_left(first: tuple[float, float], now: tuple[float, float]) -> float | N
     return (now[0] - first[0]) * (1.0 - now[1]) / done if done > 0 else None
 
 
-def table_of(standings: Sequence[CellStatus], left: float | None = None) -> Table:
+def table_of(standings: Sequence[CellStatus], seconds_to_go: float | None = None) -> Table:
     """Draw who is how far, and about how many seconds are left."""
     counts = {state: sum(cell.standing.state == state for cell in standings) for state in ORDER}
     title = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    if left:
-        title += f"; about {timedelta(seconds=round(left))} left"
+    if seconds_to_go:
+        title += f"; about {timedelta(seconds=round(seconds_to_go))} left"
     table = Table("cell", "state", "steps", "gap to the bound", title=title)
     rows = sorted(standings, key=lambda cell: ORDER.index(cell.standing.state))
     for cell in rows[:ROWS]:
@@ -176,9 +176,9 @@ def _activity(cell: CellStatus) -> str:
     return f"{cell.standing.state} {activity}".strip()
 
 
-def _steps(each: CellStatus) -> str:
-    figures, steps = each.standing.figures, f"{each.cell.steps:,}"
-    if each.standing.state == "done" or figures.get("what", "").startswith("evaluat"):
+def _steps(cell_status: CellStatus) -> str:
+    figures, steps = cell_status.standing.figures, f"{cell_status.cell.steps:,}"
+    if cell_status.standing.state == "done" or figures.get("what", "").startswith("evaluat"):
         return f"{steps} of {steps}"
     return f"{figures['done']:,} of {steps}" if figures.get("what") == "training" else ""
 

@@ -37,7 +37,7 @@ class Evaluation:
 
     run: RunDirectory
     comparison: Comparison
-    bounded: bool
+    has_bounds: bool
     figures: Mapping[str, Any]
     env: MultiAgentVectorEnv
 
@@ -64,16 +64,16 @@ class Evaluation:
         the same episodes, as it may have them.
         """
         own_path = self.run.path / "evaluation.json"
-        if path is not None or self.bounded or not self._is_kept(own_path):
+        if path is not None or self.has_bounds or not self._is_kept(own_path):
             write_json(own_path if path is None else Path(path), self.figures)
         return own_path if path is None else Path(path)
 
     def _is_kept(self, path: Path) -> bool:
         try:
-            stored = json.loads(path.read_text()) if path.is_file() else {}
+            content = json.loads(path.read_text()) if path.is_file() else {}
         except ValueError as error:
             raise RunError(f"{path}: cannot be read: {error}; delete it to evaluate anew") from error
-        return all(stored.get(name) == self.figures[name] for name in ("checkpoint", "episodes", "first_seed"))
+        return all(content.get(name) == self.figures[name] for name in ("checkpoint", "episodes", "first_seed"))
 
 
 def evaluate(

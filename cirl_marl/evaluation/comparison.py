@@ -173,7 +173,7 @@ def compare(
         uncertain,
     )
     first = first_seed(seed)
-    share = 1 / (len(candidates) + (len({each.name for each in candidates}) if bounds else 0))
+    share = 1 / (len(candidates) + (len({who_acts.name for who_acts in candidates}) if bounds else 0))
     rollouts, checkpoints = [], []
     for place, contender in enumerate(candidates):
         controller = contender.controller()
@@ -183,7 +183,7 @@ def compare(
     measure, bounds_by_entry = _without_bounds(len(candidates), "")
     if bounds:
         first_env, done = candidates[0].env(episodes), len(candidates) * share
-        starts, names = starting_stocks(first_env, first), [each.name for each in candidates]
+        starts, names = starting_stocks(first_env, first), [who_acts.name for who_acts in candidates]
         report = part_of(progress, "bounds", done, 1 - done)
         if (factors := first_env.physical.factors_if_any) is None:
             measure, bounds_by_entry = _certain_bounds(env, starts, names, rollouts, report)

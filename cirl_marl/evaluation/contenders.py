@@ -75,27 +75,27 @@ def differences(env: MultiAgentVectorEnv, reference_env: MultiAgentVectorEnv) ->
 
     Observations and rewards do not count.
     """
-    ours, reference_network = env.network, reference_env.network
-    if ours.name != reference_network.name:
-        yield f"network '{ours.name}', not '{reference_network.name}'"
+    own_network, reference_network = env.network, reference_env.network
+    if own_network.name != reference_network.name:
+        yield f"network '{own_network.name}', not '{reference_network.name}'"
         return
     if env.agents != reference_env.agents:
         yield f"agents {list(env.agents)}, not {list(reference_env.agents)}"
     if env.uncertain != reference_env.uncertain:
         words = ("drawn", "not drawn") if env.uncertain else ("not drawn", "drawn")
         yield f"uncertain numbers {words[0]}, there {words[1]}; say which with uncertain"
-    physics, reference = _physics(ours), _physics(reference_network)
+    physics, reference = _physics(own_network), _physics(reference_network)
     changes = [
         f"{quantity} {physics[quantity]!r}, not {reference[quantity]!r}"
         for quantity in physics
         if physics[quantity] != reference[quantity]
     ]
-    parts, counterparts = _parts(ours), _parts(reference_network)
+    parts, counterparts = _parts(own_network), _parts(reference_network)
     ids = [f"'{key[1]}'" for key in parts | counterparts if parts.get(key) != counterparts.get(key)]
     if ids:
         changes.append(f"the definition of {', '.join(ids[:5])}{' and others' if len(ids) > 5 else ''}")
-    if changes and ours.scenario_name != reference_network.scenario_name:
-        yield f"scenario '{ours.scenario_name}', not '{reference_network.scenario_name}'"
+    if changes and own_network.scenario_name != reference_network.scenario_name:
+        yield f"scenario '{own_network.scenario_name}', not '{reference_network.scenario_name}'"
     else:
         yield from changes
 

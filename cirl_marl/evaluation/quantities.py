@@ -60,9 +60,9 @@ class ComparedQuantity:
 
         What does not exist counts as 0, and a first value below ``round_off`` as ``round_off``.
         """
-        there = np.nan_to_num(self.values)
-        largest = float(np.abs(there - there[0]).max())
-        return largest / max(abs(float(there[0])), self.round_off) if largest > self.round_off else 0.0
+        figures = np.nan_to_num(self.values)
+        largest = float(np.abs(figures - figures[0]).max())
+        return largest / max(abs(float(figures[0])), self.round_off) if largest > self.round_off else 0.0
 
 
 def rank_quantities(simulations: Sequence[Simulation]) -> list[ComparedQuantity]:

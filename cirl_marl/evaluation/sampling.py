@@ -73,7 +73,7 @@ def sample_episodes(
     if samples < 2:
         raise CirlError(f"samples must be at least 2, got {samples}")
     env = MultiAgentVectorEnv(network, num_envs=samples, uncertain=True)
-    begun, horizon = episode_start(env), network.episode.horizon
+    start_state, horizon = episode_start(env), network.episode.horizon
     stock = np.empty((samples, horizon, len(network.stores)))
     flow = np.empty((samples, horizon, len(network.arcs)))
 
@@ -82,7 +82,7 @@ def sample_episodes(
         flow[:, steps - 1] = env.physical.flow.T
         progress(steps / horizon)
 
-    run = rollout(env, named_controller(control), seed=first_seed(seed), start=begun.initial_state, progress=keep)
+    run = rollout(env, named_controller(control), seed=first_seed(seed), start=start_state.initial_state, progress=keep)
     factors = env.physical.factors.T.copy()
     return SampledEpisodes(network, tuple(network.uncertain), factors, run.circularity_mean, run.levels, stock, flow)
 
@@ -121,8 +121,8 @@ def sensitivities(episodes: SampledEpisodes) -> list[Sensitivity]:
     causes = []
     for name, values in figures.items():
         if np.ptp(values) <= 1e-12 * np.abs(values).max(initial=0.0):
-            undefined = np.full(len(episodes.names), np.nan)
-            causes.append(Sensitivity(name, undefined, undefined))
+            no_share = np.full(len(episodes.names), np.nan)
+            causes.append(Sensitivity(name, no_share, no_share))
             continue
         indices = analysis.analyze(problem, episodes.factors, values, num_resamples=RESAMPLES, seed=0)
         causes.append(Sensitivity(name, np.array(indices["S1"]), np.array(indices["S1_conf"])))

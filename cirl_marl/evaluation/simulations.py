@@ -131,7 +131,13 @@ def simulate(
         CirlError: if scenario or controller is unknown, does not fit the network, or does not take ``constants``.
     """
     (only,) = simulate_alternatives(
-        network, scenarios=[scenario], controls=[control], held=constants, steps=steps, seed=seed, progress=progress
+        network,
+        scenarios=[scenario],
+        controls=[control],
+        constants=constants,
+        steps=steps,
+        seed=seed,
+        progress=progress,
     )
     return only
 
@@ -141,7 +147,7 @@ def simulate_alternatives(
     *,
     scenarios: Sequence[str | None] = (None,),
     controls: Sequence[str | Controller] = ("neutral",),
-    held: Mapping[str, float] | None = None,
+    constants: Mapping[str, float] | None = None,
     steps: int | None = None,
     seed: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
@@ -155,7 +161,7 @@ def simulate_alternatives(
         network: catalogue name, path of a definition file, or a network.
         scenarios: of the definition; None is the default, physical one.
         controls: names of CONTROLLERS, or controllers.
-        held: agent → constant value in [−1, 1], for those of the controllers that take such values.
+        constants: agent → constant value in [−1, 1], for those of the controllers that take such values.
         steps: control intervals of each episode; None takes the definition's.
         seed: of the evaluation whose first episode is simulated; None begins in the middle of all initial ranges.
         progress: called with the share of all work that is done.
@@ -165,20 +171,14 @@ def simulate_alternatives(
 
     Raises:
         CirlError: before anything is simulated, if a scenario or controller is unknown, given twice or not at all, if
-            nobody takes ``held``, or if units, beginnings or durations of scenarios differ, naming both. Later, if a
-            controller cannot act in a scenario; names it.
+            nobody takes ``constants``, or if units, beginnings or durations of scenarios differ, naming both. Later, if
+            a controller cannot act in a scenario; names it.
     """
     envs = [MultiAgentVectorEnv(network, num_envs=1, scenario=scenario, horizon=steps) for scenario in scenarios]
     names = [control if isinstance(control, str) else type(control).__name__ for control in controls]
-    _refuse(envs, names, held)
+    _refuse(envs, names, constants)
     cases = list(product(envs, names))
-    controllers = [
-        named_controller(control, constants=held if control in SETTABLE else None)
-        if isinstance(control, str)
-        else control
-        for _ in envs
-        for control in controls
-    ]
+    controllers = [_controller(control, constants) for _ in envs for control in controls]
     simulations = []
     for i, ((env, control), controller) in enumerate(zip(cases, controllers, strict=True)):
         choices = ((env.network.scenario_name, envs), (control, names))
@@ -193,10 +193,10 @@ def simulate_alternatives(
     return simulations
 
 
-def _controller(control: str | Controller, held: Mapping[str, float] | None) -> Controller:
+def _controller(control: str | Controller, constants: Mapping[str, float] | None) -> Controller:
     if isinstance(control, Controller):
         return control
-    return named_controller(control, constants=held if control in SETTABLE else None)
+    return named_controller(control, constants=constants if control in SETTABLE else None)
 
 
 def _refuse(
@@ -252,8 +252,8 @@ def _obstacles(first: Network, second: Network) -> Iterator[str]:
         yield f"start on the calendar {episode_1.start or 'none'} and {episode_2.start or 'none'}"
     if not math.isclose(episode_1.horizon * episode_1.control_interval, episode_2.horizon * episode_2.control_interval):
         value_1, value_2 = (
-            f"{each.horizon} intervals of {each.control_interval:g} {first.time_unit}"
-            for each in (episode_1, episode_2)
+            f"{timing.horizon} intervals of {timing.control_interval:g} {first.time_unit}"
+            for timing in (episode_1, episode_2)
         )
         advice = "; give a number of steps for both" if episode_1.control_interval == episode_2.control_interval else ""
         yield f"horizon {value_1} and {value_2}{advice}"

@@ -89,8 +89,10 @@ def over_seeds(scores: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed:
     if seeds == 1 or not np.isfinite(value):
         return Aggregate(value, float("nan"), float("nan"))
     rng = np.random.default_rng(seed)
-    found = stats.bootstrap(strata, _joint_mean, n_resamples=resamples, vectorized=True, method="percentile", rng=rng)
-    interval = found.confidence_interval
+    resampling = stats.bootstrap(
+        strata, _joint_mean, n_resamples=resamples, vectorized=True, method="percentile", rng=rng
+    )
+    interval = resampling.confidence_interval
     return Aggregate(value, float(interval.low), float(interval.high))
 
 

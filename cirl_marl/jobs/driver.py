@@ -20,7 +20,7 @@ from cirl_marl.records.files import refuse_links
 JobState = Literal["waiting", "running", "elsewhere", "done", "failed"]
 POLL, WATCH = 0.1, 1.0
 """Seconds between two looks at the workers, and between two calls of who watches."""
-EACH = 0.002
+POLL_SECONDS = 0.002
 """Seconds more for every worker, so that thousands in a queue are not asked all the time."""
 PATIENCE = 60.0
 """Seconds for workers that are told to stop to save what they have."""
@@ -102,7 +102,7 @@ def run_jobs(
     driver = _Driver(jobs, folder, watch)
     try:
         while driver.goes_on(place):
-            time.sleep(POLL + EACH * driver.at_work)
+            time.sleep(POLL + POLL_SECONDS * driver.at_work)
     finally:
         driver.stop()
         if place is not None:
@@ -129,24 +129,24 @@ class _Driver:
         if len(self._files) != len(jobs):
             raise CirlError("jobs must have distinct names")
         self._states: dict[str, JobState] = {job.name: "done" if job.is_done() else "waiting" for job in jobs}
-        self._waiting = [job for job in jobs if self._states[job.name] == "waiting"]
-        self._running: dict[str, tuple[Job, Worker]] = {}
-        self._told: dict[str, Mapping[str, Any]] = {}
-        self._watch, self._watched = watch, -WATCH
+        self._queue = [job for job in jobs if self._states[job.name] == "waiting"]
+        self._at_work: dict[str, tuple[Job, Worker]] = {}
+        self._last_report: dict[str, Mapping[str, Any]] = {}
+        self._watch, self._reported_at = watch, -WATCH
         self.failures: list[Failure] = []
 
     @property
     def at_work(self) -> int:
         """How many work at the moment."""
-        return len(self._running)
+        return len(self._at_work)
 
     def goes_on(self, place: Workplace | None) -> bool:
         """Look after those at work, start others, and return whether anything is left to be done."""
-        for job, worker in list(self._running.values()):
+        for job, worker in list(self._at_work.values()):
             if (state := worker.ended()) is not None:
                 self._take_back(job, state)
-        for job in list(self._waiting):
-            if place is not None and len(self._running) >= place.workers:
+        for job in list(self._queue):
+            if place is not None and len(self._at_work) >= place.workers:
                 break
             if self._files[job.name].is_claimed():
                 self._states[job.name] = "elsewhere"
@@ -155,30 +155,30 @@ class _Driver:
             elif place is None:
                 self._do_here(job)
             else:
-                self._waiting.remove(job)
+                self._queue.remove(job)
                 self._states[job.name] = "running"
-                self._told.pop(job.name, None)
-                self._running[job.name] = job, place.start(self._work(job))
-        remaining = bool(self._waiting or self._running)
-        self._look(at_once=not remaining)
-        return remaining
+                self._last_report.pop(job.name, None)
+                self._at_work[job.name] = job, place.start(self._work(job))
+        rest = bool(self._queue or self._at_work)
+        self._look(at_once=not rest)
+        return rest
 
     def stop(self) -> None:
         """Tell all who are at work to stop, and wait for what they save."""
-        for _, worker in self._running.values():
+        for _, worker in self._at_work.values():
             worker.stop()
         late = time.monotonic() + PATIENCE
-        while any(worker.ended() is None for _, worker in self._running.values()) and time.monotonic() < late:
+        while any(worker.ended() is None for _, worker in self._at_work.values()) and time.monotonic() < late:
             time.sleep(POLL)
 
     def _take_back(self, job: Job, state: str) -> None:
         """Note how a worker ended: the job is done, has failed, or was somebody else's."""
-        del self._running[job.name]
+        del self._at_work[job.name]
         files = self._files[job.name]
         if job.is_done():
             self._settle(job, "done")
         elif not state:
-            self._waiting.append(job)
+            self._queue.append(job)
             self._states[job.name] = "elsewhere"
         else:
             message = files.figures().get("said") or ": ".join(
@@ -202,10 +202,10 @@ class _Driver:
             self._settle(job, "done")
 
     def _settle(self, job: Job, state: JobState, failure: Failure | None = None) -> None:
-        if job in self._waiting:
-            self._waiting.remove(job)
+        if job in self._queue:
+            self._queue.remove(job)
         self._states[job.name] = state
-        self._told.pop(job.name, None)
+        self._last_report.pop(job.name, None)
         if failure is not None:
             self.failures.append(failure)
 
@@ -214,10 +214,10 @@ class _Driver:
 
     def _look(self, at_once: bool = False) -> None:
         """Call who watches, unless that was a moment ago."""
-        if not at_once and time.monotonic() - self._watched < WATCH:
+        if not at_once and time.monotonic() - self._reported_at < WATCH:
             return
-        self._watched = time.monotonic()
+        self._reported_at = time.monotonic()
         for name, state in self._states.items():
-            if state in ("running", "elsewhere") or name not in self._told:
-                self._told[name] = self._files[name].figures()
-        self._watch([Standing(name, state, self._told[name]) for name, state in self._states.items()])
+            if state in ("running", "elsewhere") or name not in self._last_report:
+                self._last_report[name] = self._files[name].figures()
+        self._watch([Standing(name, state, self._last_report[name]) for name, state in self._states.items()])

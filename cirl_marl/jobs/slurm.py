@@ -115,8 +115,8 @@ class SlurmJob:
             return f"came no further in a whole job ({state}): give it more time, --slurm timeout_min=…"
         if state == "COMPLETED":
             return ""
-        said = "ended, and Slurm does not say how" if state == "" else f"Slurm job {self._number}: {state}"
-        return ": ".join([said, *words])
+        message = "ended, and Slurm does not say how" if state == "" else f"Slurm job {self._number}: {state}"
+        return ": ".join([message, *words])
 
     def stop(self) -> None:
         """Have it save what it has, and end; out of the queue if it has not begun."""
@@ -129,19 +129,19 @@ class Queue:
 
     def __init__(self) -> None:
         """Follow nothing yet."""
-        self._followed: set[str] = set()
+        self._numbers: set[str] = set()
         self._live: dict[str, str] = {}
-        self._asked = -AGE
-        self._answered = time.monotonic()
+        self._last_query = -AGE
+        self._last_answer = time.monotonic()
 
     def follow(self, number: str) -> None:
         """Follow a job that was put into the queue this moment."""
-        self._followed.add(number)
+        self._numbers.add(number)
         self._live[number] = "PENDING"
 
     def forget(self, number: str) -> None:
         """Follow a job no longer."""
-        self._followed.discard(number)
+        self._numbers.discard(number)
         self._live.pop(number, None)
 
     def state(self, number: str) -> str:
@@ -150,12 +150,12 @@ class Queue:
         Raises:
             RunError: if the controller has not answered for a long time.
         """
-        if time.monotonic() - self._asked >= AGE:
+        if time.monotonic() - self._last_query >= AGE:
             self._ask()
         return self._live[number] if number in self._live else self._end(number)
 
     def _ask(self) -> None:
-        self._asked = time.monotonic()
+        self._last_query = time.monotonic()
         # all of the user's: of a list of numbers squeue refuses to answer when it has forgotten a single one
         answer = subprocess.run(
             ["squeue", "--noheader", "--me", "--states=all", "--format=%i %T"],
@@ -164,12 +164,12 @@ class Queue:
             check=False,
         )
         if answer.returncode:
-            if self._asked - self._answered > SILENCE:
+            if self._last_query - self._last_answer > SILENCE:
                 raise RunError(f"Slurm has not answered for {SILENCE:.0f} s: {answer.stderr.strip()}")
             return
-        self._answered = self._asked
+        self._last_answer = self._last_query
         states = dict(line.split(maxsplit=1) for line in answer.stdout.splitlines())
-        self._live = {number: states[number] for number in self._followed & states.keys() if states[number] in LIVE}
+        self._live = {number: states[number] for number in self._numbers & states.keys() if states[number] in LIVE}
 
     def _end(self, number: str) -> str:
         """Return how a job ended, by the controller while it remembers it, then by accounting if there is one."""

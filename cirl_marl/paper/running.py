@@ -103,11 +103,11 @@ class RowJob:
 def reason_to_repeat(result: Result, episodes: int | None = None) -> str:
     """Return in what a result differs from what ``run_row`` would give today; empty if in nothing that is known."""
     environment, settings = environment_of(result.row.environment), result.settings
-    expected = _evaluation_episodes(environment, episodes)
-    if result.evaluation is not None and result.evaluation.episodes != expected:
-        return f"its policy played {result.evaluation.episodes} episodes, not {expected}"
-    stored = settings.get("definition_sha256")
-    if stored is not None and stored != describe(environment).get("definition_sha256"):
+    options = _evaluation_episodes(environment, episodes)
+    if result.evaluation is not None and result.evaluation.episodes != options:
+        return f"its policy played {result.evaluation.episodes} episodes, not {options}"
+    content = settings.get("definition_sha256")
+    if content is not None and content != describe(environment).get("definition_sha256"):
         return "the definition of the environment is another now"
     if result.row.settings == "tuned" and (name := tuned_recipe(environment.name)) is not None:
         try:
@@ -146,7 +146,7 @@ def evaluate(
     env.seed(seed)
     quota = np.array([(episodes + copy) // copies for copy in range(copies)])
     episodes_done = np.full(copies, -warm_up)
-    reached, starts = np.zeros(copies, dtype=bool), np.ones(copies, dtype=bool)
+    success_count, starts = np.zeros(copies, dtype=bool), np.ones(copies, dtype=bool)
     returns: list[float] = []
     successes: list[bool] = []
     knows_success, state, observation = False, None, env.reset()
@@ -155,13 +155,13 @@ def evaluate(
         observation, _, starts, infos = env.step(actions)
         for copy, info in enumerate(infos):
             knows_success |= "success" in info
-            reached[copy] |= bool(info.get("success", False))
+            success_count[copy] |= bool(info.get("success", False))
             if starts[copy]:
                 if 0 <= episodes_done[copy] < quota[copy]:
                     returns.append(float(info["episode"]["r"]))
-                    successes.append(bool(reached[copy]))
+                    successes.append(bool(success_count[copy]))
                 episodes_done[copy] += 1
-                reached[copy] = False
+                success_count[copy] = False
         report("evaluating", len(returns), episodes)
     env.close()
     return Evaluation(

@@ -87,17 +87,17 @@ def minutes(row: PaperRow) -> float:
     return whole * row.steps / environment.steps
 
 
-def overview(rows: Sequence[PaperRow], remaining: Sequence[PaperRow]) -> str:
-    """Say how many rows there are, how many of them are done, and how long those that are ``remaining`` may take.
+def overview(rows: Sequence[PaperRow], rest: Sequence[PaperRow]) -> str:
+    """Say how many rows there are, how many of them are done, and how long those that are ``rest`` may take.
 
     >>> rows = [PaperRow(environment="Reacher", algorithm=name, steps=100_000, seed=0) for name in ("SAC", "PPO")]
     >>> overview(rows, rows[:1])
     "rows: 2, done: 1, to go by the paper's training times: 22 min"
     """
-    to_go = sum(map(minutes, remaining))
+    to_go = sum(map(minutes, rest))
     takes = f"{to_go:.0f} min" if to_go < 120 else f"{to_go / 60:.0f} h"
-    done = f"rows: {len(rows)}, done: {len(rows) - len(remaining)}"
-    return f"{done}, to go by the paper's training times: {takes}" if remaining else done
+    done = f"rows: {len(rows)}, done: {len(rows) - len(rest)}"
+    return f"{done}, to go by the paper's training times: {takes}" if rest else done
 
 
 def tuned_recipe(environment: str) -> str | None:

@@ -38,15 +38,15 @@ def environment_table(environment: PaperEnvironment, results: Sequence[Result]) 
 
 def table_rows(environment: PaperEnvironment, results: Iterable[Result]) -> list[tuple[str, ...]]:
     """Return the cells of one environment: for each algorithm the paper's row and ours, then the tuned rows."""
-    own = [result for result in results if result.row.environment == environment.name]
-    stored = {kind: [r for r in own if r.row.settings == kind] for kind in ("published", "tuned")}
+    our_results = [result for result in results if result.row.environment == environment.name]
+    results_on_disk = {kind: [r for r in our_results if r.row.settings == kind] for kind in ("published", "tuned")}
     rows = []
     for name, references in environment.runs.items():
-        found = [result for result in stored["published"] if result.row.algorithm == name]
-        rows += [_paper_row(environment, name, references), _our_row(environment, name, "ours", found)]
-    for name in dict.fromkeys(result.row.algorithm for result in stored["tuned"]) or ("",):
-        found = [result for result in stored["tuned"] if result.row.algorithm == name]
-        rows.append(_our_row(environment, name, "tuned", found))
+        row_of_table = [result for result in results_on_disk["published"] if result.row.algorithm == name]
+        rows += [_paper_row(environment, name, references), _our_row(environment, name, "ours", row_of_table)]
+    for name in dict.fromkeys(result.row.algorithm for result in results_on_disk["tuned"]) or ("",):
+        row_of_table = [result for result in results_on_disk["tuned"] if result.row.algorithm == name]
+        rows.append(_our_row(environment, name, "tuned", row_of_table))
     return rows
 
 
@@ -110,13 +110,13 @@ def _above(environment: PaperEnvironment, figures: Mapping[str, float | None]) -
     return f"{', '.join(match)} above the optimum" if match else ""
 
 
-def _our_row(environment: PaperEnvironment, algorithm: str, run: str, found: Sequence[Result]) -> tuple[str, ...]:
+def _our_row(environment: PaperEnvironment, algorithm: str, run: str, outcome: Sequence[Result]) -> tuple[str, ...]:
     """Average the seeds that have as many steps as the paper; failing these, those with the most steps."""
-    if not found:
+    if not outcome:
         return (algorithm, run, *("" for _ in NUMERIC), "", NOT_RUN)
-    done = [result.row.steps for result in found]
+    done = [result.row.steps for result in outcome]
     steps = environment.steps if environment.steps in done else max(done)
-    seeds = sorted((result for result in found if result.row.steps == steps), key=lambda result: result.row.seed)
+    seeds = sorted((result for result in outcome if result.row.steps == steps), key=lambda result: result.row.seed)
 
     def cell(figure: Callable[[Result], float]) -> str:
         return over_seeds([figure(result) for result in seeds])
@@ -169,13 +169,13 @@ def _broke(result: Result) -> str:
 def notes(environment: PaperEnvironment, results: Iterable[Result]) -> str:
     """Say what final policies played and how much episodes vary, what is the best possible, and what differs."""
     best = "; ".join(f"{number(optimum.value)} ({optimum.how})" for optimum in environment.optima) or "not known"
-    mine = [result for result in results if result.row.environment == environment.name]
-    recipes = [result for result in mine if result.row.settings == "tuned"]
+    our_results = [result for result in results if result.row.environment == environment.name]
+    recipes = [result for result in our_results if result.row.settings == "tuned"]
     sentences = []
-    if episodes := distinct(result.evaluation.episodes for result in mine if result.evaluation is not None):
+    if episodes := distinct(result.evaluation.episodes for result in our_results if result.evaluation is not None):
         spread = [result.evaluation for result in recipes if result.evaluation is not None]
-        varied = f"; {_spread(spread)}" if spread else ""
-        sentences.append(f"Final policy: {' or '.join(episodes)} episodes a seed{varied}.")
+        deviation = f"; {_spread(spread)}" if spread else ""
+        sentences.append(f"Final policy: {' or '.join(episodes)} episodes a seed{deviation}.")
     endings = [result.published_ends.mean for result in recipes if result.published_ends is not None]
     if endings:
         sentences.append(f"Tuned ones where episodes end as the published class ends them: {over_seeds(endings)}.")

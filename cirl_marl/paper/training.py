@@ -36,7 +36,7 @@ Predict = Callable[[Any, Any, NDArray[np.bool_]], tuple[NDArray[Any], Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PaperTraining:
+class TrainingRecord:
     """What a training hands over to be measured.
 
     Attributes:
@@ -74,7 +74,7 @@ def describe(environment: PaperEnvironment) -> dict[str, Any]:
     return text
 
 
-def train_published(environment: PaperEnvironment, row: PaperRow, report: Report) -> PaperTraining:
+def train_published(environment: PaperEnvironment, row: PaperRow, report: Report) -> TrainingRecord:
     """Train with the paper's settings: the library's default hyperparameters, one copy; hindsight for goal tasks.
 
     A learner whose weights become NaN ends there, and that is what these settings give: the same seed gives it again.
@@ -92,7 +92,7 @@ def train_published(environment: PaperEnvironment, row: PaperRow, report: Report
 
 def train_tuned(
     environment: PaperEnvironment, row: PaperRow, report: Report, recipe: Recipe | None = None
-) -> PaperTraining:
+) -> TrainingRecord:
     """Train by a recipe: networks with batched physics, goal tasks and others in a batch of copies.
 
     Without a recipe it is the catalogue's; steps and seed are those of the row.
@@ -131,7 +131,7 @@ def train_tuned(
 
 def _train_network(
     environment: PaperEnvironment, recipe: Recipe, row: PaperRow, report: Report, settings: dict[str, Any]
-) -> PaperTraining:
+) -> TrainingRecord:
     """Train the one agent of a network in its paper scenario."""
     arguments = check_registered(environment).kwargs
     agent = arguments.get("agent")
@@ -142,14 +142,14 @@ def _train_network(
     options: dict[str, Any] = {"steps": row.steps, "seed": row.seed, "scenario": arguments.get("scenario")}
     options |= {"agents": None if agent is None else [agent]}
     with tempfile.TemporaryDirectory() as folder:
-        elapsed = _stopwatch()
+        stop_clock = _stopwatch()
         training = train(arguments["network"], recipe, directory=Path(folder) / "run", report=watch, **options)
-        seconds, cpu_seconds = elapsed()
+        seconds, cpu_seconds = stop_clock()
         assert training.run is not None
         metrics = training.run.metrics()
     agent = training.env.agents[0]
     learner, copies = training.learners[agent], training.env.num_envs
-    return PaperTraining(
+    return TrainingRecord(
         predict=_predictor(learner.model, learner.env),
         # the copies of a network end together, and a row of the metrics is the mean over them
         ends=np.repeat(np.asarray(metrics["env_steps"], dtype=int), copies).tolist(),
@@ -169,7 +169,7 @@ def _train_copies(
     row: PaperRow,
     report: Report,
     settings: dict[str, Any],
-) -> PaperTraining:
+) -> TrainingRecord:
     """Train in copies of the Gymnasium environment; a goal task gets hindsight, as in the paper."""
     monitors: list[Monitor[Any, Any]] = [Monitor(gymnasium.make(environment.id)) for _ in range(copies)]
     env: VecEnv = DummyVecEnv([lambda monitor=monitor: monitor for monitor in monitors])  # type: ignore[misc]
@@ -185,7 +185,7 @@ def _train_copies(
         report("training", min(model.num_timesteps, row.steps), row.steps)
         return True
 
-    elapsed = _stopwatch()
+    stop_clock = _stopwatch()
     if learner.demonstrations is not None:
         seeds = [derived_seed(row.seed, "demonstrations", i) for i in range(copies)]
         act = in_copies(learner.demonstrations.controller, monitors, seeds)
@@ -195,16 +195,16 @@ def _train_copies(
             return act()
 
         demonstrate(model, learner.demonstrations.steps, act_and_tell)
-    remaining, fresh = row.steps - model.num_timesteps, model.num_timesteps == 0
+    rest, fresh = row.steps - model.num_timesteps, model.num_timesteps == 0
     try:
-        model.learn(remaining, callback=tell, reset_num_timesteps=fresh)
+        model.learn(rest, callback=tell, reset_num_timesteps=fresh)
     except (CirlError, ValueError):  # what torch's distributions and the environments say of NaN
         if _is_finite(model):
             raise
-    seconds, cpu_seconds = elapsed()
+    seconds, cpu_seconds = stop_clock()
     ends, returns = _episodes_of(monitors)
     env.close()
-    return PaperTraining(
+    return TrainingRecord(
         predict=_predictor(model, env) if _is_finite(model) else None,
         ends=ends,
         returns=returns,
@@ -224,8 +224,8 @@ def _predictor(model: BaseAlgorithm, env: VecEnv) -> Predict:
     """Return the deterministic policy of ``model`` behind the normaliser that it was trained with, if any."""
 
     def predict(observation: Any, state: Any, starts: NDArray[np.bool_]) -> tuple[NDArray[Any], Any]:
-        seen = env.normalize_obs(observation) if isinstance(env, VecNormalize) else observation
-        return model.predict(seen, state, starts, deterministic=True)
+        observations = env.normalize_obs(observation) if isinstance(env, VecNormalize) else observation
+        return model.predict(observations, state, starts, deterministic=True)
 
     return predict
 

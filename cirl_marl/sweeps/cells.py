@@ -64,10 +64,10 @@ class Cell:
     @property
     def content(self) -> dict[str, Any]:
         """All that its result depends on, as resolved and ready for JSON."""
-        given = dict(self.options)
+        own_options = dict(self.options)
         run = self.recipe.run.model_dump(mode="json")
-        run |= {key: given.pop(key) for key in tuple(given) if key in run}
-        environment = {key: value for key, value in self.recipe.environment.items() if key != "scenario"} | given
+        run |= {key: own_options.pop(key) for key in tuple(own_options) if key in run}
+        environment = {key: value for key, value in self.recipe.environment.items() if key != "scenario"} | own_options
         return {
             "network": self.network,
             "scenario": self.scenario,
@@ -157,14 +157,14 @@ class CellJob:
         from cirl_marl.learners.interface import complete_run  # it needs torch
 
         cell = self.cell
-        found = load_network(cell.address, scenario=cell.scenario)
-        if fingerprint(found) != cell.definition_sha256:
+        directory = load_network(cell.address, scenario=cell.scenario)
+        if fingerprint(directory) != cell.definition_sha256:
             raise RunError(f"{cell.address}: was edited while the sweep was running; start the sweep again")
         run = complete_run(
             self.run_directory.path,
             cell.address,
             cell.recipe,
-            report=self._reporting(tell),
+            report=self._report(tell),
             checkpoint_every=self.checkpoint_every,
             scenario=cell.scenario,
             seed=cell.seed,
@@ -174,7 +174,7 @@ class CellJob:
         comparison = compare(
             [run], ["neutral"], **asked, progress=lambda activity, share: tell("evaluating", share, 1.0)
         )
-        entry = next(each for each in comparison.entries if each.run is not None)
+        entry = next(entry_of_run for entry_of_run in comparison.entries if entry_of_run.run is not None)
         gap = None if entry.gap is None else over_episodes(entry.gap, (0.0, np.inf)).as_dict()
         figures = {
             "circularity": over_episodes(entry.circularity).as_dict(),
@@ -188,7 +188,7 @@ class CellJob:
         tell("evaluated", 1, 1, lambda: {"gap": None if gap is None else gap["value"]})
         write_json(self.result, figures)
 
-    def _reporting(self, tell: Tell) -> Callable[[Progress], None]:
+    def _report(self, tell: Tell) -> Callable[[Progress], None]:
         """Return what tells how far the training is, and what the policies reach that are the best so far."""
         steps = self.cell.steps
 

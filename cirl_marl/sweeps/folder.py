@@ -44,21 +44,21 @@ class SweepFolder:
         """
         if self.path.exists() and not self.path.is_dir():
             raise RunError(f"{self.path}: is a file, not a folder")
-        if self.path.is_dir() and not self._asked.is_file() and any(self._strangers()):
+        if self.path.is_dir() and not self._request_path.is_file() and any(self._strangers()):
             stored = ", ".join(sorted(self._strangers())[:MISMATCHES_SHOWN])
             raise RunError(f"{self.path}: holds something else than a sweep ({stored}); choose another folder")
         refuse_links(self.path)
-        now = self._described(request, cells)
+        now = self._description(request, cells)
         self.path.mkdir(parents=True, exist_ok=True)
         with FileLock(self.path / ".asked.lock"):
-            if self._asked.is_file():
-                self._check(now, self._kept())
+            if self._request_path.is_file():
+                self._check(now, self._stored_request())
             for cell in cells:
                 file = self.cell(cell.name) / "cell.json"
                 if not file.is_file():
                     file.parent.mkdir(parents=True, exist_ok=True)
                     write_json(file, cell.content)
-            write_json(self._asked, now)
+            write_json(self._request_path, now)
 
     def cell(self, name: str) -> Path:
         """Return the folder of a cell."""
@@ -81,7 +81,7 @@ class SweepFolder:
 
     def rows(self) -> list[dict[str, Any]]:
         """Return a row for each cell: what it is, and its figures with their 95 % intervals, None where not known."""
-        return [self.row(name) for name in self._kept()["cells"]]
+        return [self.row(name) for name in self._stored_request()["cells"]]
 
     def write_table(self) -> list[dict[str, Any]]:
         """Write the table of results, and return its rows."""
@@ -113,17 +113,17 @@ class SweepFolder:
         return row | {"cpu_seconds": _json(figures).get("cpu_seconds") if figures.is_file() else None}
 
     @property
-    def _asked(self) -> Path:
+    def _request_path(self) -> Path:
         return self.path / "asked.json"
 
-    def _kept(self) -> dict[str, Any]:
-        return _json(self._asked)
+    def _stored_request(self) -> dict[str, Any]:
+        return _json(self._request_path)
 
     def _strangers(self) -> Iterator[str]:
         names = {"cells", "bounds", "jobs", ".asked.lock", ".asked.partial.json"}
-        return (each.name for each in self.path.iterdir() if each.name not in names)
+        return (entry.name for entry in self.path.iterdir() if entry.name not in names)
 
-    def _described(self, request: SweepFile, cells: Sequence[Cell]) -> dict[str, Any]:
+    def _description(self, request: SweepFile, cells: Sequence[Cell]) -> dict[str, Any]:
         """Return what is asked for as JSON has it."""
         plain = request.model_dump(mode="json")
         plain["options"] = {key: values for key, values in plain["options"].items() if values is not None}
@@ -132,16 +132,16 @@ class SweepFolder:
         plain["recipes"] = {cell.recipe.name: cell.recipe.model_dump(mode="json") for cell in cells}
         return {**plain, "cells": [cell.name for cell in cells]}
 
-    def _check(self, now: dict[str, Any], stored: dict[str, Any]) -> None:
+    def _check(self, now: dict[str, Any], content: dict[str, Any]) -> None:
         """Refuse to make another sweep of the one that is kept; one may add cells to it."""
-        missing_cells = set(stored["cells"]) - set(now["cells"])
-        if not missing_cells and now["evaluation"] == stored["evaluation"]:
+        missing_cells = set(content["cells"]) - set(now["cells"])
+        if not missing_cells and now["evaluation"] == content["evaluation"]:
             return
-        mismatches = [name for key in now if key != "cells" for name in _differences(now[key], stored.get(key), key)]
+        mismatches = [name for key in now if key != "cells" for name in _differences(now[key], content.get(key), key)]
         more = f" and {len(mismatches) - MISMATCHES_SHOWN} more" if len(mismatches) > MISMATCHES_SHOWN else ""
         raise RunError(
             f"{self.path}: holds another sweep ({'; '.join(mismatches[:MISMATCHES_SHOWN])}{more}), of which "
-            f"{len(missing_cells)} of {len(stored['cells'])} cells are none of this one; "
+            f"{len(missing_cells)} of {len(content['cells'])} cells are none of this one; "
             "choose another folder. Nothing was changed"
         )
 
@@ -165,10 +165,10 @@ def _json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _differences(request: Any, stored: Any, where: str) -> Iterator[str]:
+def _differences(request: Any, content: Any, prefix: str) -> Iterator[str]:
     """Yield where two JSON values differ."""
-    if isinstance(request, dict) and isinstance(stored, dict):
-        for key in dict.fromkeys((*request, *stored)):
-            yield from _differences(request.get(key), stored.get(key), f"{where}.{key}")
-    elif request != stored:
-        yield f"{where}: {json.dumps(request)}, there {json.dumps(stored)}"
+    if isinstance(request, dict) and isinstance(content, dict):
+        for key in dict.fromkeys((*request, *content)):
+            yield from _differences(request.get(key), content.get(key), f"{prefix}.{key}")
+    elif request != content:
+        yield f"{prefix}: {json.dumps(request)}, there {json.dumps(content)}"

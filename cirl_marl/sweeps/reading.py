@@ -113,13 +113,13 @@ def _unknown_names(sound: Mapping[str, Sequence[str]]) -> Iterator[str]:
     for key, read, names in (("networks", load_network, networks), ("recipes", load_recipe, recipes)):
         for name in sound.get(key, ()):
             try:
-                each = _read(read, names, key[:-1], name)
+                candidate = _read(read, names, key[:-1], name)
             except DefinitionError as error:
                 yield from (f"{key}: {problem}" for problem in str(error).splitlines())
             except CirlError as error:
                 yield f"{key}: {error}"
             else:
-                unknown_names += [each] if isinstance(each, Network) else []
+                unknown_names += [candidate] if isinstance(candidate, Network) else []
     for network in unknown_names:
         present = [network.scenario_name, *network.scenarios]
         for name in sound.get("scenarios", ()):

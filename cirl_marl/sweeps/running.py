@@ -81,13 +81,13 @@ def sweep(
     folder.claim(request, cells)
     work = {job.name: job for job in jobs_of(cells, request, folder, checkpoint_every)}
     fronts = {cell.name: FrontJob.of(cell, folder.bounds) for cell in cells} if request.evaluation.bounds else {}
-    remaining = {fronts[name].name: fronts[name] for name, job in work.items() if name in fronts and not job.is_done()}
+    rest = {fronts[name].name: fronts[name] for name, job in work.items() if name in fronts and not job.is_done()}
 
     def report(standings: Sequence[Standing]) -> None:
         statuses = {status.name: status for status in standings}
         watch([_cell_status(work[name].cell, statuses[name], fronts.get(name)) for name in work])
 
-    jobs: list[Job] = [*remaining.values(), *work.values()]
+    jobs: list[Job] = [*rest.values(), *work.values()]
     failures = run_jobs(jobs, folder.jobs, on=on, workers=workers, settings=settings, watch=report, say=say)
     return SweepOutcome(folder.path, tuple(folder.write_table()), tuple(failures))
 
