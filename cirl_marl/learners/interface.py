@@ -80,11 +80,9 @@ def train(
     """
     _check_options(options, train)
     directories = None if directory is None else [Path(directory)]
-    settings = {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents}
-    settings |= {"checkpoint_every": checkpoint_every, **options}
-    (training,) = _train(
-        network, recipe, [seed], directories, callbacks=callbacks, report=report, device=device, **settings
-    )
+    options |= {"steps": steps, "envs": envs, "engine": engine, "min_service": min_service, "agents": agents}
+    options |= {"callbacks": callbacks, "report": report, "device": device, "checkpoint_every": checkpoint_every}
+    (training,) = _train(network, recipe, [seed], directories, **options)
     return training
 
 

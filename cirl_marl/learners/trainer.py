@@ -27,7 +27,7 @@ from cirl_marl.learners.learner import Learner, derived_seed, has_tensorboard
 from cirl_marl.learners.lockstep import Lockstep, NetworkWorld, Participant, Streams, TrainingStop, wait
 from cirl_marl.learners.policies import Policies
 from cirl_marl.learners.run_directory import RunConfig, RunDirectory, TableFile, steps_of
-from cirl_marl.learners.stacked.conditions import first_obstacle, obstacle, stacks
+from cirl_marl.learners.stacked.conditions import obstacle, stacks
 from cirl_marl.learners.stacked.stack import Stack
 from cirl_marl.learners.start import begin_again, begin_from
 from cirl_marl.learners.validation import MULTIPLIER_FROM, Score, ServiceMultiplier, ValidationEpisodes
@@ -205,18 +205,20 @@ class Training:
         Raises:
             RecipeError: if one cannot that has to; names it and what is in the way.
         """
-        engine = self.config.recipe.run.engine
-        learners = list(self.learners.values())
-        if engine == "stacked" and (reason := first_obstacle(learners)) is not None:
-            raise RecipeError(f"recipe '{self.config.recipe.name}': {reason}; use engine auto or lockstep")
-        members = [learner for learner in learners if learner.name not in callbacks and obstacle(learner) is None]
-        members = [] if engine == "lockstep" else members
-        for learner in learners:
-            if learner.spec.start is not None and learner.spec.start.last_layer and learner not in members:
-                reason = obstacle(learner) or ("engine lockstep" if engine == "lockstep" else "a callback")
-                raise RecipeError(
-                    f"{learner.agent_env.title}: start.last_layer: needs a stacked ARS, which {reason} prevents"
-                )
+        engine, members = self.config.recipe.run.engine, []
+        for learner in self.learners.values():
+            title, reason = learner.agent_env.title, obstacle(learner)
+            if engine == "stacked" and reason is not None:
+                place = f"recipe '{self.config.recipe.name}': {title}: engine stacked"
+                raise RecipeError(f"{place}: {reason}; use engine auto or lockstep")
+            if reason is None and engine == "lockstep":
+                reason = "engine lockstep"
+            elif reason is None and learner.name in callbacks:
+                reason = "a callback"
+            if reason is None:
+                members.append(learner)
+            elif learner.spec.start is not None and learner.spec.start.last_layer:
+                raise RecipeError(f"{title}: start.last_layer: needs a stacked ARS, which {reason} prevents")
         return members
 
     @property

@@ -145,11 +145,8 @@ class SharedPolicy(View):
 
     def rows(self, observations: Arrays) -> NDArray[np.floating]:
         """Return the padded and marked observations, shape (N·B, longest + N)."""
-        copies = len(observations[self.agents[0]])
-        rows = np.zeros((len(self.agents), copies, self._length + len(self.agents)), dtype=np.float32)
-        for a, agent in enumerate(self.agents):
-            observation = observations[agent]
-            rows[a, :, : observation.shape[1]] = observation
+        rows = self._padded(observations, self._length + len(self.agents))
+        for a in range(len(self.agents)):
             rows[a, :, self._length + a] = 1.0
         return rows.reshape(-1, rows.shape[2])
 
@@ -160,10 +157,15 @@ class SharedPolicy(View):
 
     def join(self, actions: Arrays) -> NDArray[np.float32]:
         """Return the padded actions, shape (N·B, longest)."""
-        rows = np.zeros((len(self.agents), len(actions[self.agents[0]]), max(self._actions.values())), np.float32)
-        for a, (agent, n) in enumerate(self._actions.items()):
-            rows[a, :, :n] = actions[agent]
-        return rows.reshape(-1, rows.shape[2])
+        longest = max(self._actions.values())
+        return self._padded(actions, longest).reshape(-1, longest)
+
+    def _padded(self, arrays: Arrays, length: int) -> NDArray[np.float32]:
+        """Return the agents' arrays with zeros after them, shape (N, B, length)."""
+        rows = np.zeros((len(self.agents), len(arrays[self.agents[0]]), length), dtype=np.float32)
+        for row, agent in zip(rows, self.agents, strict=True):
+            row[:, : arrays[agent].shape[1]] = arrays[agent]
+        return rows
 
     def score(self, rewards: Arrays) -> Floats:
         """Return each agent's reward, shape (N·B,)."""

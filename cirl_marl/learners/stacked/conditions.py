@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import torch
 from sb3_contrib import ARS
@@ -50,18 +50,6 @@ def obstacle(learner: Learner) -> str | None:
     if type(model) is ARS:
         return _search_obstacle(learner)
     return f"algorithm {learner.spec.algorithm} is not PPO, A2C or ARS"
-
-
-def first_obstacle(learners: Sequence[Learner]) -> str | None:
-    """Return what keeps the first learner that cannot be stacked from it; None if all can be."""
-    return next(
-        (
-            f"{learner.agent_env.title}: engine stacked: {reason}"
-            for learner in learners
-            if (reason := obstacle(learner)) is not None
-        ),
-        None,
-    )
 
 
 def _on_policy_obstacle(model: PPO | A2C, policy_name: str) -> str | None:
