@@ -45,9 +45,9 @@ ROBOTS = f"{__name__}.robots"
 
 
 @cache
-def _found(package: str) -> dict[str, type[Any]]:
+def _models_of(package: str) -> dict[str, type[Any]]:
     """Import every module of a package, but not its subpackages, which may be heavy, and collect its models."""
-    found: dict[str, type[Any]] = {}
+    kinds: dict[str, type[Any]] = {}
     for module_info in pkgutil.iter_modules(importlib.import_module(package).__path__):
         if module_info.ispkg:
             continue
@@ -58,10 +58,10 @@ def _found(package: str) -> dict[str, type[Any]]:
             if not issubclass(member, CompartmentModel) or isabstract(member):
                 continue
             kind = member.kind
-            if kind in found:
-                raise CirlError(f"{module.__name__}: kind '{kind}' is taken by {found[kind].__module__}.")
-            found[kind] = member
-    return found
+            if kind in kinds:
+                raise CirlError(f"{module.__name__}: kind '{kind}' is taken by {kinds[kind].__module__}.")
+            kinds[kind] = member
+    return kinds
 
 
 def models() -> dict[str, type[Any]]:
@@ -70,7 +70,7 @@ def models() -> dict[str, type[Any]]:
     >>> "transport_truck" in models()
     True
     """
-    return dict(sorted((_found(__name__) | _found(ROBOTS)).items()))
+    return dict(sorted((_models_of(__name__) | _models_of(ROBOTS)).items()))
 
 
 def model_class(kind: str) -> type[Any]:
@@ -88,20 +88,24 @@ def model_class(kind: str) -> type[Any]:
     """
     if ":" in kind:
         return _elsewhere(kind)
-    light = _found(__name__)
+    light = _models_of(__name__)
     if kind in light:
         return light[kind]
     try:
-        return _found(ROBOTS)[kind]
+        return _models_of(ROBOTS)[kind]
     except KeyError:
         raise CirlError(unknown("compartment kind", kind, models())) from None
 
 
 def kind_of(model: CompartmentModel) -> str:
     """Return the name by which definitions call the class of ``model``: its kind, or where it is if it is your own."""
-    own, kind = type(model), model.kind
-    known = kind in _found(__name__) or kind in _found(ROBOTS)
-    return kind if known and model_class(kind) is own else f"{own.__module__}:{own.__qualname__}"
+    model_type, kind = type(model), model.kind
+    is_built_in = kind in _models_of(__name__) or kind in _models_of(ROBOTS)
+    return (
+        kind
+        if is_built_in and model_class(kind) is model_type
+        else f"{model_type.__module__}:{model_type.__qualname__}"
+    )
 
 
 def _elsewhere(place: str) -> type[Any]:
@@ -109,15 +113,15 @@ def _elsewhere(place: str) -> type[Any]:
     if not all(part.isidentifier() for part in (*module.split("."), name)):
         raise CirlError(f"compartment kind '{place}': write where the class is, as 'package.module:Class'")
     try:
-        found = getattr(importlib.import_module(module), name)
+        model_class_ = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        lost = isinstance(error, ModuleNotFoundError) and error.name == module.split(".")[0]
-        remedy = "; install it, or run with PYTHONPATH pointing to the folder that it lies in" if lost else ""
+        is_absent = isinstance(error, ModuleNotFoundError) and error.name == module.split(".")[0]
+        remedy = "; install it, or run with PYTHONPATH pointing to the folder that it lies in" if is_absent else ""
         raise CirlError(f"compartment kind '{place}': {error}{remedy}") from error
     except (Exception, SystemExit) as error:
         raise CirlError(f"compartment kind '{place}': importing it failed: {type(error).__name__}: {error}") from error
-    if not isinstance(found, type):
-        raise CirlError(f"compartment kind '{place}': is no class of compartment models, but {found!r}")
-    if faults := list(model_faults(found)):
+    if not isinstance(model_class_, type):
+        raise CirlError(f"compartment kind '{place}': is no class of compartment models, but {model_class_!r}")
+    if faults := list(model_faults(model_class_)):
         raise CirlError(f"compartment kind '{place}': is no class of compartment models: {'; '.join(faults)}")
-    return found
+    return model_class_

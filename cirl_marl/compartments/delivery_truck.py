@@ -55,8 +55,8 @@ class DeliveryTruck(TransportTruck, Vehicle):
 
     def derivative(self, state: Floats, inputs: Floats, *, load_kg: Floats | float | None = None) -> Floats:
         """Return (ẋ, v̇, 0), shape (3, B); arguments as of ``TransportTruck``."""
-        moving = TransportTruck.derivative(self, state[:2], inputs, load_kg=load_kg)
-        return np.concatenate([moving, np.zeros_like(state[2:])])
+        in_motion = TransportTruck.derivative(self, state[:2], inputs, load_kg=load_kg)
+        return np.concatenate([in_motion, np.zeros_like(state[2:])])
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −((destination − x)² + 0.1 v² + weight·F²), shape (B,)."""
@@ -73,21 +73,21 @@ class DeliveryTruck(TransportTruck, Vehicle):
         """Return where the truck rests at the recipient with its load, shape (B,)."""
         return self._at(state, self.target_m)
 
-    def depart(self, state: Floats, where: NDArray[np.bool_]) -> Floats:
-        """Return the state with the recipient as destination ``where`` the truck was loaded."""
-        return self._heading(state, where, self.target_m)
+    def depart(self, state: Floats, mask: NDArray[np.bool_]) -> Floats:
+        """Return the state with the recipient as destination ``mask`` the truck was loaded."""
+        return self._heading(state, mask, self.target_m)
 
-    def turn_back(self, state: Floats, where: NDArray[np.bool_]) -> Floats:
-        """Return the state with the donor as destination ``where`` the truck was unloaded."""
-        return self._heading(state, where, 0.0)
+    def turn_back(self, state: Floats, mask: NDArray[np.bool_]) -> Floats:
+        """Return the state with the donor as destination ``mask`` the truck was unloaded."""
+        return self._heading(state, mask, 0.0)
 
     def _at(self, state: Floats, place_m: float) -> NDArray[np.bool_]:
         position_m, speed_m_s, destination_m = state
         near, slow = np.abs(position_m - place_m) <= self.reach_m, np.abs(speed_m_s) <= self.rest_m_s
-        there: NDArray[np.bool_] = near & slow & (destination_m == place_m)
-        return there
+        at_goal: NDArray[np.bool_] = near & slow & (destination_m == place_m)
+        return at_goal
 
-    def _heading(self, state: Floats, where: NDArray[np.bool_], place_m: float) -> Floats:
-        turned = state.copy()
-        turned[2] = np.where(where, place_m, state[2])
-        return turned
+    def _heading(self, state: Floats, mask: NDArray[np.bool_], place_m: float) -> Floats:
+        state_ = state.copy()
+        state_[2] = np.where(mask, place_m, state[2])
+        return state_

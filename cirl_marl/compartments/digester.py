@@ -76,16 +76,16 @@ class Digester(ContinuousModel, OutflowModel, MeasuringModel):
     @property
     def feed(self) -> Floats:
         """Concentrations in the feed, shape (6,); it carries no biomass. Zin follows from the acid's equilibrium."""
-        dissociated = self.acidity_constant_mol_l / (self.acidity_constant_mol_l + 10.0**-self.ph_in)
-        alkalinity = dissociated * self.acids_in_mmol_l
+        dissociation = self.acidity_constant_mol_l / (self.acidity_constant_mol_l + 10.0**-self.ph_in)
+        alkalinity = dissociation * self.acids_in_mmol_l
         return np.array([0.0, self.substrate_in_g_l, 0.0, self.acids_in_mmol_l, alkalinity, self.carbon_in_mmol_l])
 
     def growth(self, state: Floats) -> tuple[Floats, Floats]:
         """Return the growth of both populations, μ1X1 and μ2X2, g/(L d), each of shape (B,)."""
         x1, s1, x2, s2 = state[0], state[1], state[2], state[3]
         acidogens = self.growth1_per_day * s1 / (s1 + self.half_saturation1_g_l) * x1
-        inhibited = s2 + self.half_saturation2_mmol_l + (s2 / self.inhibition2) ** 2
-        return acidogens, self.growth2_per_day * s2 / inhibited * x2
+        inhibition = s2 + self.half_saturation2_mmol_l + (s2 / self.inhibition2) ** 2
+        return acidogens, self.growth2_per_day * s2 / inhibition * x2
 
     def reaction(self, state: Floats) -> Floats:
         """Return what the reactions and the gas change per day at no dilution, shape (6, B)."""
@@ -94,26 +94,26 @@ class Digester(ContinuousModel, OutflowModel, MeasuringModel):
         carbon = self.k4 * grown1 + self.k5 * grown2 - self.gas(state)
         return np.stack([grown1, -self.k1 * grown1, grown2, acids, np.zeros_like(grown1), carbon])
 
-    def flushing(self, state: Floats) -> Floats:
+    def washout(self, state: Floats) -> Floats:
         """Return what a unit of dilution changes: −αX for the biomass, z_in − z for the rest, shape (6, B)."""
-        washed = self.feed[:, None] - state
-        washed[[0, 2]] *= self.suspended_share
-        return washed
+        outflow_ = self.feed[:, None] - state
+        outflow_[[0, 2]] *= self.suspended_share
+        return outflow_
 
     def derivative(self, state: Floats, inputs: Floats) -> Floats:
         """Return dz/dt per day, shape (6, B); ``inputs`` is (D,), shape (1, B)."""
-        rate: Floats = self.reaction(state) + inputs[0] * self.flushing(state)
+        rate: Floats = self.reaction(state) + inputs[0] * self.washout(state)
         return rate
 
     def partial_pressure(self, state: Floats, dissolved_mmol_l: Floats | None = None) -> Floats:
         """Return P_C, atm, shape (B,); w under the root is C + S2 − Z unless another is given, shape (B,)."""
         free = state[5] + state[3] - state[4]
-        saturated = self.henry_mmol_l_atm * self.pressure_atm
-        phi = free + saturated + self.k6 / self.transfer_per_day * self.growth(state)[1]
-        rooted = free if dissolved_mmol_l is None else dissolved_mmol_l
-        root = np.sqrt(np.maximum(phi**2 - 4.0 * saturated * rooted, 0.0))
+        saturation = self.henry_mmol_l_atm * self.pressure_atm
+        phi = free + saturation + self.k6 / self.transfer_per_day * self.growth(state)[1]
+        square_root = free if dissolved_mmol_l is None else dissolved_mmol_l
+        root = np.sqrt(np.maximum(phi**2 - 4.0 * saturation * square_root, 0.0))
         # (φ − √…)/(2K_H), multiplied out so that φ ≈ √… costs no digits
-        pressure: Floats = 2.0 * self.pressure_atm * rooted / (phi + root)
+        pressure: Floats = 2.0 * self.pressure_atm * square_root / (phi + root)
         return pressure
 
     def gas(self, state: Floats) -> Floats:
@@ -147,28 +147,28 @@ class Digester(ContinuousModel, OutflowModel, MeasuringModel):
         washed_out = CirlError(
             f"digester: no equilibrium with living biomass at a dilution of {dilution_per_day!r}/day."
         )
-        needed = self.suspended_share * dilution_per_day
-        half = self.inhibition2**2 * (self.growth2_per_day - needed) / (2.0 * needed) if needed > 0.0 else 0.0
+        demand = self.suspended_share * dilution_per_day
+        half = self.inhibition2**2 * (self.growth2_per_day - demand) / (2.0 * demand) if demand > 0.0 else 0.0
         square = half**2 - self.half_saturation2_mmol_l * self.inhibition2**2
-        if not (0.0 < needed < self.growth1_per_day and half > 0.0 and square >= 0.0):
+        if not (0.0 < demand < self.growth1_per_day and half > 0.0 and square >= 0.0):
             raise washed_out
-        s1 = needed * self.half_saturation1_g_l / (self.growth1_per_day - needed)
+        s1 = demand * self.half_saturation1_g_l / (self.growth1_per_day - demand)
         # the smaller root of S2² − 2·half·S2 + K_S2·K_I2² = 0, without cancellation
         s2 = self.half_saturation2_mmol_l * self.inhibition2**2 / (half + square**0.5)
         x1 = (self.substrate_in_g_l - s1) / (self.suspended_share * self.k1)
-        acids = self.k2 * needed * x1 + dilution_per_day * (self.acids_in_mmol_l - s2)
-        x2 = acids / (self.k3 * needed)
+        acids = self.k2 * demand * x1 + dilution_per_day * (self.acids_in_mmol_l - s2)
+        x2 = acids / (self.k3 * demand)
         if x1 <= 0.0 or x2 <= 0.0:
             raise washed_out
         alkalinity = float(self.feed[4])
-        carbon = self._equilibrium_carbon(dilution_per_day, needed * x1, needed * x2, alkalinity - s2)
+        carbon = self._equilibrium_carbon(dilution_per_day, demand * x1, demand * x2, alkalinity - s2)
         return np.array([x1, s1, x2, s2, alkalinity, carbon])
 
     def _equilibrium_carbon(self, dilution: float, grown1: float, grown2: float, bound: float) -> float:
         """Return C at equilibrium (Bernard et al. 2001, eq. 46 to 48); ``bound`` is Z − S2."""
-        kla, saturated = self.transfer_per_day, self.henry_mmol_l_atm * self.pressure_atm
+        kla, saturation = self.transfer_per_day, self.henry_mmol_l_atm * self.pressure_atm
         supply = self.carbon_in_mmol_l - bound + (self.k4 * grown1 + self.k5 * grown2) / dilution
-        omega = saturated + supply + (kla + dilution) / kla * self.k6 * grown2 / dilution
-        pressure = (omega - (omega**2 - 4.0 * saturated * supply) ** 0.5) / (2.0 * self.henry_mmol_l_atm)
-        dissolved = (kla * self.henry_mmol_l_atm * pressure + dilution * supply) / (kla + dilution)
-        return float(dissolved + bound)
+        omega = saturation + supply + (kla + dilution) / kla * self.k6 * grown2 / dilution
+        pressure = (omega - (omega**2 - 4.0 * saturation * supply) ** 0.5) / (2.0 * self.henry_mmol_l_atm)
+        solution = (kla * self.henry_mmol_l_atm * pressure + dilution * supply) / (kla + dilution)
+        return float(solution + bound)

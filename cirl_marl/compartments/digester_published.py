@@ -64,7 +64,7 @@ class DigesterPublished(ContinuousModel, OutflowModel):
 
     def derivative(self, state: Floats, inputs: Floats) -> Floats:
         """Return dz/dt per day, shape (6, B); ``inputs`` are the six dilutions, shape (6, B)."""
-        return self.reaction(state) + inputs * self.process.flushing(state)
+        return self.reaction(state) + inputs * self.process.washout(state)
 
     def outflow(self, state: Floats, inputs: Floats) -> Floats:
         """Return ṁ12 = f_r·qC, CO₂ emitted per litre, mmol/(L d), shape (B,)."""
@@ -84,7 +84,7 @@ class DigesterPublished(ContinuousModel, OutflowModel):
         p = 0.5 * np.sum((start - middle) ** 2, axis=0) ** (1.0 - q) / q**2
         deviation = state - middle
         gradient = 2.0 * p * q * np.sum(deviation**2, axis=0) ** (q - 1.0) * deviation
-        flushing = self.process.flushing(state)
-        drift = self.reaction(state) + self.dilution_per_day * flushing
-        dilutions: Floats = self.dilution_per_day - (drift + 0.5 * gradient) / flushing
+        washout = self.process.washout(state)
+        drift = self.reaction(state) + self.dilution_per_day * washout
+        dilutions: Floats = self.dilution_per_day - (drift + 0.5 * gradient) / washout
         return dilutions

@@ -156,19 +156,21 @@ class Incinerator(ContinuousModel, OutflowModel):
 
     def powers(self, state: Floats, inputs: Floats, flows: Flows) -> tuple[Floats, Floats]:
         """Return what heats wastebed and freeboard, kJ/min, each of shape (B,)."""
-        bed, freeboard, taken = state[2], state[5], inputs[0]
+        bed, freeboard, recovery = state[2], state[5], inputs[0]
         gas, ambient = self.gas_heat_kj_kg_k, self.ambient_degc
-        fed = bed if self.form == "published" else ambient - bed
-        bed_power = flows.feed * self.waste_heat_kj_kg_k * fed + self.air_bed_kg_min * gas * (ambient - bed)
+        temperature_rise = bed if self.form == "published" else ambient - bed
+        bed_power = flows.feed * self.waste_heat_kj_kg_k * temperature_rise + self.air_bed_kg_min * gas * (
+            ambient - bed
+        )
         freeboard_power = flows.to_freeboard * gas * (bed - freeboard)
         freeboard_power = freeboard_power + self.air_freeboard_kg_min * gas * (ambient - freeboard)
         if self.form != "sound":
-            return bed_power + self.bed_heat_kj_min, freeboard_power + self.freeboard_heat_kj_min - taken
-        released = self.combustion_kj_kg * flows.gas_made
-        exchanged = self.exchange_kj_min_k * (freeboard - bed)
-        taken = np.minimum(taken, self.recovery_kj_min_k * (freeboard - ambient))
-        bed_power = bed_power + self.bed_share * released + exchanged
-        return bed_power, freeboard_power + (1.0 - self.bed_share) * released - exchanged - taken
+            return bed_power + self.bed_heat_kj_min, freeboard_power + self.freeboard_heat_kj_min - recovery
+        combustion = self.combustion_kj_kg * flows.gas_made
+        exchange = self.exchange_kj_min_k * (freeboard - bed)
+        recovery = np.minimum(recovery, self.recovery_kj_min_k * (freeboard - ambient))
+        bed_power = bed_power + self.bed_share * combustion + exchange
+        return bed_power, freeboard_power + (1.0 - self.bed_share) * combustion - exchange - recovery
 
     def capacities(self, state: Floats) -> tuple[Floats, Floats]:
         """Return the heat capacities of wastebed and freeboard, kJ/K, each of shape (B,)."""

@@ -68,8 +68,8 @@ class Microalgae(ContinuousModel, OwnStepModel):
         ``published`` returns K_CO2·ρ: arXiv 2502.02382 equates µmol/(µm³ d) with mmol/(L d). ``sound`` returns
         K_CO2·ρ·X/1000.
         """
-        taken = self.reward(state, inputs)
-        return taken if self.form == "published" else taken / 1000.0
+        uptake = self.reward(state, inputs)
+        return uptake if self.form == "published" else uptake / 1000.0
 
     def _halves(self, interval: float) -> tuple[int, float, float, Callable[[Floats, Floats], Drawdown]]:
         """Return the number of substeps, half of one h/2, E = e^(−Dh/2) and (S, demand) → drawdown in half of one."""
@@ -84,7 +84,7 @@ class Microalgae(ContinuousModel, OwnStepModel):
         )
         return steps, half, math.exp(-self.dilution_per_day * half), draw
 
-    def _taken(self, most: Floats | float, *halves: tuple[Floats, Drawdown]) -> Floats:
+    def _uptake_from_states(self, most: Floats | float, *halves: tuple[Floats, Drawdown]) -> Floats:
         """Return what a substep adds to ∫ρ dt (published) or ∫ρX/1000 dt (sound), of (demand, drawdown) in its halves.
 
         ``most`` is ρ at saturation, by which the demand is its product with X.

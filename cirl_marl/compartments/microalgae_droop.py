@@ -67,8 +67,8 @@ class MicroalgaeDroop(Microalgae):
         growth = self.growth_per_day * self.light(inputs) * (1.0 - self.minimal_quota_umol_um3 / quota)
         rho = self.uptake(state, inputs)
         supply = self.dilution_per_day * (self.nutrient_in_umol_l - nutrient)
-        grown = growth * biomass - self.dilution_per_day * biomass
-        return np.stack([grown, rho - growth * quota, supply - rho * biomass])
+        biovolume_growth = growth * biomass - self.dilution_per_day * biomass
+        return np.stack([biovolume_growth, rho - growth * quota, supply - rho * biomass])
 
     def integrate(self, state: Floats, inputs: Floats, interval: float) -> tuple[Floats, Floats]:
         """Return the state after an interval of constant light, (3, B), and the mean ``outflow`` over it, (B,).
@@ -88,20 +88,20 @@ class MicroalgaeDroop(Microalgae):
         ρX (sound) or ρ (published) along the exact S. All this holds for X ≥ 0, Q > k_q, S ≥ 0, I ≥ 0.
         """
         biomass, quota, nutrient = state
-        steps, half, kept, draw = self._halves(interval)
+        steps, half, retention, draw = self._halves(interval)
         ungrown = np.exp(-2.0 * half * self.growth_per_day * self.light(inputs))
         least, most = self.minimal_quota_umol_um3, self.uptake_umol_um3_day
         uptake = np.zeros_like(biomass)
         for _ in range(steps):
             early_demand = most * biomass
             early = draw(nutrient, early_demand)
-            quota = quota + most / kept * early.share_retained
+            quota = quota + most / retention * early.share_retained
 
-            grown = least + (quota - least) * ungrown
-            biomass, quota = biomass * (kept * kept) * (quota / grown), grown
+            growth = least + (quota - least) * ungrown
+            biomass, quota = biomass * (retention * retention) * (quota / growth), growth
 
             late_demand = most * biomass
             late = draw(early.nutrient, late_demand)
             quota, nutrient = quota + most * late.share_retained, late.nutrient
-            uptake += self._taken(most, (early_demand, early), (late_demand, late))
+            uptake += self._uptake_from_states(most, (early_demand, early), (late_demand, late))
         return np.stack([biomass, quota, nutrient]), self.co2_per_nutrient / interval * uptake

@@ -79,18 +79,18 @@ class MicroalgaeMonod(Microalgae):
         holds for X, S, I ≥ 0.
         """
         biomass, nutrient = state
-        steps, _, kept, draw = self._halves(interval)
+        steps, _, retention, draw = self._halves(interval)
         most = self.growth_per_day * self.light(inputs) / self.biovolume_yield  # ρ at saturation
         uptake = np.zeros_like(biomass)
         for _ in range(steps):
             early_demand = most * biomass
             early = draw(nutrient, early_demand)
-            grown = self.biovolume_yield * early_demand * early.share_retained
-            biomass = biomass * kept + grown
+            growth = self.biovolume_yield * early_demand * early.share_retained
+            biomass = biomass * retention + growth
 
-            late_demand = most * (biomass * kept + grown)
+            late_demand = most * (biomass * retention + growth)
             late = draw(early.nutrient, late_demand)
-            biomass = biomass * kept + self.biovolume_yield * late_demand * late.share_retained
+            biomass = biomass * retention + self.biovolume_yield * late_demand * late.share_retained
             nutrient = late.nutrient
-            uptake += self._taken(most, (early_demand, early), (late_demand, late))
+            uptake += self._uptake_from_states(most, (early_demand, early), (late_demand, late))
         return np.stack([biomass, nutrient]), self.co2_per_nutrient / interval * uptake

@@ -86,8 +86,8 @@ def draw_down(
     chord = weight * np.log1p(excess)
     falls = chord > 0.0
     chord = np.where(falls, chord, 1.0)
-    left = chord - goal
-    fall = np.minimum(left - wrightomega(np.log(chord) + left), 0.0)
+    residual = chord - goal
+    fall = np.minimum(residual - wrightomega(np.log(chord) + residual), 0.0)
     # S rises: the slope grows from ``first`` to 1, taken as linear in λ
     first = (nutrient + half_saturation) / (start * steady_sum)
     rise = -2.0 * goal / (first + np.sqrt(first * first + 2.0 * np.maximum(1.0 - first, 0.0) * goal))
@@ -95,23 +95,23 @@ def draw_down(
     pull = weight * ratio
     exponent = np.where(falls, fall, rise)  # −λ
     for _ in range(NEWTON_STEPS):
-        gone = np.expm1(exponent)
-        change = ratio * gone
-        kept = 1.0 + change  # (S − r₂)/(S₀ − r₂)
-        missing = goal + exponent + weight * np.log1p(change)
-        exponent = exponent - missing * kept / (kept + (pull + pull * gone))
+        decay = np.expm1(exponent)
+        change = ratio * decay
+        remainder = 1.0 + change  # (S − r₂)/(S₀ − r₂)
+        defect = goal + exponent + weight * np.log1p(change)
+        exponent = exponent - defect * remainder / (remainder + (pull + pull * decay))
 
-    gone = np.expm1(exponent)
-    end: Floats = nutrient * np.exp(exponent) - quasi_steady * gone
+    decay = np.expm1(exponent)
+    end: Floats = nutrient * np.exp(exponent) - quasi_steady * decay
     # ∫dt/(S + K) = (t + ln((S − r₂)/(S₀ − r₂))/D)/(r₁ + K), and s = 1 − K/(S + K)
-    saturation = span - half_saturation / steady_sum * (span + np.log1p(ratio * gone) / dilution)
+    saturation = span - half_saturation / steady_sum * (span + np.log1p(ratio * decay) / dilution)
 
     before, after = nutrient / (nutrient + half_saturation), end / (end + half_saturation)
     saturation = np.minimum(np.maximum(saturation, span * np.minimum(before, after)), span * np.maximum(before, after))
     kept_water = math.exp(-dilution * span)
-    untouched = nutrient * kept_water - feed * math.expm1(-dilution * span)
-    retained = (untouched - end) / (demand + _LEAST_DEMAND)
-    return Drawdown(end, saturation, np.minimum(np.maximum(retained, kept_water * saturation), saturation))
+    no_draw = nutrient * kept_water - feed * math.expm1(-dilution * span)
+    retention = (no_draw - end) / (demand + _LEAST_DEMAND)
+    return Drawdown(end, saturation, np.minimum(np.maximum(retention, kept_water * saturation), saturation))
 
 
 def substeps(interval: float, rate: float) -> int:

@@ -59,9 +59,9 @@ class TransportTruck(ContinuousModel):
 
     def resistance_n(self, speed_m_s: Floats, mass_kg: Floats | float) -> Floats:
         """Return rolling resistance plus drag, in N, shape (B,); it always opposes the motion."""
-        rolling = self.rolling_resistance * mass_kg * self.gravity_m_s2 * np.tanh(speed_m_s / self.standstill_m_s)
+        friction = self.rolling_resistance * mass_kg * self.gravity_m_s2 * np.tanh(speed_m_s / self.standstill_m_s)
         drag = 0.5 * self.air_density_kg_m3 * self.drag_area_m2 * speed_m_s * np.abs(speed_m_s)
-        return rolling + drag
+        return friction + drag
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −((x* − x)² + 0.1 v² + 0.001 F²), shape (B,)."""

@@ -48,9 +48,9 @@ class TroposphereTemperature(ContinuousModel):
     def derivative(self, state: Floats, inputs: Floats, *, stock_kg: Floats) -> Floats:
         """Return Ṫ, K/d, shape (1, B); ``stock_kg`` is x₁, the CO₂ that the network holds there, shape (B,)."""
         co2_t = stock_kg[None] / 1000.0
-        absorbed = self.solar_w_m2 * (1.0 - self.albedo)
-        emitted = self.effective_emissivity(co2_t) * self.stefan_boltzmann_w_m2_k4 * np.square(np.square(state))
-        return SECONDS_PER_DAY / self.heat_capacity_j_m2_k * (absorbed - emitted)
+        absorption = self.solar_w_m2 * (1.0 - self.albedo)
+        emission = self.effective_emissivity(co2_t) * self.stefan_boltzmann_w_m2_k4 * np.square(np.square(state))
+        return SECONDS_PER_DAY / self.heat_capacity_j_m2_k * (absorption - emission)
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −(T − T*)², K², shape (B,)."""

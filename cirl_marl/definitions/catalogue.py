@@ -20,13 +20,13 @@ CHECKOUT = Path(__file__).parent.parent.parent
 
 def folder(kind: str) -> Path:
     """Return the folder of definitions ``envs`` or ``agents``, of the installed package or of a checkout."""
-    installed = IN_PACKAGE / kind
-    if installed.is_dir():
-        return installed
+    in_package = IN_PACKAGE / kind
+    if in_package.is_dir():
+        return in_package
     beside = CHECKOUT / kind
     if beside.is_dir() and (CHECKOUT / "cirl_marl" / "definitions" / "catalogue.py").samefile(__file__):
         return beside
-    raise CirlError(f"the catalogue folder '{kind}' is missing: looked in {installed} and {beside}")
+    raise CirlError(f"the catalogue folder '{kind}' is missing: looked in {in_package} and {beside}")
 
 
 def networks() -> list[str]:

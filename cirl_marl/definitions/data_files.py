@@ -124,7 +124,7 @@ class _Table:
         (_, self.header), *self.rows = lines
         self.place = {column: i for i, column in enumerate(self.header)}
         if len(self.place) != len(self.header):
-            twice = next(each for each in self.header if self.header.count(each) > 1)
+            twice = next(name_ for name_ in self.header if self.header.count(name_) > 1)
             raise CirlError(f"file '{name}', line 1: names the column '{twice}' twice")
         for line, row in self.rows:
             if len(row) != len(self.header):
@@ -138,29 +138,29 @@ class _Table:
             if key not in self.place:
                 fault = f"file '{self.name}': {unknown('column', key, self.header)}"
                 raise CirlError(fault + ("" if len(self.header) > 1 else " Separate columns with commas."))
-        chosen = self._matching_rows(conditions)
-        lines = [self.rows[i][0] for i in chosen]
-        values = [self._number(*self.rows[i], column) for i in chosen]
+        matches = self._matching_rows(conditions)
+        lines = [self.rows[i][0] for i in matches]
+        values = [self._number(*self.rows[i], column) for i in matches]
         origin = f"{self.name}, column '{column}'" + (f", where {_conditions(conditions)}" if conditions else "")
         if times is not None:
-            return Column(self._times(chosen, times), values, origin)
-        if len(chosen) > 1:
+            return Column(self._times(matches, times), values, origin)
+        if len(matches) > 1:
             remedy = "fix more columns in 'where', or name the column of times in 'times'"
             raise CirlError(f"{origin}: lines {lines[0]} and {lines[1]} both match; {remedy}")
         return Column(None, values, origin)
 
     def _matching_rows(self, conditions: Mapping[str, str]) -> list[int]:
         """Return the rows that match, by an index of the columns in ``conditions``: many series name the same ones."""
-        keys = tuple(self.place[each] for each in conditions)
+        keys = tuple(self.place[column_] for column_ in conditions)
         if keys not in self._indices:
             index: dict[tuple[str, ...], list[int]] = {}
             for i, (_, row) in enumerate(self.rows):
                 index.setdefault(tuple(row[key] for key in keys), []).append(i)
             self._indices[keys] = index
-        chosen = self._indices[keys].get(tuple(conditions.values()))
-        if not chosen:
+        matches = self._indices[keys].get(tuple(conditions.values()))
+        if not matches:
             raise CirlError(f"file '{self.name}': {self._mismatch(conditions)}")
-        return chosen
+        return matches
 
     def _mismatch(self, conditions: Mapping[str, str]) -> str:
         """Say which entry of ``conditions`` leaves no row, with the nearest value that would leave one."""
@@ -184,12 +184,12 @@ class _Table:
             raise CirlError(f"file '{self.name}', line {line}, column '{column}': '{text}' {remedy}")
         return value
 
-    def _times(self, chosen: Iterable[int], column: str) -> list[YearOrDate]:
+    def _times(self, matches: Iterable[int], column: str) -> list[YearOrDate]:
         """Return the times of rows, which increase; all numbers or all dates, as the first is."""
-        has_dates = _date(self.rows[next(iter(chosen))][1][self.place[column]]) is not None
+        has_dates = _date(self.rows[next(iter(matches))][1][self.place[column]]) is not None
         line_of: dict[Any, int] = {}
         latest: Any = None
-        for i in chosen:
+        for i in matches:
             line, row = self.rows[i]
             subject = f"file '{self.name}', line {line}, column '{column}'"
             text = row[self.place[column]]

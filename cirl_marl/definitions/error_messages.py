@@ -40,8 +40,8 @@ def _bare_word(error: str, line: str, column: int) -> str:
     if not error.startswith(("Invalid value", "Expected newline", "Unclosed")):
         return ""
     start = column if error.startswith("Invalid value") else line.rfind("=", 0, column) + 1
-    found = re.compile(r"[^][{}\"'#,=]*+(?!=)").match(line, start)
-    word = found[0].strip() if found is not None and found.end() > column else ""
+    words = re.compile(r"[^][{}\"'#,=]*+(?!=)").match(line, start)
+    word = words[0].strip() if words is not None and words.end() > column else ""
     return word if re.search(r"[^\W\d]", word) else ""
 
 
@@ -57,11 +57,11 @@ def _mistake(item: Mapping[str, Any], model: type[BaseModel]) -> str:
         return f"{path}: write flow = {{ times = […], values = […], time_unit = …, unit = …, source = … }}"
     if item["type"] == "extra_forbidden":
         parent = _model_at(model, location[:-1])
-        known = [f.alias or name for name, f in parent.model_fields.items()] if parent else []
-        return f"{path}: {unknown('key', location[-1], known)}"
+        options = [f.alias or name for name, f in parent.model_fields.items()] if parent else []
+        return f"{path}: {unknown('key', location[-1], options)}"
     if item["type"] in ("enum", "literal_error"):
-        known = choices(str(item["ctx"]["expected"]))
-        return f"{path}: {unknown('value', item['input'], known)}"
+        options = choices(str(item["ctx"]["expected"]))
+        return f"{path}: {unknown('value', item['input'], options)}"
     if item["type"] == "missing":
         return f"{path}: missing"
     if item["type"] in ("model_type", "model_attributes_type"):
@@ -98,11 +98,11 @@ def parameter_mistakes(
     kind: type[Any], parameters: Mapping[str, bool | float], form: Mapping[str, str]
 ) -> Iterator[str]:
     """Yield what a model does not take, what it needs besides, and numbers and truth values that are none."""
-    known = {name: each for name, each in inspect.signature(kind).parameters.items() if each.kind in BY_NAME}
+    accepts = {name: spec for name, spec in inspect.signature(kind).parameters.items() if spec.kind in BY_NAME}
     for name in (*parameters, *form):
-        if name not in known:
-            yield unknown("parameter", name, known)
-    for name, parameter in known.items():
+        if name not in accepts:
+            yield unknown("parameter", name, accepts)
+    for name, parameter in accepts.items():
         if parameter.default is parameter.empty and name not in {*parameters, *form}:
             yield f"{name}: missing" if name == "form" else f"parameters.{name}: missing"
         elif name in parameters:

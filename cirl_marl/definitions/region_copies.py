@@ -47,16 +47,20 @@ def compose_copies(
         NetworkError: naming the key of each mistake.
     """
     table = _table(document["copies"], "copies")
-    known = original.get("regions")
-    if not isinstance(known, Mapping) or not known or "copies" in original:
+    texts = original.get("regions")
+    if not isinstance(texts, Mapping) or not texts or "copies" in original:
         fault = "has copies itself" if "copies" in original else "has no [regions], and a copy is of a region"
         raise NetworkError(table.of, [f"copies.of: '{table.of}' {fault}"])
     pattern = _pattern(document, original, scenario)
     document_ = {k: dict(v) if isinstance(v, Mapping) else v for k, v in document.items() if k != "scenarios"}
-    mistakes = [f"copies.regions: {unknown('region', each, known)}" for each in table.regions if each not in known]
+    mistakes = [
+        f"copies.regions: {unknown('region', region_id, texts)}"
+        for region_id in table.regions
+        if region_id not in texts
+    ]
     nodes: dict[str, tuple[str, ...]] = {}
-    for region in [] if mistakes else table.regions or known:
-        copy = _copy(pattern, region, str(known[region]))
+    for region in [] if mistakes else table.regions or texts:
+        copy = _copy(pattern, region, str(texts[region]))
         for part in NAME_KEYS:
             entries, more = document_.setdefault(part, {}), copy.get(part, {})
             mistakes += [f"{part}.{id_}: a copy of '{table.of}' has the same name" for id_ in more if id_ in entries]

@@ -23,22 +23,22 @@ class Arrivals:
         network, routing = laws.staged_network, laws.routing
         stores = len(network.stores)
         ends = network.recipients[arcs] - stores
-        self._entering: Integers = np.flatnonzero(ends >= 0)
-        self._into: Integers = routing.places[ends[self._entering]]
+        self._stockless_ends: Integers = np.flatnonzero(ends >= 0)
+        self._into: Integers = routing.places[ends[self._stockless_ends]]
         rows: list[int] = []
         columns: list[int] = []
         place = {int(k): n for n, k in enumerate([*routing.arcs, *arcs])}
         for row, service in enumerate(services):
             if service.quantity == "stock":
-                measured = self._arriving(service)
+                measured_arcs = self._inflows_of_stock(service)
             else:
-                measured = [int(k) for k in laws.staged_network.service_arcs(service)]
-            found = [place[k] for k in measured if k in place]
-            rows += [row] * len(found)
-            columns += found
+                measured_arcs = [int(k) for k in laws.staged_network.service_arcs(service)]
+            columns_ = [place[k] for k in measured_arcs if k in place]
+            rows += [row] * len(columns_)
+            columns += columns_
         self._measure = RowSum(rows, columns, 1.0, (len(services), len(place)))
 
-    def _arriving(self, service: Service) -> list[int]:
+    def _inflows_of_stock(self, service: Service) -> list[int]:
         """Return the arcs that bring something to the stock that a service measures, from elsewhere."""
         network = self._laws.staged_network
         parts = getattr(network, "parts", {})
@@ -54,14 +54,14 @@ class Arrivals:
         """
         routing = self._laws.routing
         routes = routing.routes(rate)
-        found = np.zeros((self._count, self._count, rate.shape[1]))
+        response = np.zeros((self._count, self._count, rate.shape[1]))
         shares = rate.take(routing.arcs, 0)
         for s in range(self._count):
-            own = np.where(self._of[:, None] == s, weights, 0.0)
+            supply = np.where(self._of[:, None] == s, weights, 0.0)
             through = np.zeros((routing.nodes, rate.shape[1]))
-            np.add.at(through, self._into, own[self._entering])
-            passed = np.empty((0, rate.shape[1]))
+            np.add.at(through, self._into, supply[self._stockless_ends])
+            onward_flow = np.empty((0, rate.shape[1]))
             if routes is not None:
-                passed = routing.throughputs(through, routes).take(routing.throughput_rows, 0) * shares
-            found[:, s] = self._measure(np.concatenate([passed, own]))
-        return found
+                onward_flow = routing.throughputs(through, routes).take(routing.throughput_rows, 0) * shares
+            response[:, s] = self._measure(np.concatenate([onward_flow, supply]))
+        return response

@@ -35,17 +35,17 @@ class BatchTransport:
         """Compile the batch arcs, whose rows are those of ``rows``."""
         self._network, self._rows, self.lines = network, rows, rows.lines
         self.arcs = [k for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH]
-        self._releasing = [line for line in self.lines if line.by]
+        self._model_lines = [line for line in self.lines if line.by]
         self._vehicles = [(i, line) for i, line in enumerate(self.lines) if not line.slots]
-        self._receiving = sorted({line.recipient for line in self.lines})
-        count, every, lines = len(self.lines), np.arange(len(self.lines)), self.lines
-        self._delivery = RowSum([line.recipient for line in lines], every, 1.0, (rows.masses, count))
-        self._arrivals = RowSum([line.part for line in lines], every, [line.arrives for line in lines], (2, count))
-        held = [(i, row) for i, line in enumerate(lines) for row in line.rows]
-        self._held = RowSum([i for i, _ in held], [row for _, row in held], 1.0, (count, rows.masses))
-        self._delayed = np.flatnonzero([line.slots > 0 for line in lines])
-        self._first = np.array([lines[i].first for i in self._delayed], dtype=np.intp)[:, None]
-        self._slots = np.array([lines[i].slots for i in self._delayed], dtype=np.intp)[:, None]
+        self._recipients = sorted({line.recipient for line in self.lines})
+        count, positions, lines = len(self.lines), np.arange(len(self.lines)), self.lines
+        self._delivery = RowSum([line.recipient for line in lines], positions, 1.0, (rows.masses, count))
+        self._arrivals = RowSum([line.part for line in lines], positions, [line.arrives for line in lines], (2, count))
+        places = [(i, row) for i, line in enumerate(lines) for row in line.rows]
+        self._load_sum = RowSum([i for i, _ in places], [row for _, row in places], 1.0, (count, rows.masses))
+        self._slot_lines = np.flatnonzero([line.slots > 0 for line in lines])
+        self._first = np.array([lines[i].first for i in self._slot_lines], dtype=np.intp)[:, None]
+        self._slots = np.array([lines[i].slots for i in self._slot_lines], dtype=np.intp)[:, None]
         self._compile_schedule()
 
     def _compile_schedule(self) -> None:
@@ -73,8 +73,8 @@ class BatchTransport:
         mass = self._schedule[:, step]
         if not mass.any():
             return np.zeros((2, stock.shape[1]))
-        asked, left = -self._departure(mass), self._departure.add_to(stock.copy(), mass)
-        share = np.divide(disposable(stock, len(mass)), asked, out=np.ones_like(asked), where=left < 0)
+        demand, remainder = -self._departure(mass), self._departure.add_to(stock.copy(), mass)
+        share = np.divide(disposable(stock, len(mass)), demand, out=np.ones_like(demand), where=remainder < 0)
         mass = mass * share.take(self._sent_donor, axis=0)
         self._departure.add_to(stock, mass)
         # the slot that is read at the end of the last interval of the delay
@@ -87,43 +87,43 @@ class BatchTransport:
         Vehicles turn and plants receive in ``inner``. Returned are the mass delivered by each batch arc, shape (batch
         arcs, B), and m_fb of the interval's end, shape (2, B).
         """
-        delivered = np.empty((len(self.lines), stock.shape[1]))
+        deliveries = np.empty((len(self.lines), stock.shape[1]))
         slots, copies = self._first + step % self._slots, np.arange(stock.shape[1])
-        delivered[self._delayed] = stock[slots, copies]
+        deliveries[self._slot_lines] = stock[slots, copies]
         stock[slots, copies] = 0.0
         for i, line in self._vehicles:
-            delivered[i] = np.where(physics.arrive(line.id, inner), stock[line.first], 0.0)
-            stock[line.first] -= delivered[i]
-        arrived = self._delivery(delivered)
-        stock += arrived
-        for node in self._receiving:
-            physics.receive(node, inner, arrived[node])
-        counted = self._arrivals(delivered)
-        for line in self._releasing:
+            deliveries[i] = np.where(physics.arrive(line.id, inner), stock[line.first], 0.0)
+            stock[line.first] -= deliveries[i]
+        arrivals = self._delivery(deliveries)
+        stock += arrivals
+        for node in self._recipients:
+            physics.receive(node, inner, arrivals[node])
+        batch_mass = self._arrivals(deliveries)
+        for line in self._model_lines:
             units = physics.released_units(line.by, line.port, inner)
-            counted[line.part] += line.leaves * self._collect(line, stock, units)
+            batch_mass[line.part] += line.leaves * self._collect(line, stock, units)
             self._send(line, stock, inner, step, physics)
-        return delivered, counted
+        return deliveries, batch_mass
 
-    def _collect(self, line: BatchLine, stock: Floats, released: Floats) -> Floats:
+    def _collect(self, line: BatchLine, stock: Floats, units: Floats) -> Floats:
         """Move what the model of ``by`` released in this interval out of the donor."""
-        mass: Floats = np.minimum(line.unit * released, stock[line.donor])
+        mass: Floats = np.minimum(line.unit * units, stock[line.donor])
         stock[line.donor] -= mass
-        stock[line.collecting] += mass
+        stock[line.collection_row] += mass
         return mass
 
     def _send(self, line: BatchLine, stock: Floats, inner: Floats, step: Integers, physics: InnerPhysics) -> None:
         """Send complete batches on their way."""
-        complete = np.where(physics.complete(line.by, inner), stock[line.collecting], 0.0)
-        stock[line.collecting] -= complete
-        if line.packed is None:
+        complete = np.where(physics.complete(line.by, inner), stock[line.collection_row], 0.0)
+        stock[line.collection_row] -= complete
+        if line.packed_row is None:
             stock[line.first + step % line.slots, np.arange(stock.shape[1])] += complete
             return
-        stock[line.packed] += complete
-        load = np.where(physics.board(line.id, inner, stock[line.packed] > 0.0), stock[line.packed], 0.0)
-        stock[line.packed] -= load
+        stock[line.packed_row] += complete
+        load = np.where(physics.board(line.id, inner, stock[line.packed_row] > 0.0), stock[line.packed_row], 0.0)
+        stock[line.packed_row] -= load
         stock[line.first] += load
 
     def loads(self, stock: Floats) -> Floats:
         """Return the mass that each batch arc holds, shape (batch arcs, B)."""
-        return self._held(stock)
+        return self._load_sum(stock)

@@ -28,7 +28,7 @@ class _Round:
     nodes: Annotated[Integers, "the nodes"]
     out: Annotated[Integers, "entries of the shares that they give to nodes eliminated later"]
     giver: Annotated[Integers, "which of ``nodes`` each belongs to"]
-    given: Annotated[RowSum, "sum of ``out`` for each of ``nodes``"]
+    out_sum: Annotated[RowSum, "sum of ``out`` for each of ``nodes``"]
     into: Annotated[Integers, "entries of the shares that they get from nodes eliminated later"]
     getter: Annotated[Integers, "which of ``nodes`` each belongs to"]
     first: Annotated[Integers, "of each detour past a node of the round, its way in, among ``into``"]
@@ -58,17 +58,17 @@ class EliminationOrder:
         for i, j in pairs:
             self._join(i, j)
         self.rounds: list[_Round] = []
-        left = set(range(nodes))
-        while left:
-            chosen = self._independent(left)
-            self.rounds.append(self._eliminated(chosen))
-            left.difference_update(chosen)
+        candidates = set(range(nodes))
+        while candidates:
+            pivots = self._independent(candidates)
+            self.rounds.append(self._round_of(pivots))
+            candidates.difference_update(pivots)
 
     @property
     def work(self) -> tuple[int, int]:
         """Multiplications for every throughput, and for every elimination, in each copy."""
-        passing = sum(len(each.out) + len(each.into) for each in self.rounds)
-        return passing, sum(len(each.first) for each in self.rounds)
+        multiplications = sum(len(round_.out) + len(round_.into) for round_ in self.rounds)
+        return multiplications, sum(len(round_.first) for round_ in self.rounds)
 
     def entry(self, i: int, j: int) -> int:
         """Return the entry of the share that i gives to j; the first ones are what leaves the set."""
@@ -84,43 +84,43 @@ class EliminationOrder:
             self._gets[j].add(i)
         return self._place[i, j]
 
-    def _independent(self, left: set[int]) -> list[int]:
-        cost = {i: len(self._gives[i]) * len(self._gets[i]) for i in left}
+    def _independent(self, candidates: set[int]) -> list[int]:
+        cost = {i: len(self._gives[i]) * len(self._gets[i]) for i in candidates}
         most = COSTLY * min(cost.values())
-        chosen: list[int] = []
+        pivots: list[int] = []
         near: set[int] = set()
-        for i in sorted((i for i in left if cost[i] <= most), key=lambda i: (cost[i], i)):
+        for i in sorted((i for i in candidates if cost[i] <= most), key=lambda i: (cost[i], i)):
             if i not in near:
-                chosen.append(i)
+                pivots.append(i)
                 near |= self._gives[i] | self._gets[i]
-        return chosen
+        return pivots
 
-    def _eliminated(self, chosen: list[int]) -> _Round:
-        out = [(n, i, k) for n, i in enumerate(chosen) for k in sorted(self._gives[i])]
-        into = [(n, j, i) for n, i in enumerate(chosen) for j in sorted(self._gets[i])]
+    def _round_of(self, pivots: list[int]) -> _Round:
+        out = [(n, i, k) for n, i in enumerate(pivots) for k in sorted(self._gives[i])]
+        into = [(n, j, i) for n, i in enumerate(pivots) for j in sorted(self._gets[i])]
         out_entries = [self.entry(i, k) for _, i, k in out]
         into_entries = [self.entry(j, i) for _, j, i in into]
-        ways: list[list[tuple[int, int]]] = [[(len(out) + n, -1)] for n in range(len(chosen))]
+        ways: list[list[tuple[int, int]]] = [[(len(out) + n, -1)] for n in range(len(pivots))]
         for place, (n, _, k) in enumerate(out):
             ways[n].append((place, k))
         detours = [(way_in, way_out, j, k) for way_in, (n, j, _) in enumerate(into) for way_out, k in ways[n] if k != j]
-        for i in chosen:
+        for i in pivots:
             for k in self._gives[i]:
                 self._gets[k].discard(i)
             for j in self._gets[i]:
                 self._gives[j].discard(i)
-        made = [self._join(j, k) for _, _, j, k in detours]
+        entries = [self._join(j, k) for _, _, j, k in detours]
         # entries that later rounds add are beyond those of now; the array of values has room for all of them
         return _Round(
-            nodes=_places(chosen),
+            nodes=_places(pivots),
             out=_places(out_entries),
             giver=_places(n for n, _, _ in out),
-            given=RowSum([n for n, _, _ in out], range(len(out)), 1.0, (len(chosen), len(out))),
+            out_sum=RowSum([n for n, _, _ in out], range(len(out)), 1.0, (len(pivots), len(out))),
             into=_places(into_entries),
             getter=_places(n for n, _, _ in into),
             first=_places(way for way, _, _, _ in detours),
             second=_places(way for _, way, _, _ in detours),
-            detours=RowSum(made, range(len(made)), 1.0, (self.size, len(made))),
+            detours=RowSum(entries, range(len(entries)), 1.0, (self.size, len(entries))),
             forward=RowSum([k for _, _, k in out], range(len(out)), 1.0, (self.nodes, len(out))),
             donors=_places(i for _, i, _ in out),
             backward=RowSum([i for _, _, i in into], range(len(into)), 1.0, (self.nodes, len(into))),
@@ -135,23 +135,25 @@ class EliminatedShares:
         """Eliminate ``values``, shape (entries, B or 1): of each node what leaves the set, then the shares."""
         self._steps = []
         self._inverse = np.empty((order.nodes, values.shape[1]))
-        for each in order.rounds:
-            out, into, leaving = values.take(each.out, 0), values.take(each.into, 0), values.take(each.nodes, 0)
-            inverse = 1.0 / each.given.add_to(leaving.copy(), out)
-            out *= inverse.take(each.giver, 0)
-            leaving *= inverse
-            each.detours.add_to(values, into.take(each.first, 0) * np.concatenate([out, leaving]).take(each.second, 0))
-            into *= inverse.take(each.getter, 0)
-            self._inverse[each.nodes] = inverse
-            self._steps.append((each, out, into))
+        for round_ in order.rounds:
+            out, into, exits = values.take(round_.out, 0), values.take(round_.into, 0), values.take(round_.nodes, 0)
+            inverse = 1.0 / round_.out_sum.add_to(exits.copy(), out)
+            out *= inverse.take(round_.giver, 0)
+            exits *= inverse
+            round_.detours.add_to(
+                values, into.take(round_.first, 0) * np.concatenate([out, exits]).take(round_.second, 0)
+            )
+            into *= inverse.take(round_.getter, 0)
+            self._inverse[round_.nodes] = inverse
+            self._steps.append((round_, out, into))
 
     def throughput(self, inflow: Floats) -> Floats:
         """Return q in place of what enters from elsewhere, shape (nodes, B)."""
-        for each, out, _ in self._steps:
-            each.forward.add_to(inflow, inflow.take(each.donors, 0) * out)
+        for round_, out, _ in self._steps:
+            round_.forward.add_to(inflow, inflow.take(round_.donors, 0) * out)
         inflow *= self._inverse
-        for each, _, into in reversed(self._steps):
-            each.backward.add_to(inflow, inflow.take(each.sources, 0) * into)
+        for round_, _, into in reversed(self._steps):
+            round_.backward.add_to(inflow, inflow.take(round_.sources, 0) * into)
         return inflow
 
 

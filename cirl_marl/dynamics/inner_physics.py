@@ -45,32 +45,36 @@ class InnerPhysics:
         self.owners, self.names, self.rows = rows.owners, rows.state_names, rows.states
         self._models = [owner.model for owner in owners if owner.model is not None]
         self._states = list(self.rows.values())
-        placed = list(enumerate(self._models))
-        named = dict(zip(self.owners, self._models, strict=True))
-        self._outflowing = [(i, model) for i, model in placed if isinstance(model, OutflowModel)]
-        self._measuring = [(i, model) for i, model in placed if isinstance(model, MeasuringModel)]
-        self._tasks = [(i, model) for i, model in placed if isinstance(model, Task)]
-        self._releasing = {owner: model for owner, model in named.items() if isinstance(model, ReleasingModel)}
-        self._vehicles = {owner: model for owner, model in named.items() if isinstance(model, Vehicle)}
+        numbered_models = list(enumerate(self._models))
+        model_of = dict(zip(self.owners, self._models, strict=True))
+        self._outflow_models = [(i, model) for i, model in numbered_models if isinstance(model, OutflowModel)]
+        self._measuring_models = [(i, model) for i, model in numbered_models if isinstance(model, MeasuringModel)]
+        self._tasks = [(i, model) for i, model in numbered_models if isinstance(model, Task)]
+        self._releasing_models = {
+            owner: model for owner, model in model_of.items() if isinstance(model, ReleasingModel)
+        }
+        self._vehicles = {owner: model for owner, model in model_of.items() if isinstance(model, Vehicle)}
         self.measure_names = tuple(
-            f"{self.owners[i]}.{name}" for i, model in self._measuring for name in model.measure_names
+            f"{self.owners[i]}.{name}" for i, model in self._measuring_models for name in model.measure_names
         )
         self.observed_rows = {
             owner: tuple(self.rows[owner].start + model.state_names.index(name) for name in model.observed_states)
-            for owner, model in named.items()
+            for owner, model in model_of.items()
         }
-        self.visible = np.array([row for seen in self.observed_rows.values() for row in sorted(seen)], dtype=np.intp)
+        self.visible = np.array([row for rows_ in self.observed_rows.values() for row in sorted(rows_)], dtype=np.intp)
         euler = network.episode.solver == "euler"
-        self._discrete = [(i, model) for i, model in placed if isinstance(model, DiscreteTimeModel)]
-        own = ((i, model) for i, model in placed if isinstance(model, OwnStepModel))
-        self._own_step = [(i, model) for i, model in own if not (euler and isinstance(model, ContinuousModel))]
-        self._averaged = {i for i, _ in self._own_step}
-        taken = self._averaged.union(i for i, _ in self._discrete)
-        self._continuous = [(i, m) for i, m in placed if isinstance(m, ContinuousModel) and i not in taken]
-        every = np.arange(len(self.names))
-        self._moving = np.concatenate([every[:0], *(every[self._states[i]] for i, _ in self._continuous)])
-        ranged = (name in model.ranged_states for model in self._models for name in model.state_names)
-        self.range_rows = np.flatnonzero(np.fromiter(ranged, dtype=bool))
+        self._discrete = [(i, model) for i, model in numbered_models if isinstance(model, DiscreteTimeModel)]
+        own_steppers = ((i, model) for i, model in numbered_models if isinstance(model, OwnStepModel))
+        self._own_step = [(i, model) for i, model in own_steppers if not (euler and isinstance(model, ContinuousModel))]
+        self._with_mean_output = {i for i, _ in self._own_step}
+        not_by_solver = self._with_mean_output.union(i for i, _ in self._discrete)
+        self._continuous = [
+            (i, m) for i, m in numbered_models if isinstance(m, ContinuousModel) and i not in not_by_solver
+        ]
+        all_rows = np.arange(len(self.names))
+        self._solver_rows = np.concatenate([all_rows[:0], *(all_rows[self._states[i]] for i, _ in self._continuous)])
+        has_range = (name in model.ranged_states for model in self._models for name in model.state_names)
+        self.range_rows = np.flatnonzero(np.fromiter(has_range, dtype=bool))
         ranges = [span for owner in owners for span in owner.inner]
         self.low: Floats = np.array([low for low, _ in ranges], dtype=float)
         self.high: Floats = np.array([high for _, high in ranges], dtype=float)
@@ -78,14 +82,16 @@ class InnerPhysics:
         self._speed = [factor(network.time_unit, model.time_unit) for model in self._models]
         takes = (o.control is not None and o.control.kind is ControlKind.INPUT for o in owners)
         self._inputs = [network.control_rows[o.id] if t else slice(0, 0) for o, t in zip(owners, takes, strict=True)]
-        self._held = [network.node_index[o] if o in network.node_index else rows.aboard.get(o) for o in self.owners]
+        self._context_rows = [
+            network.node_index[o] if o in network.node_index else rows.aboard.get(o) for o in self.owners
+        ]
         self._kg, index = factor(network.mass_unit, "kg") if owners else 1.0, network.node_index
-        self._plants = {index[o]: (self.rows[o], model) for o, model in named.items() if o in index}
+        self._plants = {index[o]: (self.rows[o], model) for o, model in model_of.items() if o in index}
 
     def start(self, stream: np.random.Generator) -> Floats:
         """Draw the states of the models that draw their own, one after the other, shape (rows not ranged,)."""
-        drawn = [model.start(stream) for _, model in self._discrete]
-        return np.concatenate(drawn) if drawn else np.empty(0)
+        starts = [model.start(stream) for _, model in self._discrete]
+        return np.concatenate(starts) if starts else np.empty(0)
 
     def derivative(self, inner: Floats, controls: Floats, stock: Floats) -> Floats:
         """Return dz/dt of continuous models in the network's time unit, 0 for the others, shape (states, B)."""
@@ -97,10 +103,10 @@ class InnerPhysics:
 
     def after_change(self, inner: Floats, change: Floats) -> Floats:
         """Return the states after continuous models changed by ``change``; states of the others keep their bits."""
-        if len(self._moving) == len(inner):
+        if len(self._solver_rows) == len(inner):
             return inner + change
         after = inner.copy()
-        after[self._moving] += change[self._moving]
+        after[self._solver_rows] += change[self._solver_rows]
         return after
 
     def own_steps(self, inner: Floats, controls: Floats, interval: float, stock: Floats) -> tuple[Floats, Floats]:
@@ -133,8 +139,8 @@ class InnerPhysics:
         if not self._models:
             return stock
         outputs = np.zeros((len(self._models), stock.shape[1]))
-        for i, model in self._outflowing:
-            if means is not None and i in self._averaged:
+        for i, model in self._outflow_models:
+            if means is not None and i in self._with_mean_output:
                 outputs[i] = means[i]
             else:
                 outputs[i] = model.outflow(inner[self._states[i]], controls[self._inputs[i]])
@@ -150,8 +156,10 @@ class InnerPhysics:
 
     def measures(self, inner: Floats, controls: Floats) -> Floats:
         """Return what the models measure, shape (measures, B)."""
-        measured = [model.measures(inner[self._states[i]], controls[self._inputs[i]]) for i, model in self._measuring]
-        return np.concatenate(measured) if measured else np.empty((0, inner.shape[1]))
+        readings = [
+            model.measures(inner[self._states[i]], controls[self._inputs[i]]) for i, model in self._measuring_models
+        ]
+        return np.concatenate(readings) if readings else np.empty((0, inner.shape[1]))
 
     def successes(self, inner: Floats, controls: Floats) -> dict[str, NDArray[np.bool_]]:
         """Return, for each model with a criterion of success, whether it is met, shape (B,)."""
@@ -161,25 +169,25 @@ class InnerPhysics:
 
     def released_units(self, owner: str, port: str, inner: Floats) -> Floats:
         """Return the units that a model released into a port in the last interval, shape (B,)."""
-        model = self._releasing[owner]
+        model = self._releasing_models[owner]
         units: Floats = model.released_units(inner[self.rows[owner]])[model.ports.index(port)]
         return units
 
     def complete(self, owner: str, inner: Floats) -> NDArray[np.bool_]:
         """Return where a model completed a batch in the last interval, shape (B,)."""
-        return self._releasing[owner].complete(inner[self.rows[owner]])
+        return self._releasing_models[owner].complete(inner[self.rows[owner]])
 
     def arrive(self, arc: str, inner: Floats) -> NDArray[np.bool_]:
         """Return where the vehicle of ``arc`` is at the recipient; it turns back, in place."""
         rows, vehicle = self.rows[arc], self._vehicles[arc]
-        arrived = vehicle.has_arrived(inner[rows])
-        inner[rows] = vehicle.turn_back(inner[rows], arrived)
-        return arrived
+        at_recipient = vehicle.has_arrived(inner[rows])
+        inner[rows] = vehicle.turn_back(inner[rows], at_recipient)
+        return at_recipient
 
-    def board(self, arc: str, inner: Floats, waiting: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def board(self, arc: str, inner: Floats, load: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return where the vehicle of ``arc`` takes the waiting load; it departs, in place."""
         rows, vehicle = self.rows[arc], self._vehicles[arc]
-        leaves = vehicle.can_board(inner[rows]) & waiting
+        leaves = vehicle.can_board(inner[rows]) & load
         inner[rows] = vehicle.depart(inner[rows], leaves)
         return leaves
 
@@ -191,5 +199,5 @@ class InnerPhysics:
 
     def _context(self, i: int, stock: Floats) -> dict[str, Floats]:
         """What model i asks for: the mass that its node holds or that its vehicle carries."""
-        held = self._held[i]
-        return {name: stock[held] * self._kg for name in self._models[i].context_names} if held is not None else {}
+        row = self._context_rows[i]
+        return {name: stock[row] * self._kg for name in self._models[i].context_names} if row is not None else {}

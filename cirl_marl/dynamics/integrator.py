@@ -71,11 +71,11 @@ class Dynamics(FlowLaws):
         self._taylor = Taylor(self, self.substep) if episode.solver == "exact" else None
         self.terms = self._taylor.terms if self._taylor is not None else 0
         shape = (rows.masses, len(network.arcs))
-        self._outgoing = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
+        self._outflow_sum = RowSum(rows.donors, np.arange(shape[1]), 1.0, shape)
         self._busiest = int(np.bincount(network.donors, minlength=1).max())
         laws = {arc.law for arc in network.arcs}
         self._heedless = self.physical and bool(laws & {Law.RECIPIENT, Law.COMPARTMENT})
-        self._timed = (*self.time_dependent, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
+        self._needs_step = (*self.time_dependent, *(arc.id for arc in network.arcs if arc.law is Law.BATCH))
         self._compile_orders()
 
     def _compile_orders(self) -> None:
@@ -108,39 +108,41 @@ class Dynamics(FlowLaws):
             CirlError: if ``step`` is missing though an arc needs it, or if a state is no longer a finite number, as the
                 solver's step is too long for the physics.
         """
-        if step is None and self._timed:
+        if step is None and self._needs_step:
             raise CirlError(
                 f"network '{self.network.name}': advance needs step, the index of the control interval of each copy: "
-                f"time series and batches depend on it, those of arc '{self._timed[0]}' for one"
+                f"time series and batches depend on it, those of arc '{self._needs_step[0]}' for one"
             )
-        rate = realised = self.rate(controls, step, factors)
+        rate = actual_rate = self.rate(controls, step, factors)
         if self.slots is not None:
-            stock = self.slots.moved_on(stock)
-            self.slots.come_out(stock, rate)
+            stock = self.slots.shift_slots(stock)
+            self.slots.set_outflows(stock, rate)
         routes = self.routing.routes(rate)
-        sent = None
+        batch_start = None
         if self.batches.lines and step is not None:
             stock = stock.copy()
-            sent = self.batches.dispatch(stock, step)
+            batch_start = self.batches.dispatch(stock, step)
         inner = self.inner.tick(inner, controls, stock)
         total = None
         for _ in range(self.substeps):
-            realised = self._limit_orders(stock, rate) if self.physical else rate
+            actual_rate = self._limit_orders(stock, rate) if self.physical else rate
             if self._taylor is not None:
-                stock, moved, realised = self._settle(stock, realised, partial(self._taylor.moved_mass, stock, routes))
+                stock, transfer, actual_rate = self._settle(
+                    stock, actual_rate, partial(self._taylor.moved_mass, stock, routes)
+                )
             else:
-                stock, inner, moved, realised = self._explicit_step(stock, inner, realised, routes, controls)
-            total = moved if total is None else total + moved
+                stock, inner, transfer, actual_rate = self._explicit_step(stock, inner, actual_rate, routes, controls)
+            total = transfer if total is None else total + transfer
         assert total is not None
-        batched = None
-        if sent is not None and step is not None:
+        batch_mass = None
+        if batch_start is not None and step is not None:
             inner = inner.copy()
-            delivered, counted = self.batches.settle(stock, inner, step, self.inner)
-            total[self.batches.arcs] = delivered
-            batched = np.stack([sent, counted])
+            deliveries, batch_end = self.batches.settle(stock, inner, step, self.inner)
+            total[self.batches.arcs] = deliveries
+            batch_mass = np.stack([batch_start, batch_end])
         self._check_finite(stock, inner)
-        flow, arcs = self._flow_at(stock, inner, controls, realised, routes), len(self.network.arcs)
-        return Transition(stock, inner, total[:arcs], flow[:arcs], batched)
+        flow, arcs = self._flow_at(stock, inner, controls, actual_rate, routes), len(self.network.arcs)
+        return Transition(stock, inner, total[:arcs], flow[:arcs], batch_mass)
 
     def _check_finite(self, stock: Floats, inner: Floats) -> None:
         if np.isfinite(stock).all() and np.isfinite(inner).all():
@@ -158,15 +160,15 @@ class Dynamics(FlowLaws):
         """Return the flows at the start of an episode, cut to what the donors hold, shape (arcs, B), mass/time."""
         rate = self.rate(controls, np.zeros(stock.shape[1], dtype=np.intp), factors)
         if self.slots is not None:
-            stock = self.slots.moved_on(stock)
-            self.slots.come_out(stock, rate)
+            stock = self.slots.shift_slots(stock)
+            self.slots.set_outflows(stock, rate)
         if self.physical:
             rate = self._limit_orders(stock, rate)
         routes = self.routing.routes(rate)
         flow, arcs = self._flow_at(stock, inner, controls, rate, routes), len(self.network.arcs)
         if not self._heedless:
             return flow[:arcs]
-        out = self._outgoing(flow) * self.substep
+        out = self._outflow_sum(flow) * self.substep
         out[self.rows.unit] = 0.0
         share = np.divide(stock, out, out=np.ones_like(out), where=out > stock)
         flow *= share.take(self.rows.donors, axis=0)
@@ -198,28 +200,28 @@ class Dynamics(FlowLaws):
         nodes, weights = RUNGE_KUTTA[self.network.episode.solver]
         change = np.zeros_like(inner)
 
-        def passing(rate: Floats, settled: Floats | None = None) -> Floats:
+        def transfer(rate: Floats, imposed_flow: Floats | None = None) -> Floats:
             """Go through the stages; leaves the change of the inner states in ``change``."""
-            flow, slope, moved = np.zeros_like(rate), np.zeros_like(inner), np.zeros_like(rate)
+            flow, slope, mass = np.zeros_like(rate), np.zeros_like(inner), np.zeros_like(rate)
             change.fill(0.0)
             for node, weight in zip(nodes, weights, strict=True):
                 stage = self.incidence.add_to(stock.copy(), flow * (node * h)) if node else stock
                 stage_inner = inner + slope * (node * h) if node else inner
                 flow = self.flow(self.inner.extend(stage, stage_inner, controls, means), rate)
-                if settled is not None:
-                    np.copyto(flow, settled, where=~np.isnan(settled))
+                if imposed_flow is not None:
+                    np.copyto(flow, imposed_flow, where=~np.isnan(imposed_flow))
                 flow = self._forward(flow, routes)
                 slope = self.inner.derivative(stage_inner, controls, stage)
-                moved += flow * (weight * h)
+                mass += flow * (weight * h)
                 np.add(change, slope * (weight * h), out=change)
-            return moved
+            return mass
 
         if self.physical:
-            after, moved, rate = self._settle(stock, rate, passing)
+            after, moved_mass, rate = self._settle(stock, rate, transfer)
         else:
-            moved = passing(rate)
-            after = self.incidence.add_to(stock.copy(), moved)
-        return after, self.inner.after_change(ahead, change), moved, rate
+            moved_mass = transfer(rate)
+            after = self.incidence.add_to(stock.copy(), moved_mass)
+        return after, self.inner.after_change(ahead, change), moved_mass, rate
 
     def _limit_orders(self, stock: Floats, rate: Floats) -> Floats:
         """Cut scheduled flows so that no donor is overdrawn.
@@ -231,18 +233,20 @@ class Dynamics(FlowLaws):
             return rate
         outflows = self._orders_and_exits(rate)
         outflows *= self.substep
-        asked, turned_over = outflows[: len(self._order_donors)], outflows[len(self._order_donors) :]
-        held = stock.take(self._order_donors, axis=0)
-        if (asked <= held * (1.0 - turned_over) * (1.0 - 1e-12)).all():
+        demand, turned_over = outflows[: len(self._order_donors)], outflows[len(self._order_donors) :]
+        available_stock = stock.take(self._order_donors, axis=0)
+        if (demand <= available_stock * (1.0 - turned_over) * (1.0 - 1e-12)).all():
             return rate  # x·a/(e^{ah} − 1) ≥ x(1 − ah)/h: nothing can be overdrawn
-        share = np.divide(turned_over, np.expm1(turned_over), out=np.ones_like(held), where=turned_over > 1e-12)
-        available = held * share * (1.0 - 1e-12)
-        factor = np.divide(available, asked, out=np.ones_like(held), where=asked > available)
+        share = np.divide(
+            turned_over, np.expm1(turned_over), out=np.ones_like(available_stock), where=turned_over > 1e-12
+        )
+        available = available_stock * share * (1.0 - 1e-12)
+        factor = np.divide(available, demand, out=np.ones_like(available_stock), where=demand > available)
         rate = rate.copy()
         rate[self._order_arcs] *= factor.take(self._order_slot, axis=0)
         return rate
 
-    def _settle(self, stock: Floats, rate: Floats, passing: Transfer) -> tuple[Floats, Floats, Floats]:
+    def _settle(self, stock: Floats, rate: Floats, transfer: Transfer) -> tuple[Floats, Floats, Floats]:
         """Move mass; where a flow that does not heed its donor asked for more than that held, send what was there.
 
         Proportional and scheduled flows never overdraw. A recipient or a model that asks for more than there is gets
@@ -250,22 +254,22 @@ class Dynamics(FlowLaws):
         are then settled, and the others follow from them, lest the recipient passes on what it did not get. Each pass
         settles at least one more node. Returned are the stocks at the end, the mass moved, and the rates realised.
         """
-        moved = passing(rate)
-        after = self.incidence.add_to(stock.copy(), moved)
+        moved_mass = transfer(rate)
+        after = self.incidence.add_to(stock.copy(), moved_mass)
         if after.min() >= 0:
-            return after, moved, rate
-        held = disposable(stock, self._busiest)
-        settled, cut_copies = np.full_like(moved, np.nan), np.zeros(moved.shape[1], dtype=bool)
+            return after, moved_mass, rate
+        available = disposable(stock, self._busiest)
+        imposed_flow, cut_copies = np.full_like(moved_mass, np.nan), np.zeros(moved_mass.shape[1], dtype=bool)
         while (after < 0).any():  # asked of every copy, as a NaN in one says nothing of the others
-            out = self._outgoing(moved)
+            out = self._outflow_sum(moved_mass)
             short = (after < 0) & (out > 0)
-            share = np.divide(held, out, out=np.ones_like(out), where=short & (out > held))
+            share = np.divide(available, out, out=np.ones_like(out), where=short & (out > available))
             share = share.take(self.rows.donors, axis=0)
             cut = short.take(self.rows.donors, axis=0)
-            settled[cut] = (moved * share)[cut] / self.substep
+            imposed_flow[cut] = (moved_mass * share)[cut] / self.substep
             rate = rate * share
             # the copies in which nothing was cut keep what they have, to the bit
             cut_copies |= short.any(axis=0)
-            moved = np.where(cut_copies, passing(rate, settled), moved)
-            after = self.incidence.add_to(stock.copy(), moved)
-        return after, moved, rate
+            moved_mass = np.where(cut_copies, transfer(rate, imposed_flow), moved_mass)
+            after = self.incidence.add_to(stock.copy(), moved_mass)
+        return after, moved_mass, rate

@@ -34,45 +34,48 @@ class KronReduction:
         routing, nodes, masses = laws.routing, laws.routing.nodes, laws.rows.masses
         outer = laws.staged_network.donors < laws.rows.nodes.stop
         place = {i: n for n, i in enumerate(routing.detours.kept_nodes)}
-        self._flowing = np.flatnonzero(outer & ~laws.is_fixed)
-        self._drivers = laws.driver[self._flowing]
+        self._varying_flows = np.flatnonzero(outer & ~laws.is_fixed)
+        self._drivers = laws.driver[self._varying_flows]
         donors = routing.donors.tolist()
-        sent = [k for k, same in enumerate(routing.is_fixed) if donors[k] in place and not same]
-        self._sent = routing.arcs[sent]
-        self._senders = np.array([place[donors[k]] for k in sent], dtype=np.intp)
+        varying_exits = [k for k, is_same in enumerate(routing.is_fixed) if donors[k] in place and not is_same]
+        self._varying_arcs = routing.arcs[varying_exits]
+        self._senders = np.array([place[donors[k]] for k in varying_exits], dtype=np.intp)
 
         # nodes have the names that they have in ``detours``, and so has what stocks, the first of the masses, get
-        mass, flow, share, end = np.cumsum([nodes + masses, masses, len(self._flowing), len(sent)]).tolist()
+        mass, flow, share, end = np.cumsum(
+            [nodes + masses, masses, len(self._varying_flows), len(varying_exits)]
+        ).tolist()
         rates = laws.rate(laws.neutral[:, :1])[:, 0]
-        gathered = _inflow_rows(laws, rates, range(mass, flow), range(flow, share), self._flowing)
-        before = contract_hubs(gathered, routing.detours.order)
-        spread = _outflow_rows(routing, rates, range(share, end), sent)
+        inflow_rows = _inflow_rows(laws, rates, range(mass, flow), range(flow, share), self._varying_flows)
+        before = contract_hubs(inflow_rows, routing.detours.order)
+        spread = _outflow_rows(routing, rates, range(share, end), varying_exits)
         after = contract_hubs(spread, routing.detours.order)
         names: list[Sequence[int]] = [range(mass, flow), range(flow, share), before, routing.detours.kept_nodes]
         names += [range(share, end), after, range(nodes, nodes + masses)]
         parts = spans(map(len, names))
-        self._masses, self._flows, hubs, self._kept, self._sending, _, self._change = parts
+        self._masses, self._flows, hubs, self._kept_rows, self._varying_rows, _, self._change = parts
         self._rest, size = slice(hubs.start, self._change.stop), self._change.stop
         rows = [
-            dict(zip(each, range(part.start, part.stop), strict=True)) for each, part in zip(names, parts, strict=True)
+            dict(zip(columns, range(part.start, part.stop), strict=True))
+            for columns, part in zip(names, parts, strict=True)
         ]
-        self._gathered = square_matrix(gathered, rows[0] | rows[1] | rows[2] | rows[3] | rows[6], size)
+        self._inflow_matrix = square_matrix(inflow_rows, rows[0] | rows[1] | rows[2] | rows[3] | rows[6], size)
         self._spread = square_matrix(spread, rows[3] | rows[4] | rows[5] | rows[6], size)
 
     def mean(self, stock: Floats, routes: IntervalRoutes, rate: Floats) -> Floats:
         """Return the mean of the masses over the substep for constant ``rate``, shape (masses, B)."""
-        rates, shares = rate.take(self._flowing, 0), routes.rate.take(self._sent, 0)
+        rates, shares = rate.take(self._varying_flows, 0), routes.rate.take(self._varying_arcs, 0)
         work: Floats = np.empty((self._change.stop, stock.shape[1]))
         mean: Floats = work[self._masses]
-        flows, kept = work[self._flows], work[self._kept]
-        sending, change, rest = work[self._sending], work[self._change], work[self._rest]
+        flows, kept_rows = work[self._flows], work[self._kept_rows]
+        varying_rows, change, rest = work[self._varying_rows], work[self._change], work[self._rest]
         mean[...] = stock
         for factor in self._factors:
             np.multiply(mean.take(self._drivers, 0), rates, out=flows)
             rest.fill(0.0)
-            self._gathered.substitute(work)
-            routes.kept_nodes.throughput(kept)
-            np.multiply(kept.take(self._senders, 0), shares, out=sending)
+            self._inflow_matrix.substitute(work)
+            routes.kept_nodes.throughput(kept_rows)
+            np.multiply(kept_rows.take(self._senders, 0), shares, out=varying_rows)
             self._spread.substitute(work)
             change *= factor
             np.add(stock, change, out=mean)
@@ -80,11 +83,11 @@ class KronReduction:
 
 
 def _inflow_rows(
-    laws: FlowLaws, rates: Floats, masses: Sequence[int], flows: Sequence[int], flowing: Integers
+    laws: FlowLaws, rates: Floats, masses: Sequence[int], flows: Sequence[int], varying_flows: Integers
 ) -> dict[int, SparseRow]:
-    """Return what masses and ``flowing`` arcs send to stocks, and past constant nodes to stocks and kept nodes."""
+    """Return what masses and ``varying_flows`` send to stocks, and past constant nodes to stocks and kept nodes."""
     detours, stores, nodes = laws.routing.detours, laws.rows.nodes.stop, laws.routing.nodes
-    number = dict(zip(flowing.tolist(), flows, strict=True))
+    number = dict(zip(varying_flows.tolist(), flows, strict=True))
     gives: dict[int, SparseRow] = {name: {} for name in (*masses, *flows)}
     for k in np.flatnonzero(laws.staged_network.donors < stores).tolist():
         source, rate = (number[k], 1.0) if k in number else (masses[laws.driver[k]], float(rates[k]))
@@ -94,17 +97,19 @@ def _inflow_rows(
     return gives | {i: dict(parts) for i, parts in zip(detours.order, detours.out, strict=True)}
 
 
-def _outflow_rows(routing: Routing, rates: Floats, shares: Sequence[int], sent: Sequence[int]) -> dict[int, SparseRow]:
-    """Return what kept nodes, and the arcs ``sent`` of theirs, send to stocks.
+def _outflow_rows(
+    routing: Routing, rates: Floats, shares: Sequence[int], varying_exits: Sequence[int]
+) -> dict[int, SparseRow]:
+    """Return what kept nodes, and the arcs ``varying_exits`` of theirs, send to stocks.
 
     What comes back to kept nodes is left out: it is in their throughputs already.
     """
-    kept, number = set(routing.detours.kept_nodes), dict(zip(sent, shares, strict=True))
-    gives: dict[int, SparseRow] = {name: {} for name in (*kept, *shares)}
+    remaining_nodes, number = set(routing.detours.kept_nodes), dict(zip(varying_exits, shares, strict=True))
+    gives: dict[int, SparseRow] = {name: {} for name in (*remaining_nodes, *shares)}
     for k, (i, end) in enumerate(zip(routing.donors.tolist(), routing.ends.tolist(), strict=True)):
-        if i in kept and end not in kept:
+        if i in remaining_nodes and end not in remaining_nodes:
             source, part = (number[k], 1.0) if k in number else (i, float(rates[routing.arcs[k]]))
             gives[source][end] = gives[source].get(end, 0.0) + part
     for i, parts in zip(routing.detours.order, routing.detours.out, strict=True):
-        gives[i] = {end: part for end, part in parts.items() if end not in kept}
+        gives[i] = {end: part for end, part in parts.items() if end not in remaining_nodes}
     return gives

@@ -111,23 +111,23 @@ class ArcRates:
     def _bound_rates(self, draws: FlowFactors | None) -> None:
         """Bound what arcs carry and stocks drive with every control at its upper bound."""
         widest = single_column(self.control_high).max(axis=1, keepdims=True)
-        widest[self._stretched] = self.control_low[self._stretched].min(axis=1, keepdims=True)
-        self.max_rate: Floats = self._unshared(widest)[:, 0]
+        widest[self._stretch_rows] = self.control_low[self._stretch_rows].min(axis=1, keepdims=True)
+        self.max_rate: Floats = self._rate_without_shares(widest)[:, 0]
         if len(self._series_arcs):
             self.max_rate[self._series_arcs] *= self._series.max(axis=1)
         if draws is not None:
             self.max_rate[draws.arcs] *= draws.highest
         # the arcs of a split carry together what one of them would carry alone: the first without control counts
-        stores, leading = self.rows.nodes.stop, dict[str, int]()
-        counted, ends = self.driver < stores, np.minimum(self.staged_network.recipients, stores)
+        stores, representatives = self.rows.nodes.stop, dict[str, int]()
+        is_counted, ends = self.driver < stores, np.minimum(self.staged_network.recipients, stores)
         for k, arc in enumerate(self.staged_network.arcs):
             if arc.law is Law.SHARE:
-                counted[k] = False
+                is_counted[k] = False
                 if arc.control is None and self.driver[k] < stores:
-                    leading.setdefault(arc.donor, k)
-        first = [*leading.values()]
-        counted[first], ends[first] = True, stores
-        self.driven_arcs = np.flatnonzero(counted)
+                    representatives.setdefault(arc.donor, k)
+        first = [*representatives.values()]
+        is_counted[first], ends[first] = True, stores
+        self.driven_arcs = np.flatnonzero(is_counted)
         self.driven_to, self.driven_rate = ends[self.driven_arcs], self.max_rate[self.driven_arcs]
         self.turnover: Floats = np.bincount(self.driver[self.driven_arcs], self.driven_rate, stores).astype(float)
 
@@ -141,16 +141,16 @@ class ArcRates:
         fastest = float(self.turnover.max(initial=0.0))
         if episode.solver != "euler" and len(self.turnover):
             node = network.nodes[int(self.turnover.argmax())].id.partition(".")[0]
-            where = f"network '{network.name}': node '{node}' turns over {fastest:.4g}/{network.time_unit}"
+            subject = f"network '{network.name}': node '{node}' turns over {fastest:.4g}/{network.time_unit}"
             if fastest * episode.control_interval > MAX_STEPS * MAX_TURNOVER:
                 raise CirlError(
-                    f"{where}; a control interval of {episode.control_interval:g} {network.time_unit} would need more "
-                    f"than {MAX_STEPS:,} solver steps. Is a rate in the wrong unit?"
+                    f"{subject}; a control interval of {episode.control_interval:g} {network.time_unit} would need "
+                    f"more than {MAX_STEPS:,} solver steps. Is a rate in the wrong unit?"
                 )
             step = episode.solver_step or 0.0
             if episode.solver == "rk4" and fastest * step > MAX_TURNOVER:
                 raise CirlError(
-                    f"{where}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / fastest:.4g} "
+                    f"{subject}; solver 'rk4' needs a solver_step of at most {MAX_TURNOVER / fastest:.4g} "
                     f"{network.time_unit}, not {step:g}"
                 )
         if episode.solver == "exact":
@@ -158,24 +158,28 @@ class ArcRates:
         assert episode.solver_step is not None
         return round(episode.control_interval / episode.solver_step)
 
-    def _unshared(self, controls: Floats) -> Floats:
+    def _rate_without_shares(self, controls: Floats) -> Floats:
         """Return r, but for shares and time series."""
-        if len(self._stretched):
+        if len(self._stretch_rows):
             controls = controls.copy()
-            controls[self._stretched] = 1.0 / controls[self._stretched]
+            controls[self._stretch_rows] = 1.0 / controls[self._stretch_rows]
         if self._partial:  # some arc lacks a control: let a row of ones stand in for it
             controls = np.concatenate([controls, np.ones((1, controls.shape[1]))])
-        own, base, donor = self._own_control, self._base, self._donor_control
-        if sparse := 2 * len(self._acted) < len(base):
+        own_row, base, donor = self._own_control, self._base, self._donor_control
+        if sparse := 2 * len(self._controlled_arcs) < len(base):
             rate = np.empty((len(base), controls.shape[1]))
             rate[...] = base
-            own, base, donor = own[self._acted], base[self._acted], donor[self._acted]
-        acted: Floats = controls.take(own, axis=0)
-        acted *= base
-        acted *= controls.take(donor, axis=0)
+            own_row, base, donor = (
+                own_row[self._controlled_arcs],
+                base[self._controlled_arcs],
+                donor[self._controlled_arcs],
+            )
+        rate_: Floats = controls.take(own_row, axis=0)
+        rate_ *= base
+        rate_ *= controls.take(donor, axis=0)
         if not sparse:
-            return acted
-        rate[self._acted] = acted
+            return rate_
+        rate[self._controlled_arcs] = rate_
         return rate
 
     def _compile_controls(self) -> None:
@@ -183,25 +187,25 @@ class ArcRates:
         network = self.staged_network
         kinds = {c.id: c.control.kind for c in network.compartments.values() if c.control is not None}
         position = {id_: network.control_rows[id_].start for id_, kind in kinds.items() if kind in SCALING}
-        stretched = [position[id_] for id_, kind in kinds.items() if kind is ControlKind.STRETCH]
-        self._stretched: Integers = np.array(stretched, dtype=np.intp)
+        stretch_rows = [position[id_] for id_, kind in kinds.items() if kind is ControlKind.STRETCH]
+        self._stretch_rows: Integers = np.array(stretch_rows, dtype=np.intp)
         self.control_low, self.neutral, self.control_high = network.control_bounds
-        none = len(self.neutral)
+        no_row = len(self.neutral)
         valves = network.valves if isinstance(network, StagedNetwork) else {}
 
         def acting_on(arc: Arc) -> tuple[int, int]:
             if arc.donor in valves:
-                return none, position.get(valves[arc.donor], none)
+                return no_row, position.get(valves[arc.donor], no_row)
             donor = network.compartments[arc.donor]
-            own, valve = position.get(arc.id, none), position.get(arc.donor, none)
+            own_row, valve = position.get(arc.id, no_row), position.get(arc.donor, no_row)
             if donor.control is not None and donor.control.kind is FLOW:
-                return (valve, none) if arc.law is Law.CONTROLLED else (own, none)
-            return own, valve
+                return (valve, no_row) if arc.law is Law.CONTROLLED else (own_row, no_row)
+            return own_row, valve
 
         rows = np.array([acting_on(arc) for arc in network.arcs], dtype=np.intp).reshape(-1, 2)
         self._own_control, self._donor_control = rows[:, 0].copy(), rows[:, 1].copy()
-        self._partial = bool((rows == none).any())
-        self._acted: Integers = np.flatnonzero((rows < none).any(axis=1))
+        self._partial = bool((rows == no_row).any())
+        self._controlled_arcs: Integers = np.flatnonzero((rows < no_row).any(axis=1))
 
 
 class FlowLaws(ArcRates):
@@ -218,17 +222,17 @@ class FlowLaws(ArcRates):
     def __init__(self, network: Network, *, uncertain: bool = False) -> None:
         """Compile ``network``."""
         staged_network = simulated_network(network)
-        self._drawn = FlowFactors(staged_network) if uncertain else None
-        super().__init__(staged_network, self._drawn)
+        self._factors = FlowFactors(staged_network) if uncertain else None
+        super().__init__(staged_network, self._factors)
         self.network, rows, arcs = network, self.rows, len(staged_network.arcs)
         ends = np.concatenate([staged_network.donors, staged_network.recipients])
-        stored, both = ends < rows.nodes.stop, np.tile(np.arange(arcs), 2)
+        has_stock, arcs_twice = ends < rows.nodes.stop, np.tile(np.arange(arcs), 2)
         signs = np.repeat([-1.0, 1.0], arcs)
-        self.incidence = RowSum(ends[stored], both[stored], signs[stored], (rows.masses, arcs))
+        self.incidence = RowSum(ends[has_stock], arcs_twice[has_stock], signs[has_stock], (rows.masses, arcs))
         self._shares = Shares(staged_network, uncertain=uncertain)
         self.max_rate[self._shares.arcs] *= self._shares.highest
-        timed = [*self._series_arcs, *(self._shares.varying_arcs if self._shares.is_time_varying else ())]
-        self.time_dependent = tuple(staged_network.arcs[k].id for k in timed)
+        time_arcs = [*self._series_arcs, *(self._shares.varying_arcs if self._shares.is_time_varying else ())]
+        self.time_dependent = tuple(staged_network.arcs[k].id for k in time_arcs)
         self._share_out()
         self.routing = Routing(staged_network, self.rate(self.neutral[:, :1]), self.is_fixed)
 
@@ -236,14 +240,14 @@ class FlowLaws(ArcRates):
         """Multiply constant shares into r, where no control comes before them, and find out which r never change."""
         shares = self._shares
         self.is_fixed = ~self.is_scheduled
-        self.is_fixed[self._acted] = False
-        once = ~np.isin(shares.constant_arcs, self._acted)
+        self.is_fixed[self._controlled_arcs] = False
+        once = ~np.isin(shares.constant_arcs, self._controlled_arcs)
         self._base[shares.constant_arcs[once]] *= shares.values[once]
         self._constant_shares = shares.constant_arcs[~once], shares.values[~once]
         self.is_fixed[self._series_arcs] = False
         self.is_fixed[shares.varying_arcs] = False
-        if self._drawn is not None:
-            self.is_fixed[self._drawn.arcs] = False
+        if self._factors is not None:
+            self.is_fixed[self._factors.arcs] = False
 
     def rate(self, controls: Floats, step: Integers | None = None, factors: Floats | None = None) -> Floats:
         """Return r of each arc, shape (arcs, B): 1/time for stock-driven arcs, mass/time for scheduled ones.
@@ -253,7 +257,7 @@ class FlowLaws(ArcRates):
             step: index of the control interval in each copy, shape (B,); without it time series count as 1.
             factors: on the uncertain numbers, shape (numbers, B); None leaves them as they are stated.
         """
-        rate = self._unshared(controls)
+        rate = self._rate_without_shares(controls)
         if len(self._constant_shares[0]):
             arcs, shares = self._constant_shares
             rate[arcs] *= shares
@@ -261,8 +265,8 @@ class FlowLaws(ArcRates):
             rate[self._shares.varying_arcs] *= self._shares(controls, step, factors)
         if step is not None and len(self._series_arcs):
             rate[self._series_arcs] *= self._series[:, step]
-        if factors is not None and self._drawn is not None:
-            self._drawn.multiply(rate, factors)
+        if factors is not None and self._factors is not None:
+            self._factors.multiply(rate, factors)
         return rate
 
     def neutral_in(self, step: Integers) -> Floats:

@@ -48,13 +48,13 @@ class Routing:
         detours: the constant and the kept nodes.
     """
 
-    def __init__(self, network: Network, rate: Floats, fixed: NDArray[np.bool_]) -> None:
+    def __init__(self, network: Network, rate: Floats, arc_is_fixed: NDArray[np.bool_]) -> None:
         """Eliminate the constant nodes, and find the order of elimination of the others.
 
         Args:
             network: whose nodes they are.
             rate: rates of all arcs in one interval, shape (arcs, 1).
-            fixed: whether they are the same in all copies and intervals, shape (arcs,).
+            arc_is_fixed: whether they are the same in all copies and intervals, shape (arcs,).
         """
         stores, self._network = len(network.stores), network
         self.nodes = len(network.nodes) - stores
@@ -62,13 +62,13 @@ class Routing:
         self.donors: Integers = network.donors[self.arcs] - stores
         ends = network.recipients[self.arcs] - stores
         self.ends: Integers = np.where(ends < 0, ends + stores + self.nodes, ends)
-        self.is_fixed = fixed[self.arcs]
+        self.is_fixed = arc_is_fixed[self.arcs]
         shares = rate[self.arcs, 0]
         gives: dict[int, SparseRow] = {i: {} for i in range(self.nodes)}
-        for i, j, share, same in zip(
+        for i, j, share, is_same in zip(
             self.donors.tolist(), self.ends.tolist(), shares.tolist(), self.is_fixed, strict=True
         ):
-            if share > 0 or not same:
+            if share > 0 or not is_same:
                 gives[i][j] = gives[i].get(j, 0.0) + share
         constant = set(range(self.nodes)).difference(self.donors[~self.is_fixed].tolist())
         self.detours = StaticElimination(self.nodes, constant, gives)
@@ -83,9 +83,9 @@ class Routing:
         self._early = slice(0, early)
         place = {i: n for n, i in enumerate((*detours.order, *detours.kept_nodes))}
         self.places: Integers = np.array([place[i] for i in range(self.nodes)], dtype=np.intp)
-        entering = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
+        inflows = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
         shape = (self.nodes, len(network.arcs))
-        self._entering = RowSum(self.places[network.recipients[entering] - stores], entering, 1.0, shape)
+        self._inflow_sum = RowSum(self.places[network.recipients[inflows] - stores], inflows, 1.0, shape)
         gives = dict(zip(detours.order, detours.out, strict=True))
         self._ahead = square_matrix(gives, place, self.nodes)
         self._among = square_matrix(gives, {i: place[i] for i in detours.order}, self.nodes)
@@ -109,51 +109,55 @@ class Routing:
         """Write the shares between kept nodes as weighted sums of the shares of arcs."""
         detours, order = self.detours, self.detours.elimination
         place, reach = {i: n for n, i in enumerate(detours.kept_nodes)}, detours.reach()
-        same: list[tuple[int, int, float]] = []
-        other: list[tuple[int, int, float]] = []
+        fixed_terms: list[tuple[int, int, float]] = []
+        varying_terms: list[tuple[int, int, float]] = []
         for k, (i, end) in enumerate(zip(self.donors.tolist(), self.ends.tolist(), strict=True)):
             if i in place and (shares[k] > 0 or not self.is_fixed[k]):
                 for j, part in reach.get(end, {end if end < self.nodes else -1: 1.0}).items():
                     if j != i:
                         entry = order.entry(place[i], place.get(j, -1))
-                        (same if self.is_fixed[k] else other).append((entry, k, part))
-        given = [part * shares[k] for _, k, part in same]
-        self._given = np.bincount([entry for entry, _, _ in same], given, order.size).astype(float)[:, None]
-        self._varying = np.array(sorted({k for _, k, _ in other}), dtype=np.intp)
-        columns = np.searchsorted(self._varying, [k for _, k, _ in other])
-        weights = [part for _, _, part in other]
-        self._entries = RowSum([entry for entry, _, _ in other], columns, weights, (order.size, len(self._varying)))
+                        (fixed_terms if self.is_fixed[k] else varying_terms).append((entry, k, part))
+        products = [part * shares[k] for _, k, part in fixed_terms]
+        self._fixed_entries = np.bincount([entry for entry, _, _ in fixed_terms], products, order.size).astype(float)[
+            :, None
+        ]
+        self._varying_arcs = np.array(sorted({k for _, k, _ in varying_terms}), dtype=np.intp)
+        columns = np.searchsorted(self._varying_arcs, [k for _, k, _ in varying_terms])
+        weights = [part for _, _, part in varying_terms]
+        self._entries = RowSum(
+            [entry for entry, _, _ in varying_terms], columns, weights, (order.size, len(self._varying_arcs))
+        )
 
     def routes(self, rate: Floats) -> IntervalRoutes | None:
         """Return what to pass flows on with while ``rate``, shape (arcs, B), holds; None if every node stores."""
         return (self._constant or self._routes(rate)) if self.nodes else None
 
     def _routes(self, rate: Floats) -> IntervalRoutes:
-        values = np.repeat(self._given, rate.shape[1], axis=1)
-        self._entries.add_to(values, rate.take(self.arcs[self._varying], 0))
+        values = np.repeat(self._fixed_entries, rate.shape[1], axis=1)
+        self._entries.add_to(values, rate.take(self.arcs[self._varying_arcs], 0))
         return IntervalRoutes(rate, EliminatedShares(self.detours.elimination, values))
 
     def pass_on(self, flow: Floats, routes: IntervalRoutes) -> None:
         """Fill in what leaves the nodes without stock, given in place what enters them, shape (arcs, B)."""
-        sent = self.throughputs(self._entering(flow), routes).take(self.throughput_rows, 0)
-        sent *= routes.rate.take(self.arcs, 0)
-        flow[self.arcs] = sent
+        outflows = self.throughputs(self._inflow_sum(flow), routes).take(self.throughput_rows, 0)
+        outflows *= routes.rate.take(self.arcs, 0)
+        flow[self.arcs] = outflows
 
     def throughputs(self, through: Floats, routes: IntervalRoutes) -> Floats:
-        """Return what passes through, in the rows of ``found``, for what enters, in ``places``, which is used up.
+        """Return what passes through, in the rows of ``result``, for what enters, in ``places``, which is used up.
 
         Shapes are (nodes, B).
         """
         early, late = self._early, slice(self._early.stop, self.nodes)
-        found = np.empty_like(through)
+        result = np.empty_like(through)
         if late.start < late.stop:
-            kept = found[late]
-            kept[...] = self._ahead.substitute(through.copy())[late]
-            routes.kept_nodes.throughput(kept)
-            self._on_to.add_to(through, kept.take(self._on_from, 0) * routes.rate.take(self._on, 0))
+            kept_rows = result[late]
+            kept_rows[...] = self._ahead.substitute(through.copy())[late]
+            routes.kept_nodes.throughput(kept_rows)
+            self._on_to.add_to(through, kept_rows.take(self._on_from, 0) * routes.rate.take(self._on, 0))
         self._among.substitute(through)
-        np.multiply(through[early][::-1], self._inverse, out=found[early])
-        return self._back.substitute(found)
+        np.multiply(through[early][::-1], self._inverse, out=result[early])
+        return self._back.substitute(result)
 
     def most(self, flow: Floats) -> Floats:
         """Return upper bounds of the throughputs if flows that enter are at most ``flow``, shape (arcs,).
@@ -163,5 +167,5 @@ class Routing:
         """
         passes = VisitBounds(self._network, splits(self._network))
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
-        entering = self._entering(flow[:, None])[self.places, 0]
-        return np.full(self.nodes, float(entering @ total))
+        inflow = self._inflow_sum(flow[:, None])[self.places, 0]
+        return np.full(self.nodes, float(inflow @ total))

@@ -59,7 +59,7 @@ class StagedNetwork(Network):
         """Arcs that touch the environment and do not lie within a node of it."""
         return super().environmental & ~self._within
 
-    def metered(self, service: Service) -> Integers:
+    def service_arcs(self, service: Service) -> Integers:
         """Return the arcs whose flows add up to what a service measures; an outflow is what leaves the whole node."""
         if service.quantity != "outflow":
             return super().service_arcs(service)
@@ -80,8 +80,8 @@ class StagedNetwork(Network):
     def lines(self) -> Mapping[str, str]:
         """The part of ``leaving`` that comes out of slots."""
         arcs = {arc.id: arc for arc in self.arcs}
-        written = {node: arc for node, arc in self.release_arcs.items() if len(self.stages[node]) > 1}
-        return {node: arc for node, arc in written.items() if arcs[arc].law is Law.EXOGENOUS}
+        with_stages = {node: arc for node, arc in self.release_arcs.items() if len(self.stages[node]) > 1}
+        return {node: arc for node, arc in with_stages.items() if arcs[arc].law is Law.EXOGENOUS}
 
 
 def staged_network(network: Network, whole: Container[str] = ()) -> StagedNetwork:
@@ -90,9 +90,9 @@ def staged_network(network: Network, whole: Container[str] = ()) -> StagedNetwor
     Of nodes that stay ``whole`` the arc ``leaving`` alone is written, with the rate of the stages, or 1 for a line:
     what it carries does not follow from the stock.
     """
-    living = [node for node in network.stores if node.lifetime is not None]
+    with_lifetime = [node for node in network.stores if node.lifetime is not None]
     parts = _Parts(network)
-    for node in living:
+    for node in with_lifetime:
         assert node.lifetime is not None
         if node.id in whole:
             parts.whole(node)
@@ -106,14 +106,14 @@ def staged_network(network: Network, whole: Container[str] = ()) -> StagedNetwor
         )
         for arc in network.arcs
     ]
-    plain = {n.id: Node(id=n.id, role=n.role, scale=n.scale, control=n.control) for n in living}
+    plain = {n.id: Node(id=n.id, role=n.role, scale=n.scale, control=n.control) for n in with_lifetime}
     stores = [plain.get(node.id, node) for node in network.stores]
-    passing = [Node(id=each, stores=False) for each in (*parts.enters.values(), *parts.leaves.values())]
-    kept = {each: getattr(network, each) for each in network.__dataclass_fields__}
-    kept |= {"nodes": (*stores, *parts.stores, *network.nodes[len(stores) :], *passing), "scenarios": {}}
-    kept["arcs"] = (*arcs, *parts.arcs)
+    stockless = [Node(id=item, stores=False) for item in (*parts.enters.values(), *parts.leaves.values())]
+    fields_ = {item: getattr(network, item) for item in network.__dataclass_fields__}
+    fields_ |= {"nodes": (*stores, *parts.stores, *network.nodes[len(stores) :], *stockless), "scenarios": {}}
+    fields_["arcs"] = (*arcs, *parts.arcs)
     return StagedNetwork(
-        **kept, stages=parts.stages, valves=parts.valves, release_arcs=parts.release_arcs, parts=parts.of
+        **fields_, stages=parts.stages, valves=parts.valves, release_arcs=parts.release_arcs, parts=parts.of
     )
 
 
@@ -141,9 +141,9 @@ class _Parts:
         assert node.lifetime is not None and node.lifetime.chain is not None
         chain, entry, release = node.lifetime.chain, self._entry(node), self._release(node)
         names = self._stores(node, chain.stages - 1)
-        for name, following in zip(names, (*names[1:], release), strict=True):
+        for name, successor in zip(names, (*names[1:], release), strict=True):
             self.valves[name] = node.id
-            self.arcs.append(Arc(id=f"{name}.leaving", donor=name, recipient=following, rate=self._rate(node)))
+            self.arcs.append(Arc(id=f"{name}.leaving", donor=name, recipient=successor, rate=self._rate(node)))
         for end, part in zip((*names, release), (*chain.inflow_shares, chain.weights[0]), strict=True):
             if part > 0:
                 self.arcs.append(self._share_arc(entry, end, float(part)))
@@ -173,8 +173,8 @@ class _Parts:
         return self.leaves[node.id]
 
     def _out(self, node: Node, law: Law) -> None:
-        release, driven = self._release(node), law is Law.DONOR
-        rate, flow = (self._rate(node), 0.0) if driven else (0.0, 1.0)
+        release, by_stock = self._release(node), law is Law.DONOR
+        rate, flow = (self._rate(node), 0.0) if by_stock else (0.0, 1.0)
         arc = Arc(id=self.release_arcs[node.id], donor=node.id, recipient=release, law=law, rate=rate, flow=flow)
         self.arcs.append(arc)
 
@@ -213,16 +213,16 @@ class FixedLifetimes:
         self._old = np.array([rows[-1] for rows in places], dtype=np.intp)
         self.arcs: Integers = np.array([network.arc_index[arc] for arc in network.lines.values()], dtype=np.intp)
 
-    def moved_on(self, stock: Floats) -> Floats:
+    def shift_slots(self, stock: Floats) -> Floats:
         """Return the masses, shape (rows, B), with those of each slot in the next one, and an empty first slot."""
         after = stock.copy()
         # what rounding left of what came out comes out now
-        left = stock[self._old]
+        rest = stock[self._old]
         after[self._to] = stock[self._from]
-        after[self._old] += left
+        after[self._old] += rest
         after[self._young] = 0.0
         return after
 
-    def come_out(self, stock: Floats, rate: Floats) -> None:
+    def set_outflows(self, stock: Floats, rate: Floats) -> None:
         """Set the flows of what comes out in the interval, in place; ``rate`` has shape (arcs, B)."""
         rate[self.arcs] = stock[self._old] / self._interval

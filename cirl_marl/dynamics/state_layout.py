@@ -32,8 +32,8 @@ class BatchLine:
     unit: Annotated[float, "mass per unit released"]
     donor: Annotated[int, "row of the node that gives"]
     recipient: Annotated[int, "row of the node that receives"]
-    collecting: Annotated[int, "row of the batch that is being put together"]
-    packed: Annotated[int | None, "row of complete batches that wait for the vehicle; None without a vehicle"]
+    collection_row: Annotated[int, "row of the batch that is being put together"]
+    packed_row: Annotated[int | None, "row of complete batches that wait for the vehicle; None without a vehicle"]
     first: Annotated[int, "first row of the slots, or the row of what is aboard"]
     slots: Annotated[int, "number of slots; 0 with a vehicle"]
     leaves: Annotated[float, "weight with which mass that leaves the donor counts in m_fb"]
@@ -43,7 +43,7 @@ class BatchLine:
     @property
     def rows(self) -> range:
         """All rows of the arc."""
-        return range(self.collecting, self.first + max(self.slots, 1))
+        return range(self.collection_row, self.first + max(self.slots, 1))
 
 
 class StateLayout:
@@ -71,12 +71,15 @@ class StateLayout:
     def __init__(self, network: Network) -> None:
         """Lay out the rows of ``network``, which has its lifetimes as stages if it has any."""
         nodes = len(network.stores)
-        staged: Mapping[str, tuple[str, ...]] = {}
+        stages_of: Mapping[str, tuple[str, ...]] = {}
         self.stages: dict[int, Integers] = {}
         if isinstance(network, StagedNetwork):
-            staged, index = {n: each for n, each in network.stages.items() if len(each) > 1}, network.node_index
-            self.stages = {index[node]: network.node_index_of(stages) for node, stages in staged.items()}
-        self._totals = _totals(nodes, self.stages) if staged else None
+            stages_of, index = (
+                {n: names_ for n, names_ in network.stages.items() if len(names_) > 1},
+                network.node_index,
+            )
+            self.stages = {index[node]: network.node_index_of(stages) for node, stages in stages_of.items()}
+        self._totals = _totals(nodes, self.stages) if stages_of else None
         names: list[str] = []
         self.lines = tuple(
             _line(network, k, nodes, names) for k, arc in enumerate(network.arcs) if arc.law is Law.BATCH
@@ -90,7 +93,7 @@ class StateLayout:
         models = {c.id: c.model for c in network.compartments.values() if c.model is not None}
         self.owners = tuple(models)
         self.state_names = tuple(f"{owner}.{name}" for owner, model in models.items() for name in model.state_names)
-        last = {node: f"{node}.stage_{len(stages)}" for node, stages in staged.items()}
+        last = {node: f"{node}.stage_{len(stages)}" for node, stages in stages_of.items()}
         self.start_names = (*(last.get(node.id, node.id) for node in network.stores), *self.state_names)
         self.states = dict(zip(models, spans(len(model.state_names) for model in models.values()), strict=True))
         self.outputs = {owner: self.masses + i for i, owner in enumerate(self.owners)}
@@ -112,10 +115,10 @@ class StateLayout:
 
 def _totals(rows: int, stages: Mapping[int, Integers]) -> RowSum:
     """Return the sum of the stages of each node, from the rows of all stocks."""
-    own = np.arange(rows - sum(len(each) - 1 for each in stages.values()))
-    parts = {**{int(i): np.array([i]) for i in own}, **stages}
-    places = np.concatenate([np.full(len(each), i) for i, each in parts.items()])
-    return RowSum(places, np.concatenate([*parts.values()]), 1.0, (len(own), rows))
+    single_rows = np.arange(rows - sum(len(rows_) - 1 for rows_ in stages.values()))
+    parts = {**{int(i): np.array([i]) for i in single_rows}, **stages}
+    places = np.concatenate([np.full(len(rows_), i) for i, rows_ in parts.items()])
+    return RowSum(places, np.concatenate([*parts.values()]), 1.0, (len(single_rows), rows))
 
 
 def _line(network: Network, k: int, nodes: int, names: list[str]) -> BatchLine:
@@ -135,8 +138,8 @@ def _line(network: Network, k: int, nodes: int, names: list[str]) -> BatchLine:
         unit=extremes(arc.rate)[0],
         donor=network.node_index[arc.donor],
         recipient=network.node_index[arc.recipient],
-        collecting=start,
-        packed=None if slots else start + 1,
+        collection_row=start,
+        packed_row=None if slots else start + 1,
         first=start + (1 if slots else 2),
         slots=slots,
         leaves=sign if early else 0.0,

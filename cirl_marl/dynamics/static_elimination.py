@@ -60,14 +60,14 @@ class StaticElimination:
 
     def reach(self) -> dict[int, SparseRow]:
         """Return in which parts what enters each of ``order`` gets to kept nodes, and past them, end −1."""
-        found: dict[int, SparseRow] = {}
+        rows: dict[int, SparseRow] = {}
         for i, out in zip(reversed(self.order), reversed(self.out), strict=True):
-            mine: SparseRow = {}
+            row: SparseRow = {}
             for end, part in out.items():
-                for j, further in found.get(end, {end if end < self._nodes else -1: 1.0}).items():
-                    mine[j] = mine.get(j, 0.0) + part * further
-            found[i] = mine
-        return found
+                for j, further in rows.get(end, {end if end < self._nodes else -1: 1.0}).items():
+                    row[j] = row.get(j, 0.0) + part * further
+            rows[i] = row
+        return rows
 
     def _eliminate(self, constant: set[int]) -> None:
         """Eliminate all constant nodes, the cheapest first, then take back those that were better kept."""
@@ -89,8 +89,8 @@ class StaticElimination:
                 heappush(queue, (self._cost(j), j))
         ways.append(self._way(entries))
         _, count, self.kept_nodes, self.elimination = min(ways, key=lambda way: way[:2])
-        for each in (self.order, self.inverse, self.out, self.into):
-            del each[count:]
+        for sequence in (self.order, self.inverse, self.out, self.into):
+            del sequence[count:]
         early = set(self.order)
         self.into = [{j: part for j, part in into.items() if j in early} for into in self.into]
 
@@ -99,13 +99,18 @@ class StaticElimination:
 
     def _way(self, entries: int) -> tuple[float, int, list[int], EliminationOrder]:
         """Return what it costs to stop here, how many are eliminated then, who is kept, and in which order."""
-        kept = sorted(self._gives)
-        place = {i: n for n, i in enumerate(kept)}
-        pairs = [(place[i], place[j]) for i in kept for j in self._gives[i] if j in place and j != i]
-        order = EliminationOrder(len(kept), pairs)
-        passing, making = order.work
+        kept_nodes = sorted(self._gives)
+        place = {i: n for n, i in enumerate(kept_nodes)}
+        pairs = [(place[i], place[j]) for i in kept_nodes for j in self._gives[i] if j in place and j != i]
+        order = EliminationOrder(len(kept_nodes), pairs)
+        pass_cost, build_cost = order.work
         # factors that differ from copy to copy are gathered, multiplied and added: three passes over memory, not one
-        return 2 * entries + 3 * passing + 4 * making / SERIES + ROUND * len(order.rounds), len(self.order), kept, order
+        return (
+            2 * entries + 3 * pass_cost + 4 * build_cost / SERIES + ROUND * len(order.rounds),
+            len(self.order),
+            kept_nodes,
+            order,
+        )
 
     def _without(self, i: int) -> set[int]:
         """Eliminate node i and return its neighbours."""
@@ -114,11 +119,11 @@ class StaticElimination:
         parts = {end: share * inverse for end, share in out.items()}
         into: SparseRow = {}
         for j in sources:
-            given = self._gives[j].pop(i)
-            into[j] = given * inverse
+            share_ = self._gives[j].pop(i)
+            into[j] = share_ * inverse
             for end, part in parts.items():
                 if end != j:  # what comes back to j is left out, and its pivot is the sum of the rest
-                    self._gives[j][end] = self._gives[j].get(end, 0.0) + given * part
+                    self._gives[j][end] = self._gives[j].get(end, 0.0) + share_ * part
                     if end < self._nodes:
                         self._gets[end].add(j)
         near = {end for end in out if end < self._nodes}
@@ -151,9 +156,9 @@ def contract_hubs(gives: dict[int, SparseRow], hubs: Iterable[int]) -> list[int]
         if len(sources) * len(parts) > len(sources) + len(parts):
             continue
         for i in sources:
-            given = gives[i].pop(hub)
+            share = gives[i].pop(hub)
             for j, part in parts.items():
-                gives[i][j] = gives[i].get(j, 0.0) + given * part
+                gives[i][j] = gives[i].get(j, 0.0) + share * part
         for j in parts.keys() & gets.keys():
             gets[j].discard(hub)
             gets[j] |= sources

@@ -56,8 +56,8 @@ class Supply:
         self._dynamics, network = dynamics, dynamics.network
         made_up = [arc for arc in network.arcs if arc.makes_up_for]
         self.arcs = tuple(arc.id for arc in made_up)
-        served = list(dict.fromkeys(arc.makes_up_for for arc in made_up))
-        services = [service for service in network.services if service.id in served]
+        service_ids = list(dict.fromkeys(arc.makes_up_for for arc in made_up))
+        services = [service for service in network.services if service.id in service_ids]
         order = [service.id for service in services]
         self._of: Integers = np.array([order.index(arc.makes_up_for) for arc in made_up], dtype=np.intp)
         self._rows: Integers = np.array([network.control_rows[arc.id].start for arc in made_up], dtype=np.intp)
@@ -66,11 +66,13 @@ class Supply:
         demand = [network.interval_means(service.low) for service in services]
         self._demand = np.array(demand).reshape(len(services), network.episode.horizon)
         numbers = numbers_of(network, "services", "low")
-        self._drawn = RowFactors({row: numbers[each.id] for row, each in enumerate(services) if each.id in numbers})
+        self._factors = RowFactors(
+            {row: numbers[service_.id] for row, service_ in enumerate(services) if service_.id in numbers}
+        )
         stores, rows, columns = len(network.stores), [], []
         for row, service in enumerate(services):
             if service.quantity == "stock":
-                read = [network.node_index[each] for each in service.providers]
+                read = [network.node_index[service_] for service_ in service.providers]
             else:
                 read = [stores + int(k) for k in network.service_arcs(service)]
             rows += [row] * len(read)
@@ -79,7 +81,9 @@ class Supply:
         indices = np.array([network.arc_index[arc] for arc in self.arcs], dtype=np.intp)
         self._arrivals = Arrivals(dynamics, services, indices, self._of)
         interval = network.episode.control_interval
-        self._lasting = np.array([interval if each.quantity == "stock" else 1.0 for each in services])[:, None, None]
+        self._duration = np.array([interval if service_.quantity == "stock" else 1.0 for service_ in services])[
+            :, None, None
+        ]
 
     def idle(self, agents: Container[str]) -> Bools:
         """Return which of ``arcs`` nobody acts on, shape (arcs, 1)."""
@@ -109,16 +113,20 @@ class Supply:
         batch, idle = controls.shape[1], np.broadcast_to(idle, (len(self.arcs), controls.shape[1]))
         block = max(1, CELLS // self._dynamics.rows.masses)
         if batch <= block:
-            return self._supplied(stock, inner, controls, step, idle, factors)
+            return self._controls_of_block(stock, inner, controls, step, idle, factors)
         parts = []
         for first in range(0, batch, block):
-            some = slice(first, first + block)
-            each = [np.ascontiguousarray(given[:, some]) for given in (stock, inner, controls)]
-            drawn = None if factors is None else np.ascontiguousarray(factors[:, some])
-            parts.append(self._supplied(each[0], each[1], each[2], step[some], idle[:, some], drawn))
+            columns = slice(first, first + block)
+            block_arrays = [np.ascontiguousarray(array[:, columns]) for array in (stock, inner, controls)]
+            block_factors = None if factors is None else np.ascontiguousarray(factors[:, columns])
+            parts.append(
+                self._controls_of_block(
+                    block_arrays[0], block_arrays[1], block_arrays[2], step[columns], idle[:, columns], block_factors
+                )
+            )
         return np.concatenate(parts, axis=1)
 
-    def _supplied(
+    def _controls_of_block(
         self, stock: Floats, inner: Floats, controls: Floats, step: Integers, idle: Bools, factors: Floats | None
     ) -> Floats:
         """Return what ``__call__`` does, for copies so few that all they take stays in a cache."""
@@ -126,78 +134,78 @@ class Supply:
         low, high = (
             table[self._rows].take(step, axis=1) for table in (self._dynamics.control_low, self._dynamics.control_high)
         )
-        demand = self._drawn(self._demand.take(step, axis=1), factors)
+        demand = self._factors(self._demand.take(step, axis=1), factors)
         most = np.zeros((count, batch))
         weights = np.broadcast_to(self._weights, low.shape)
-        asked = np.divide(high - low, weights, out=np.zeros_like(low), where=idle & (weights > 0))
-        np.maximum.at(most, self._of, asked)
+        range_ = np.divide(high - low, weights, out=np.zeros_like(low), where=idle & (weights > 0))
+        np.maximum.at(most, self._of, range_)
 
-        def supplied(supply: Floats) -> Floats:
+        def controls_for(supply: Floats) -> Floats:
             """Return all controls for V, shape (services, B), shape (controls, B)."""
-            found = controls.copy()
-            wanted = np.minimum(low + self._weights * supply[self._of], high)
-            found[self._rows] = np.where(idle, wanted, controls[self._rows])
-            return found
+            all_controls = controls.copy()
+            target = np.minimum(low + self._weights * supply[self._of], high)
+            all_controls[self._rows] = np.where(idle, target, controls[self._rows])
+            return all_controls
 
-        def measured(supply: Floats, times: int = 1) -> Floats:
-            return self._measured(stock, inner, supplied(supply), step, times, factors)
+        def quantities_for(supply: Floats, times: int = 1) -> Floats:
+            return self._service_quantities(stock, inner, controls_for(supply), step, times, factors)
 
-        def probed(supply: Floats, base: Floats) -> Floats:
+        def probed_slope(supply: Floats, base: Floats) -> Floats:
             """Return A, shape (services, services, B), from an interval for each column."""
             # small beside what lacks, as a donor may hold little more than that, and not lost in rounding
             probe = np.minimum(np.maximum(PROBE * np.abs(demand - base), LEAST * demand) / interval, PROBE * most)
-            tried = [supplied(supply + probe * (np.arange(count) == s)[:, None]) for s in range(count)]
-            found = self._measured(stock, inner, np.concatenate(tried, axis=1), step, count, factors)
-            more = found.reshape(count, count, batch) - base[:, None]
+            trials = [controls_for(supply + probe * (np.arange(count) == s)[:, None]) for s in range(count)]
+            responses = self._service_quantities(stock, inner, np.concatenate(trials, axis=1), step, count, factors)
+            more = responses.reshape(count, count, batch) - base[:, None]
             return np.divide(more, probe, out=np.zeros_like(more), where=probe > 0)
 
         def room(supply: Floats) -> Bools:
             """Return which arcs can supply more, shape (arcs, B)."""
-            found: Bools = idle & (low + self._weights * supply[self._of] < high)
-            return found
+            has_room: Bools = idle & (low + self._weights * supply[self._of] < high)
+            return has_room
 
-        def arriving(supply: Floats) -> Floats:
+        def arrival_slope(supply: Floats) -> Floats:
             """Return A, but for a factor in each row."""
-            rate = self._dynamics.rate(supplied(supply), step, factors)
-            found: Floats = self._arrivals(rate, np.where(room(supply), self._weights, 0.0)) * self._lasting
-            return found
+            rate = self._dynamics.rate(controls_for(supply), step, factors)
+            slope_: Floats = self._arrivals(rate, np.where(room(supply), self._weights, 0.0)) * self._duration
+            return slope_
 
         supply, interval = np.zeros((count, batch)), self._dynamics.network.episode.control_interval
         open_, factor = np.ones(batch, dtype=bool), np.ones((count, batch))
         before: tuple[Floats, Floats, Floats] | None = None
         for _ in range(ROUNDS):
-            base = measured(supply)
-            lacking = demand - base
-            lacks = (lacking > CLOSE * demand) & (supply < most) | (lacking < -CLOSE * demand) & (supply > 0)
+            base = quantities_for(supply)
+            shortage = demand - base
+            lacks = (shortage > CLOSE * demand) & (supply < most) | (shortage < -CLOSE * demand) & (supply > 0)
             open_ &= lacks.any(axis=0)
             if not open_.any():
                 break
             if count <= MOST_PROBES:
-                slope = _by_copy(probed(supply, base))
+                slope = _by_copy(probed_slope(supply, base))
             else:
-                bent = np.ones((1, batch), dtype=bool)
+                has_bent = np.ones((1, batch), dtype=bool)
                 if before is not None:
-                    bent = (room(supply) != room(before[0])).any(axis=0, keepdims=True)
+                    has_bent = (room(supply) != room(before[0])).any(axis=0, keepdims=True)
                     # where an arc has come to its bound, less was to be expected
-                    told = (np.abs(before[2]) > NOTICEABLE * demand) & ~bent
-                    factor *= np.divide(base - before[1], before[2], out=np.ones_like(base), where=told)
-                if bent.any():
-                    arrivals = _by_copy(arriving(supply))
+                    is_telling = (np.abs(before[2]) > NOTICEABLE * demand) & ~has_bent
+                    factor *= np.divide(base - before[1], before[2], out=np.ones_like(base), where=is_telling)
+                if has_bent.any():
+                    arrivals = _by_copy(arrival_slope(supply))
                 slope = arrivals * factor.T[..., None]
-            better = np.where(open_, _complementary(slope, lacking, supply, most, interval), supply)
+            better = np.where(open_, _complementary(slope, shortage, supply, most, interval), supply)
             before = supply, base, (slope * np.ascontiguousarray((better - supply).T)[:, None]).sum(axis=2).T
             supply = better
-        return supplied(supply)
+        return controls_for(supply)
 
-    def _measured(
+    def _service_quantities(
         self, stock: Floats, inner: Floats, controls: Floats, step: Integers, times: int, factors: Floats | None
     ) -> Floats:
         """Return what the services measure at the end of the interval under several controls, shape (services, …)."""
         dynamics = self._dynamics
-        start, drawn = (np.tile(stock, (1, times)), np.tile(inner, (1, times))), None
+        start, factors_ = (np.tile(stock, (1, times)), np.tile(inner, (1, times))), None
         if factors is not None:
-            drawn = np.tile(factors, (1, times))
-        done = dynamics.advance(*start, controls, np.tile(step, times), drawn)
+            factors_ = np.tile(factors, (1, times))
+        done = dynamics.advance(*start, controls, np.tile(step, times), factors_)
         flow = done.moved_mass / dynamics.network.episode.control_interval
         return self._measure(np.concatenate([dynamics.rows.stocks(done.stock), flow]))
 
@@ -207,76 +215,76 @@ def _by_copy(slope: Floats) -> Floats:
     return np.ascontiguousarray(np.moveaxis(slope, 2, 0))
 
 
-def _complementary(slope: Floats, lacking: Floats, supply: Floats, most: Floats, interval: float) -> Floats:
+def _complementary(slope: Floats, shortage: Floats, supply: Floats, most: Floats, interval: float) -> Floats:
     """Return V, shape (services, B), at which nothing lacks that can be supplied, for q linear around ``supply``.
 
     Each copy goes its own way, whatever the others in the batch do.
 
     Args:
         slope: A, shape (B, services, services).
-        lacking: D − q at ``supply``, shape (services, B).
+        shortage: D − q at ``supply``, shape (services, B).
         supply: V.
         most: largest V.
         interval: length of an interval, by which a flow becomes a stock.
     """
-    short, now, high = (np.ascontiguousarray(each.T) for each in (lacking, supply, most))
+    short, now, high = (np.ascontiguousarray(array.T) for array in (shortage, supply, most))
     # more of what does not arrive is not supplied
     arrives = np.diagonal(slope, axis1=1, axis2=2) > TINY * min(1.0, interval)
-    if len(lacking) == 1:
+    if len(shortage) == 1:
         return _gauss_seidel(slope, short, now, high, arrives).T
-    found, solved = _active_set(slope, short, now, high, arrives)
-    if not solved.all():
-        found = np.where(solved[:, None], found, _gauss_seidel(slope, short, now, high, arrives))
-    return np.ascontiguousarray(found.T)
+    solution, is_solved = _active_set(slope, short, now, high, arrives)
+    if not is_solved.all():
+        solution = np.where(is_solved[:, None], solution, _gauss_seidel(slope, short, now, high, arrives))
+    return np.ascontiguousarray(solution.T)
 
 
-def _active_set(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arrives: Bools) -> tuple[Floats, Bools]:
+def _active_set(slope: Floats, shortage: Floats, supply: Floats, most: Floats, arrives: Bools) -> tuple[Floats, Bools]:
     """Return V as ``_complementary`` does, shape (B, services), and in which copies it is found.
 
     All supplies between their bounds are solved for together; then it is changed which these are. A copy for which that
     comes to no end is left to others.
     """
-    wanted = lacking + (slope * supply[:, None]).sum(axis=2)
-    held: Floats
-    free, held = arrives & (most > 0), np.where(arrives, 0.0, supply)
-    found, solved, unit = supply.copy(), np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
+    target = shortage + (slope * supply[:, None]).sum(axis=2)
+    pinned_values: Floats
+    free, pinned_values = arrives & (most > 0), np.where(arrives, 0.0, supply)
+    solution, is_solved, unit = supply.copy(), np.zeros(len(supply), dtype=bool), np.eye(supply.shape[1])
     for _ in range(CHANGES):
-        tried = _solve(np.where(free[..., None], slope, unit), np.where(free, wanted, held))
-        excess = wanted - (slope * tried[:, None]).sum(axis=2)  # what lacks still
-        under, over = free & (tried < 0), free & (tried > most)
-        back = ~free & arrives & (most > 0) & np.where(held > 0, excess < 0, excess > 0)
-        settled = ~(under | over | back).any(axis=1) & np.isfinite(tried).all(axis=1)
-        found[settled & ~solved] = tried[settled & ~solved]
-        solved |= settled
-        if solved.all():
+        trial = _solve(np.where(free[..., None], slope, unit), np.where(free, target, pinned_values))
+        excess = target - (slope * trial[:, None]).sum(axis=2)  # what lacks still
+        under, over = free & (trial < 0), free & (trial > most)
+        back = ~free & arrives & (most > 0) & np.where(pinned_values > 0, excess < 0, excess > 0)
+        is_settled = ~(under | over | back).any(axis=1) & np.isfinite(trial).all(axis=1)
+        solution[is_settled & ~is_solved] = trial[is_settled & ~is_solved]
+        is_solved |= is_settled
+        if is_solved.all():
             break
-        held = np.where(under, 0.0, np.where(over, most, held))
+        pinned_values = np.where(under, 0.0, np.where(over, most, pinned_values))
         free = np.asarray((free & ~under & ~over) | back)
-    return found, solved
+    return solution, is_solved
 
 
-def _solve(matrix: Floats, wanted: Floats) -> Floats:
+def _solve(matrix: Floats, target: Floats) -> Floats:
     """Return the solutions of linear systems, shape (B, services); NaN where one is singular."""
     try:
-        found: Floats = np.asarray(np.linalg.solve(matrix, wanted[..., None])[..., 0], dtype=np.float64)
+        solution: Floats = np.asarray(np.linalg.solve(matrix, target[..., None])[..., 0], dtype=np.float64)
     except np.linalg.LinAlgError:
         if len(matrix) == 1:
-            return np.full_like(wanted, np.nan)
-        return np.concatenate([_solve(matrix[i : i + 1], wanted[i : i + 1]) for i in range(len(matrix))])
-    return found
+            return np.full_like(target, np.nan)
+        return np.concatenate([_solve(matrix[i : i + 1], target[i : i + 1]) for i in range(len(matrix))])
+    return solution
 
 
-def _gauss_seidel(slope: Floats, lacking: Floats, supply: Floats, most: Floats, arrives: Bools) -> Floats:
+def _gauss_seidel(slope: Floats, shortage: Floats, supply: Floats, most: Floats, arrives: Bools) -> Floats:
     """Return V as ``_complementary`` does, shape (B, services), by projected Gauss-Seidel sweeps."""
-    count, found = lacking.shape[1], supply.copy()
-    open_ = np.ones(len(lacking), dtype=bool)
+    count, solution = shortage.shape[1], supply.copy()
+    open_ = np.ones(len(shortage), dtype=bool)
     for _ in range(SWEEPS):
-        before = found.copy()
+        before = solution.copy()
         for s in range(count):
-            short = lacking[:, s] - (slope[:, s] * (found - supply)).sum(axis=1)
+            short = shortage[:, s] - (slope[:, s] * (solution - supply)).sum(axis=1)
             step = np.divide(short, slope[:, s, s], out=np.zeros_like(short), where=arrives[:, s])
-            found[:, s] = np.where(open_, np.clip(found[:, s] + step, 0.0, most[:, s]), found[:, s])
-        open_ &= (np.abs(found - before) > 1e-15 * found).any(axis=1)
+            solution[:, s] = np.where(open_, np.clip(solution[:, s] + step, 0.0, most[:, s]), solution[:, s])
+        open_ &= (np.abs(solution - before) > 1e-15 * solution).any(axis=1)
         if count == 1 or not open_.any():
             break
-    return found
+    return solution

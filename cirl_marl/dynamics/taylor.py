@@ -36,9 +36,9 @@ class Taylor:
         # throughputs stand below the masses, and drive what leaves nodes without stock
         self._driver = laws.driver.copy()
         self._driver[routing.arcs] = laws.rows.masses + routing.throughput_rows
-        self._entering = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
-        entered = routing.places[network.recipients[self._entering] - stores]
-        self._into = RowSum(entered, range(len(entered)), 1.0, (routing.nodes, len(entered)))
+        self._inflows = np.flatnonzero((network.donors < stores) & (network.recipients >= stores))
+        entry_places = routing.places[network.recipients[self._inflows] - stores]
+        self._into = RowSum(entry_places, range(len(entry_places)), 1.0, (routing.nodes, len(entry_places)))
 
     def _number(self) -> int:
         """Smallest K ≥ 2 for which the first neglected term of the mean, ‖|A|^K‖₁·h^K/(K + 1)!, is ≤ TRUNCATION.
@@ -52,47 +52,49 @@ class Taylor:
         while term > TRUNCATION or k < 2:
             k += 1
             ends = np.append(reach, reach.max(initial=0.0))[laws.driven_to]
-            moved = laws.driven_rate * (reach[donors] + ends) * self._substep
-            reach = np.bincount(laws.driver[laws.driven_arcs], weights=moved, minlength=stores) / (k + 1)
+            transfers = laws.driven_rate * (reach[donors] + ends) * self._substep
+            reach = np.bincount(laws.driver[laws.driven_arcs], weights=transfers, minlength=stores) / (k + 1)
             term = float(reach.max(initial=0.0))
         return k
 
     def moved_mass(
-        self, stock: Floats, routes: IntervalRoutes | None, rate: Floats, settled: Floats | None = None
+        self, stock: Floats, routes: IntervalRoutes | None, rate: Floats, imposed_flow: Floats | None = None
     ) -> Floats:
         """Return h·r∘ȳ[driver], ȳ the exact mean of the state over the substep, shape (arcs, B).
 
-        Flows given in ``settled``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
+        Flows given in ``imposed_flow``, shape (arcs, B), hold whatever the state; NaN where the flow law does.
         """
-        if self._shortcut is not None and routes is not None and settled is None:
-            moved = self.flow(self._shortcut.mean(stock, routes, rate), routes, rate)
+        if self._shortcut is not None and routes is not None and imposed_flow is None:
+            transfer = self.flow(self._shortcut.mean(stock, routes, rate), routes, rate)
         else:
-            moved = self._mean_flow(stock, routes, rate, settled)
-        moved *= self._substep
+            transfer = self._mean_flow(stock, routes, rate, imposed_flow)
+        transfer *= self._substep
         if self._pulls:
-            np.maximum(moved, 0.0, out=moved)  # the mean of an overdrawn stock may be negative
-        return moved
+            np.maximum(transfer, 0.0, out=transfer)  # the mean of an overdrawn stock may be negative
+        return transfer
 
     def flow(self, masses: Floats, routes: IntervalRoutes | None, rate: Floats) -> Floats:
         """Return the flows at ``masses``, those that are passed on too, shape (arcs, B)."""
         laws = self._laws
         if routes is None:
             return laws.flow(masses, rate)
-        entering = masses.take(laws.driver[self._entering], 0)
-        entering *= rate.take(self._entering, 0)
-        through = laws.routing.throughputs(self._into(entering), routes)
+        inflow = masses.take(laws.driver[self._inflows], 0)
+        inflow *= rate.take(self._inflows, 0)
+        through = laws.routing.throughputs(self._into(inflow), routes)
         flow: Floats = np.concatenate([masses, through]).take(self._driver, 0)
         flow *= rate
         return flow
 
-    def _mean_flow(self, stock: Floats, routes: IntervalRoutes | None, rate: Floats, settled: Floats | None) -> Floats:
+    def _mean_flow(
+        self, stock: Floats, routes: IntervalRoutes | None, rate: Floats, imposed_flow: Floats | None
+    ) -> Floats:
         """Return r∘ȳ[driver], with the flows of all arcs in each term."""
         laws, flow, mean = self._laws, np.empty_like(rate), stock.copy()
         for incidence in (*self._horner, None):
             mean.take(laws.driver, axis=0, out=flow, mode="clip")
             flow *= rate
-            if settled is not None:
-                np.copyto(flow, settled, where=~np.isnan(settled))
+            if imposed_flow is not None:
+                np.copyto(flow, imposed_flow, where=~np.isnan(imposed_flow))
             if routes is not None:
                 laws.routing.pass_on(flow, routes)
             if incidence is not None:

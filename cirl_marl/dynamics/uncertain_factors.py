@@ -31,9 +31,9 @@ class RowFactors:
         """Return a table of shape (rows, 1 or B) times what was drawn."""
         if factors is None or not len(self.rows):
             return table
-        scaled = np.repeat(table, factors.shape[1] // table.shape[1], axis=1)
-        scaled[self.rows] *= factors.take(self._numbers, axis=0)
-        return scaled
+        product = np.repeat(table, factors.shape[1] // table.shape[1], axis=1)
+        product[self.rows] *= factors.take(self._numbers, axis=0)
+        return product
 
 
 class FlowFactors:
@@ -49,7 +49,7 @@ class FlowFactors:
         valves = network.valves if isinstance(network, StagedNetwork) else {}
         rates, flows = numbers_of(network, "arcs", "rate"), numbers_of(network, "arcs", "flow")
         releases, stretches = numbers_of(network, "nodes", "rate"), numbers_of(network, "nodes", "stretch")
-        found: list[tuple[int, int, bool]] = []
+        entries: list[tuple[int, int, bool]] = []
         for k, arc in enumerate(network.arcs):
             if arc.donor in valves:
                 number = stretches.get(valves[arc.donor])
@@ -58,17 +58,17 @@ class FlowFactors:
             else:
                 number = (flows if arc.law is Law.EXOGENOUS else rates).get(arc.id)
             if number is not None:
-                found.append((k, number, arc.donor in valves))
-        self.arcs: Integers = np.array([k for k, _, _ in found], dtype=np.intp)
-        self._numbers: Integers = np.array([number for _, number, _ in found], dtype=np.intp)
-        self._stretched: Integers = np.flatnonzero([inverse for _, _, inverse in found])
+                entries.append((k, number, arc.donor in valves))
+        self.arcs: Integers = np.array([k for k, _, _ in entries], dtype=np.intp)
+        self._numbers: Integers = np.array([number for _, number, _ in entries], dtype=np.intp)
+        self._inverse_rows: Integers = np.flatnonzero([inverse for _, _, inverse in entries])
         ends = [spread.ends for spread in network.uncertain.values()]
-        extremes = [1 / ends[number][0] if inverse else ends[number][1] for _, number, inverse in found]
+        extremes = [1 / ends[number][0] if inverse else ends[number][1] for _, number, inverse in entries]
         self.highest: Floats = np.array(extremes, dtype=float)
 
     def multiply(self, rate: Floats, factors: Floats) -> None:
         """Multiply what was drawn into the rates of arcs, shape (arcs, B), in place."""
         if len(self.arcs):
-            acting = factors.take(self._numbers, axis=0)
-            acting[self._stretched] = 1.0 / acting[self._stretched]
-            rate[self.arcs] *= acting
+            multipliers = factors.take(self._numbers, axis=0)
+            multipliers[self._inverse_rows] = 1.0 / multipliers[self._inverse_rows]
+            rate[self.arcs] *= multipliers

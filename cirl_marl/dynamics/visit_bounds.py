@@ -37,15 +37,15 @@ class _Alike:
     proportions: Annotated[Floats, "of the other arcs in what is left, shape (splits, others, horizon)"]
 
     @classmethod
-    def of(cls, found: Sequence[tuple[int, Split, Integers]]) -> _Alike:
+    def of(cls, members: Sequence[tuple[int, Split, Integers]]) -> _Alike:
         """Stack splits, each with its node and what its arcs enter."""
-        bounds = np.stack([split.bounds for _, split, _ in found])
+        bounds = np.stack([split.bounds for _, split, _ in members])
         return cls(
-            donors=np.array([i for i, _, _ in found], dtype=np.intp),
-            ends=np.stack([ends for _, _, ends in found]),
+            donors=np.array([i for i, _, _ in members], dtype=np.intp),
+            ends=np.stack([ends for _, _, ends in members]),
             low=bounds[:, 0],
             high=bounds[:, 2],
-            proportions=np.stack([split.proportions for _, split, _ in found]),
+            proportions=np.stack([split.proportions for _, split, _ in members]),
         )
 
     def end_values(self, values: Floats) -> Floats:
@@ -54,19 +54,19 @@ class _Alike:
 
     def best_shares(self, values: Floats, step: int) -> Floats:
         """Return the shares that are best for ``values`` in one interval, shape (splits, arcs, n)."""
-        low, high, proportions = (each[:, :, step, None] for each in (self.low, self.high, self.proportions))
-        gains, others = np.split(self.end_values(values), [low.shape[1]], axis=1)
+        low, high, proportions = (table[:, :, step, None] for table in (self.low, self.high, self.proportions))
+        gains, rest_gains = np.split(self.end_values(values), [low.shape[1]], axis=1)
         # what is left to the arcs without control counts as one choice without bounds, of their mean value
-        gains = np.concatenate([gains, (others * proportions).sum(axis=1, keepdims=True)], axis=1)
+        gains = np.concatenate([gains, (rest_gains * proportions).sum(axis=1, keepdims=True)], axis=1)
         room = np.ones_like(gains)
         room[:, :-1] = high - low
         order = np.argsort(-gains, axis=1, kind="stable")
         sorted_room = np.take_along_axis(room, order, axis=1)
         before = np.cumsum(sorted_room, axis=1) - sorted_room
-        taken = np.empty_like(room)
-        left = 1.0 - low.sum(axis=1, keepdims=True)
-        np.put_along_axis(taken, order, np.clip(left - before, 0.0, sorted_room), axis=1)
-        return np.concatenate([low + taken[:, :-1], proportions * taken[:, -1:]], axis=1)
+        allotment = np.empty_like(room)
+        remainder = 1.0 - low.sum(axis=1, keepdims=True)
+        np.put_along_axis(allotment, order, np.clip(remainder - before, 0.0, sorted_room), axis=1)
+        return np.concatenate([low + allotment[:, :-1], proportions * allotment[:, -1:]], axis=1)
 
 
 class VisitBounds:
@@ -80,24 +80,24 @@ class VisitBounds:
         """Compile the splits of ``network`` (``split_fractions.splits``)."""
         stores, self._network = len(network.stores), network
         self._nodes = len(network.nodes) - stores
-        found = [(network.node_index[split.donor] - stores, split) for split in network_splits]
+        node_splits = [(network.node_index[split.donor] - stores, split) for split in network_splits]
         alike: dict[tuple[int, int], list[tuple[int, Split, Integers]]] = {}
-        for i, split in found:
+        for i, split in node_splits:
             if i >= 0:
                 ends = network.recipients[[*split.controlled_arcs, *split.other_arcs]] - stores
                 alike.setdefault((len(split.controlled_arcs), len(split.other_arcs)), []).append((i, split, ends))
-        self._splits = [_Alike.of(each) for each in alike.values()]
-        tables = [table for i, split in found if i >= 0 and (table := split.table).shape[1] > 1]
+        self._splits = [_Alike.of(members) for members in alike.values()]
+        tables = [table for i, split in node_splits if i >= 0 and (table := split.table).shape[1] > 1]
         self.kinds: Sequence[int] = [0]
         if tables:
             self.kinds = np.unique(np.concatenate(tables), axis=1, return_index=True)[1].tolist()
 
     def best(self, values: Floats, step: int) -> Floats:
         """Return max_s Σ_j s_ij V_j of each node i in one interval, V being 0 at stocks; shapes (nodes, n)."""
-        found = np.empty_like(values)
-        for each in self._splits:
-            found[each.donors] = (each.best_shares(values, step) * each.end_values(values)).sum(axis=1)
-        return found
+        best_values = np.empty_like(values)
+        for group in self._splits:
+            best_values[group.donors] = (group.best_shares(values, step) * group.end_values(values)).sum(axis=1)
+        return best_values
 
     def total(self, step: int) -> Floats:
         """Return the most passes in all of mass that enters each node, in one interval, shape (nodes,)."""
@@ -105,9 +105,9 @@ class VisitBounds:
 
         passes = np.ones(self._nodes)
         for _ in range(MOST_ROUNDS):
-            kept = self._among(passes, step)
+            matrix = self._among(passes, step)
             try:
-                better = splu(sparse.eye_array(self._nodes, format="csc") - kept).solve(np.ones(self._nodes))
+                better = splu(sparse.eye_array(self._nodes, format="csc") - matrix).solve(np.ones(self._nodes))
             except RuntimeError:  # singular: so little leaves a loop that nothing is left of it in a sum with 1
                 break
             if (better <= passes * (1 + SLACK / 10)).all():
@@ -127,12 +127,12 @@ class VisitBounds:
 
     def _among(self, values: Floats, step: int) -> sparse.csc_array:
         """Return the shares that are best for ``values``, shape (nodes,), of what goes on to nodes without stock."""
-        rows, columns, shares = (np.concatenate(each) for each in zip(*self._entries(values, step), strict=True))
+        rows, columns, shares = (np.concatenate(parts) for parts in zip(*self._entries(values, step), strict=True))
         on = columns >= 0
         return sparse.csc_array((shares[on], (rows[on], columns[on])), shape=(self._nodes, self._nodes))
 
     def _entries(self, values: Floats, step: int) -> Iterator[tuple[Integers, Integers, Floats]]:
         yield np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), np.empty(0)
-        for each in self._splits:
-            shares = each.best_shares(values[:, None], step)
-            yield np.repeat(each.donors, each.ends.shape[1]), each.ends.ravel(), shares.ravel()
+        for group in self._splits:
+            shares = group.best_shares(values[:, None], step)
+            yield np.repeat(group.donors, group.ends.shape[1]), group.ends.ravel(), shares.ravel()

@@ -28,7 +28,7 @@ Form = Annotated[Literal["published", "sound"], Word("``published`` or ``sound``
 Bools = NDArray[np.bool_]
 
 
-REQUIRED: Any = abstractmethod(lambda: None)
+ABSTRACT: Any = abstractmethod(lambda: None)
 """Stands for an attribute that the class of a model has to state: Python takes it for abstract."""
 
 
@@ -47,9 +47,9 @@ class CompartmentModel(ABC):
     """
 
     __slots__ = ()
-    kind: ClassVar[str] = REQUIRED
-    time_unit: ClassVar[str] = REQUIRED
-    reward_state: ClassVar[RewardState] = REQUIRED
+    kind: ClassVar[str] = ABSTRACT
+    time_unit: ClassVar[str] = ABSTRACT
+    reward_state: ClassVar[RewardState] = ABSTRACT
     input_unit: ClassVar[str | None] = None
     context_names: ClassVar[tuple[str, ...]] = ()
 
@@ -159,7 +159,7 @@ class MeasuringModel(CompartmentModel):
     """A model of which services and observers may read more than states: ``measure_names``, with units, in order."""
 
     __slots__ = ()
-    measure_names: ClassVar[tuple[str, ...]] = REQUIRED
+    measure_names: ClassVar[tuple[str, ...]] = ABSTRACT
 
     @abstractmethod
     def measures(self, state: Floats, inputs: Floats) -> Floats:
@@ -180,9 +180,9 @@ class GoalTask(Task):
     """A task with goals, for ``GoalEnv``: names of observed states besides the goal, of it as it is and should be."""
 
     __slots__ = ()
-    observation_names: ClassVar[tuple[str, ...]] = REQUIRED
-    achieved_names: ClassVar[tuple[str, ...]] = REQUIRED
-    desired_names: ClassVar[tuple[str, ...]] = REQUIRED
+    observation_names: ClassVar[tuple[str, ...]] = ABSTRACT
+    achieved_names: ClassVar[tuple[str, ...]] = ABSTRACT
+    desired_names: ClassVar[tuple[str, ...]] = ABSTRACT
 
     @abstractmethod
     def goal_reward(self, achieved_goal: Floats, desired_goal: Floats) -> Floats:
@@ -193,7 +193,7 @@ class ReleasingModel(CompartmentModel):
     """A model that releases units of its node's stock into batch arcs, of which each of its ``ports`` has one."""
 
     __slots__ = ()
-    ports: ClassVar[tuple[str, ...]] = REQUIRED
+    ports: ClassVar[tuple[str, ...]] = ABSTRACT
 
     @property
     def unit_kg(self) -> float | None:

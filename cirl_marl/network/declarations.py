@@ -51,7 +51,7 @@ def _annotations(record: Any) -> dict[str, Any]:
     return {name: notes[0] for name, notes in metadata.items() if notes}
 
 
-class TimeVarying:
+class TimeDependent:
     """What may stand for a number that is declared to vary: one that changes in time, between two ``extremes``."""
 
     __slots__ = ()
@@ -121,8 +121,8 @@ class Quantity(Declaration):
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
         if self.past:
-            return "" if isinstance(value, TimeVarying) else f"a series, of times and values, got {value!r}"
-        return "" if self.varies and isinstance(value, TimeVarying) else _problem(value, "a number", ())
+            return "" if isinstance(value, TimeDependent) else f"a series, of times and values, got {value!r}"
+        return "" if self.varies and isinstance(value, TimeDependent) else _problem(value, "a number", ())
 
     def bound_problem(self, value: float) -> str:
         """Return what a number out of its bounds must be; nothing if it is within."""
@@ -158,7 +158,7 @@ class Numbers(Declaration):
 
     def problem(self, value: object) -> str:
         """See ``Declared.problem``."""
-        return "" if self.varies and isinstance(value, TimeVarying) else _problem(value, self.form, self.shape)
+        return "" if self.varies and isinstance(value, TimeDependent) else _problem(value, self.form, self.shape)
 
 
 Amount = partial(Numbers, form="a number", shape=(), table_form="amount", varies=True)
@@ -261,7 +261,7 @@ def bound_problems(part_: Any, prefix: str = "") -> Iterator[str]:
         if isinstance(declaration, Word) and value not in declaration.of:
             yield f"{prefix}{unknown(declaration.label or name, value, declaration.of)}"
         elif isinstance(declaration, Quantity) and value is not None:
-            for number in value.extremes if isinstance(value, TimeVarying) else (value,):
+            for number in value.extremes if isinstance(value, TimeDependent) else (value,):
                 if fault := declaration.bound_problem(number):
                     yield f"{prefix}{name} {number} {fault}"
                     break

@@ -189,7 +189,7 @@ class Network(Specification):
     def control_bounds(self) -> Floats:
         """Low, neutral and high value of each control in each interval, shape (3, controls, horizon)."""
         controls = [c.control for id_ in self.controllable for c in [self.compartments[id_]] for _ in range(c.actions)]
-        triples = [(each.low, each.neutral, each.high) for each in controls if each is not None]
+        triples = [(actuator.low, actuator.neutral, actuator.high) for actuator in controls if actuator is not None]
         shape = (3, len(triples), self.episode.horizon)
         if not any(isinstance(value, Series) for triple in triples for value in triple):
             constant = np.array(triples, dtype=float).reshape(-1, 3).T

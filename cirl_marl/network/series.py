@@ -15,7 +15,7 @@ from cirl_marl.network.declarations import (
     Declaration,
     Numbers,
     Quantity,
-    TimeVarying,
+    TimeDependent,
     Word,
     frozen_record,
 )
@@ -23,7 +23,7 @@ from cirl_marl.network.rowsum import Floats
 
 
 @frozen_record
-class Series(CheckedRecord, TimeVarying):
+class Series(CheckedRecord, TimeDependent):
     """A number that changes in time; within a control interval its mean over the interval holds."""
 
     times: Annotated[
@@ -52,7 +52,7 @@ class Series(CheckedRecord, TimeVarying):
         low, high = min(self.values), max(self.values)
         if self.factor is None:
             return low, high
-        corners = [end * other for end in (low, high) for other in self.factor.extremes]
+        corners = [end * bound for end in (low, high) for bound in self.factor.extremes]
         return min(corners), max(corners)
 
     def __format__(self, spec: str) -> str:

@@ -64,12 +64,12 @@ class Split:
             leaves: which arcs, the controlled ones first, shape (arcs, intervals).
             steps: the intervals.
         """
-        out, others = leaves[: len(self.controlled_arcs)], leaves[len(self.controlled_arcs) :]
+        out, free = leaves[: len(self.controlled_arcs)], leaves[len(self.controlled_arcs) :]
         low, _, high = self.bounds[:, :, steps]
         certain = np.where(out, low, 0.0).sum(axis=0)
         # the arcs that stay take their highest shares first
         room = np.maximum(0.0, 1.0 - certain - np.where(out, 0.0, high).sum(axis=0))
-        least: Floats = certain + room * np.where(others, self.proportions[:, steps], 0.0).sum(axis=0)
+        least: Floats = certain + room * np.where(free, self.proportions[:, steps], 0.0).sum(axis=0)
         return least
 
     def problems(self) -> Iterator[str]:
@@ -127,11 +127,11 @@ def splits(network: Specification) -> list[Split]:
             sides: list[list[Any]] = [[getattr(c, side) for c in controls] for side in ("low", "neutral", "high")]
             shares: list[Any] = [np.nan if share is None else share for _, share in free]
             values = [*(value for side in sides for value in side), *shares]
-            columns, bounds, given = 1, sides, shares
+            columns, bounds, numbers = 1, sides, shares
             if any(isinstance(value, Series) for value in values):
                 columns = horizon
                 bounds = [list(map(network.interval_means, side)) for side in sides]
-                given = [network.interval_means(share) for share in shares]
+                numbers = [network.interval_means(share) for share in shares]
             divisions.append(
                 Split(
                     donor=node.id,
@@ -141,7 +141,7 @@ def splits(network: Specification) -> list[Split]:
                         np.array(bounds, dtype=float).reshape(3, -1, columns), (3, len(controls), horizon)
                     ),
                     stated_shares=np.broadcast_to(
-                        np.array(given, dtype=float).reshape(-1, columns), (len(free), horizon)
+                        np.array(numbers, dtype=float).reshape(-1, columns), (len(free), horizon)
                     ),
                 )
             )

@@ -58,7 +58,7 @@ def refuse_links(folder: Path) -> None:
 @contextmanager
 def publish_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder; its files move to ``folder`` if all goes well, and are forgotten if not."""
-    made = not folder.exists()
+    is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(dir=folder, prefix=".partial-"))
     try:
@@ -67,7 +67,7 @@ def publish_folder(folder: Path) -> Iterator[Path]:
             os.replace(file, folder / file.name)
     finally:
         shutil.rmtree(partial)
-        if made and not any(folder.iterdir()):
+        if is_new and not any(folder.iterdir()):
             folder.rmdir()
 
 

@@ -14,8 +14,8 @@ PACKAGES = (
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, the platform and every package that bears on a result."""
-    found = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
-    return found | {package: metadata.version(package) for package in PACKAGES}
+    packages = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
+    return packages | {package: metadata.version(package) for package in PACKAGES}
 
 
 def processor() -> str:

@@ -21,7 +21,7 @@ from cirl_marl.drawing.folding import fold_copies as folded_network
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats
 from cirl_marl.network.calendar import labels
-from cirl_marl.network.declarations import TimeVarying
+from cirl_marl.network.declarations import TimeDependent
 from cirl_marl.network.elements import Law, Service
 from cirl_marl.optimum import gap
 from cirl_marl.report.decisions import decisions_table, save_decisions, savings_table, settings
@@ -140,7 +140,7 @@ def _service(network: Network, service: Service) -> tuple[str, ...]:
 
 def _value(value: object) -> str:
     """Write a number, or the ends of one that changes in time."""
-    if not isinstance(value, TimeVarying):
+    if not isinstance(value, TimeDependent):
         return f"{value:g}"
     low, high = value.extremes
     return f"{low:.5g} … {high:.5g} in time"

@@ -32,15 +32,19 @@ class Engine(ABC):
         interval: time of a step, s.
     """
 
-    def __init__(self, env: Any, shown: Sequence[str]) -> None:
+    def __init__(self, env: Any, visible_rows: Sequence[str]) -> None:
         """Take an environment of gymnasium or gymnasium-robotics."""
         self.env = env
         self.interval = float(env.dt)
-        self.shown = tuple(shown)
-        self._welded = _welded_bodies(env.model)
+        self.visible_rows = tuple(visible_rows)
+        self._mocap_bodies = _welded_bodies(env.model)
         self._size = mujoco.mj_stateSize(env.model, STATE)
-        pose = [f"weld{i}_{part}" for i in range(len(self._welded)) for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
-        self.names = (*self.shown, *pose, *(f"mujoco_{i}" for i in range(self._size)))
+        pose = [
+            f"weld{i}_{part}"
+            for i in range(len(self._mocap_bodies))
+            for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
+        ]
+        self.names = (*self.visible_rows, *pose, *(f"mujoco_{i}" for i in range(self._size)))
 
     def start(self, stream: np.random.Generator) -> Floats:
         """Reset as the library does, with its draws from ``stream``; return the column, shape (rows,)."""
@@ -61,15 +65,15 @@ class Engine(ABC):
         """Put the simulator into the state of a column."""
         model, data = self.env.model, self.env.data
         mujoco.mj_setState(model, data, np.ascontiguousarray(column[-self._size :]), STATE)
-        poses = column[len(self.shown) : -self._size].reshape(-1, 7)
-        data.xpos[self._welded], data.xquat[self._welded] = poses[:, :3], poses[:, 3:]
+        poses = column[len(self.visible_rows) : -self._size].reshape(-1, 7)
+        data.xpos[self._mocap_bodies], data.xquat[self._mocap_bodies] = poses[:, :3], poses[:, 3:]
         self._load_task(column)
 
     def _read(self) -> Floats:
         data = self.env.data
         physics = np.empty(self._size)
         mujoco.mj_getState(self.env.model, data, physics, STATE)
-        poses = np.concatenate([data.xpos[self._welded], data.xquat[self._welded]], axis=1)
+        poses = np.concatenate([data.xpos[self._mocap_bodies], data.xquat[self._mocap_bodies]], axis=1)
         return np.concatenate([self._show(), poses.ravel(), physics])
 
     def _load_task(self, column: Floats) -> None:
@@ -90,13 +94,13 @@ E = TypeVar("E", bound=Engine)
 
 def one_per_thread(make: Callable[[], E]) -> Callable[[], E]:
     """Return a function that gives each thread an engine of its own; MuJoCo lets others run while it steps."""
-    kept = threading.local()
+    of_thread = threading.local()
 
     def engine() -> E:
-        if not hasattr(kept, "engine"):
-            kept.engine = make()
-        found: E = kept.engine
-        return found
+        if not hasattr(of_thread, "engine"):
+            of_thread.engine = make()
+        engine_: E = of_thread.engine
+        return engine_
 
     return engine
 
@@ -130,8 +134,8 @@ class Robot(DiscreteTimeModel):
 
 def _welded_bodies(model: Any) -> list[int]:
     """Return the bodies that are welded to a mocap body."""
-    welded = []
+    bodies = []
     for kind, first, second in zip(model.eq_type, model.eq_obj1id, model.eq_obj2id, strict=True):
         if kind == mujoco.mjtEq.mjEQ_WELD:
-            welded.append(int(second if model.body_mocapid[first] != -1 else first))
-    return welded
+            bodies.append(int(second if model.body_mocapid[first] != -1 else first))
+    return bodies

@@ -23,7 +23,7 @@ within 0.15 m of (1.34, 0.75), as near as it can be without an object in it at t
 
 
 def _names(*groups: tuple[str, str]) -> tuple[str, ...]:
-    return tuple(f"{what}_{axis}" for what, axes in groups for axis in axes)
+    return tuple(f"{quantity}_{axis}" for quantity, axes in groups for axis in axes)
 
 
 OBSERVATION = _names(
@@ -32,7 +32,7 @@ OBSERVATION = _names(
     *((what, "xyz") for what in ("object_angle", "object_slip", "object_spin", "grip_move")),
     ("finger_move", "rl"),
 )
-ACHIEVED, DESIRED = _names(("achieved", "xyz")), _names(("desired", "xyz"))
+ACHIEVED_GOAL, DESIRED_GOAL = _names(("achieved", "xyz")), _names(("desired", "xyz"))
 
 
 class WasteSorting(MujocoFetchPickAndPlaceEnv):  # type: ignore[misc]
@@ -47,7 +47,7 @@ class FetchEngine(Engine):
 
     def __init__(self) -> None:
         """Make the environment."""
-        super().__init__(WasteSorting(reward_type="sparse"), (*OBSERVATION, *ACHIEVED, *DESIRED))
+        super().__init__(WasteSorting(reward_type="sparse"), (*OBSERVATION, *ACHIEVED_GOAL, *DESIRED_GOAL))
 
     def _load_task(self, column: Floats) -> None:
         self.env.goal = column[len(OBSERVATION) + 3 : len(OBSERVATION) + 6].copy()
@@ -59,8 +59,8 @@ class FetchEngine(Engine):
         self.env._step_callback()
 
     def _show(self) -> Floats:
-        shown: dict[str, Any] = self.env._get_obs()
-        return np.concatenate([shown["observation"], shown["achieved_goal"], shown["desired_goal"]])
+        observation: dict[str, Any] = self.env._get_obs()
+        return np.concatenate([observation["observation"], observation["achieved_goal"], observation["desired_goal"]])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,20 +78,20 @@ class Fetch(Robot, GoalTask):
     input_names: ClassVar[tuple[str, ...]] = ("move_x", "move_y", "move_z", "fingers")
     engine = staticmethod(one_per_thread(FetchEngine))
     interval: ClassVar[float] = 0.04
-    observed_states: ClassVar[tuple[str, ...]] = (*OBSERVATION, *ACHIEVED, *DESIRED)
+    observed_states: ClassVar[tuple[str, ...]] = (*OBSERVATION, *ACHIEVED_GOAL, *DESIRED_GOAL)
     observation_names: ClassVar[tuple[str, ...]] = OBSERVATION
-    achieved_names: ClassVar[tuple[str, ...]] = ACHIEVED
-    desired_names: ClassVar[tuple[str, ...]] = DESIRED
+    achieved_names: ClassVar[tuple[str, ...]] = ACHIEVED_GOAL
+    desired_names: ClassVar[tuple[str, ...]] = DESIRED_GOAL
 
-    def goal_reward(self, achieved: Floats, desired: Floats) -> Floats:
+    def goal_reward(self, achieved_goal: Floats, desired_goal: Floats) -> Floats:
         """Return the sparse reward for goals of shape (..., 3)."""
-        reward: Floats = self.engine().env.compute_reward(achieved, desired, {})
+        reward: Floats = self.engine().env.compute_reward(achieved_goal, desired_goal, {})
         return reward
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return 0 where the object is at the target, else −1, shape (B,)."""
-        achieved, desired = self._goals(state)
-        return self.goal_reward(achieved, desired).astype(np.float64)
+        achieved_goal, desired_goal = self._goals(state)
+        return self.goal_reward(achieved_goal, desired_goal).astype(np.float64)
 
     def success(self, state: Floats, inputs: Floats) -> NDArray[np.bool_]:
         """Return whether the object is at the target, shape (B,)."""

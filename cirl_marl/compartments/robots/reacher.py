@@ -13,7 +13,7 @@ from cirl_marl.network.compartment_model import Task
 from cirl_marl.network.declarations import Quantity, frozen_record
 from cirl_marl.network.rowsum import Floats
 
-OBSERVED = tuple(
+OBSERVATION_ROWS = tuple(
     "cos_0 cos_1 sin_0 sin_1 target_x_m target_y_m speed_0_rad_s speed_1_rad_s to_target_x_m to_target_y_m".split()
 )
 
@@ -23,7 +23,7 @@ class ReacherEngine(Engine):
 
     def __init__(self) -> None:
         """Make the environment."""
-        super().__init__(gymnasium.make("Reacher-v5").unwrapped, (*OBSERVED, "distance_m"))
+        super().__init__(gymnasium.make("Reacher-v5").unwrapped, (*OBSERVATION_ROWS, "distance_m"))
 
     def _act(self, inputs: Floats) -> None:
         self.env.do_simulation(inputs, self.env.frame_skip)
@@ -51,17 +51,17 @@ class Reacher(Robot, Task):
     input_names: ClassVar[tuple[str, ...]] = ("torque_0_n_m", "torque_1_n_m")
     engine = staticmethod(one_per_thread(ReacherEngine))
     interval: ClassVar[float] = 0.02
-    observed_states: ClassVar[tuple[str, ...]] = OBSERVED
+    observed_states: ClassVar[tuple[str, ...]] = OBSERVATION_ROWS
 
     reach_m: Annotated[float, Quantity("distance that counts as a success [published]")] = 0.04
     torque_n_m: Annotated[float, Quantity("torque below which the arm counts as at rest [published]")] = 0.005
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return −|tip − target| − |inputs|², shape (B,)."""
-        reward: Floats = -state[len(OBSERVED)] - np.square(inputs).sum(axis=0)
+        reward: Floats = -state[len(OBSERVATION_ROWS)] - np.square(inputs).sum(axis=0)
         return reward
 
     def success(self, state: Floats, inputs: Floats) -> NDArray[np.bool_]:
         """Return whether the tip is at the target and the joints are at rest, shape (B,)."""
-        near: NDArray[np.bool_] = state[len(OBSERVED)] < self.reach_m
+        near: NDArray[np.bool_] = state[len(OBSERVATION_ROWS)] < self.reach_m
         return near & (np.abs(inputs) < self.torque_n_m).all(axis=0)

@@ -16,7 +16,7 @@ from cirl_marl.network.rowsum import Floats
 
 ROBOTS: dict[str, Fetch | Reacher] = {"fetch": Fetch(), "reacher": Reacher()}
 BOOKS = ("busy", "attempt_step", "done_in_batch", "sorted_now", "missed_now", "complete_now", "key", "attempt")
-BUSY, STEP, DONE, SORTED, MISSED, COMPLETE, KEY, ATTEMPT = range(len(BOOKS))
+BUSY, STEP, DONE, SORTED_ITEMS, MISSED_ITEMS, COMPLETE, KEY, ATTEMPT = range(len(BOOKS))
 
 
 @frozen_record
@@ -99,30 +99,30 @@ class SortingStation(DiscreteTimeModel, ReleasingModel):
         after = state.copy()
         books = after[: len(BOOKS)]
         busy = books[BUSY] > 0
-        presented = ~busy & (stock_kg >= self.item_kg * (1.0 - 1e-9))
-        books[[SORTED, MISSED, COMPLETE]] = 0.0
-        for i in np.flatnonzero(presented):
+        new_item = ~busy & (stock_kg >= self.item_kg * (1.0 - 1e-9))
+        books[[SORTED_ITEMS, MISSED_ITEMS, COMPLETE]] = 0.0
+        for i in np.flatnonzero(new_item):
             stream = np.random.default_rng([int(books[KEY, i]), int(books[ATTEMPT, i])])
             after[len(BOOKS) :, i] = self.robot.start(stream)
-        working = np.flatnonzero(busy)
-        moved = self.robot.advance(state[len(BOOKS) :, working], inputs[:, working])
-        after[len(BOOKS) :, working] = moved
-        succeeded = np.zeros_like(busy)
-        succeeded[working] = self.robot.success(moved, inputs[:, working])
+        columns = np.flatnonzero(busy)
+        robot_state = self.robot.advance(state[len(BOOKS) :, columns], inputs[:, columns])
+        after[len(BOOKS) :, columns] = robot_state
+        is_success = np.zeros_like(busy)
+        is_success[columns] = self.robot.success(robot_state, inputs[:, columns])
         books[STEP] = np.where(busy, books[STEP] + 1.0, 0.0)
-        missed = busy & ~succeeded & (books[STEP] >= self.attempt_steps)
-        ended = succeeded | missed
-        done = books[DONE] + ended
-        complete = ended & (done >= self.items_per_batch)
-        books[SORTED], books[MISSED], books[COMPLETE] = succeeded, missed, complete
+        is_missed = busy & ~is_success & (books[STEP] >= self.attempt_steps)
+        is_over = is_success | is_missed
+        done = books[DONE] + is_over
+        complete = is_over & (done >= self.items_per_batch)
+        books[SORTED_ITEMS], books[MISSED_ITEMS], books[COMPLETE] = is_success, is_missed, complete
         books[DONE] = np.where(complete, 0.0, done)
-        books[ATTEMPT] += presented
-        books[BUSY] = (busy & ~ended) | presented
+        books[ATTEMPT] += new_item
+        books[BUSY] = (busy & ~is_over) | new_item
         return after
 
     def released_units(self, state: Floats) -> Floats:
         """Return the items sorted and missed in the last interval, shape (2, B)."""
-        return state[[SORTED, MISSED]]
+        return state[[SORTED_ITEMS, MISSED_ITEMS]]
 
     def complete(self, state: Floats) -> NDArray[np.bool_]:
         """Return where the last interval completed a batch, shape (B,)."""
@@ -131,5 +131,5 @@ class SortingStation(DiscreteTimeModel, ReleasingModel):
 
     def reward(self, state: Floats, inputs: Floats) -> Floats:
         """Return the robot's reward where it worked in the last interval, else 0, shape (B,)."""
-        worked = state[STEP] > 0
-        return np.where(worked, self.robot.reward(state[len(BOOKS) :], inputs), 0.0)
+        was_busy = state[STEP] > 0
+        return np.where(was_busy, self.robot.reward(state[len(BOOKS) :], inputs), 0.0)
