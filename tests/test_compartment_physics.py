@@ -422,7 +422,7 @@ class TestBalances:
         """At the reference inventories and temperature the rates of the bed are the published ones."""
         state = np.array([2400.0, 150.0, 300.0, 1.0, 1.0, 900.0])[:, None]
         found, usual = Incinerator().flows(state), PUBLISHED_FLOWS
-        for name in ("feed", "ash", "consumed", "char_made", "char_burnt", "char_out"):
+        for name in ("feed", "ash", "waste_consumed", "char_made", "char_burnt", "char_out"):
             np.testing.assert_allclose(getattr(found, name), getattr(usual, name), rtol=1e-14, err_msg=name)
 
     def test_incinerator_conserves_enthalpy(self) -> None:

@@ -37,7 +37,7 @@ def test_time_window_is_twice_the_mean_of_the_stages() -> None:
             staged_circularity(at, mass=7.0, success=success, departure=0.0, truck_arrival=trucked, use_end=used),
             np.diff(edges),
         )
-        times = {"use": use, "sorting": sorting, "truck": truck, "incineration": incineration}
+        times = {"use": use, "sorting_time": sorting, "truck": truck, "incineration": incineration}
         expected = 2.0 * 0.3 * mean / edges[-1]
         assert time_window_circularity([7.0], [0.3], success=success, **times) == pytest.approx(expected, rel=1e-12)
 
@@ -51,7 +51,7 @@ def test_time_window_is_twice_the_mean_of_the_stages() -> None:
         ({"success": np.nan}, "must be a percentage"),
         ({"truck": 5.1}, r"truck 5\.1"),
         ({"use": 0.0, "truck": 0.0}, r"use 0\.0"),
-        ({"sorting": -1.0}, r"sorting -1\.0"),
+        ({"sorting_time": -1.0}, r"sorting -1\.0"),
         ({"incineration": np.nan}, "incineration nan"),
         ({"use": np.inf}, "use inf"),
     ],
@@ -59,7 +59,7 @@ def test_time_window_is_twice_the_mean_of_the_stages() -> None:
 def test_times_without_meaning_are_refused(changes: dict[str, Any], message: str) -> None:
     """Each by name and value, also what is no number."""
     usual: dict[str, Any] = {"masses": [1.0], "criticality": [0.5], "success": 50.0}
-    usual |= {"use": 5.0, "sorting": 1.0, "truck": 2.0, "incineration": 1.0}
+    usual |= {"use": 5.0, "sorting_time": 1.0, "truck": 2.0, "incineration": 1.0}
     assert time_window_circularity(**usual) < 0.0
     with pytest.raises(CirlError, match=message):
         time_window_circularity(**(usual | changes))

@@ -123,16 +123,16 @@ class Incinerator(ContinuousModel, OutflowModel):
         faster = np.exp(self.activation_k * inverse)
         of_waste, of_char = waste / self.waste_reference_kg, char / self.char_reference_kg
         usual = PUBLISHED_FLOWS
-        consumed, char_burnt = usual.waste_consumed * faster * of_waste, usual.char_burnt * faster * of_char
-        char_made = usual.char_made / usual.waste_consumed * consumed
+        consumption, char_burnt = usual.waste_consumed * faster * of_waste, usual.char_burnt * faster * of_char
+        char_made = usual.char_made / usual.waste_consumed * consumption
         return Flows(
             feed=feed,
             ash=usual.ash * of_waste,
-            waste_consumed=consumed,
+            waste_consumed=consumption,
             char_made=char_made,
             char_burnt=char_burnt,
             char_out=usual.char_out * of_char,
-            gas_made=consumed - char_made + char_burnt,
+            gas_made=consumption - char_made + char_burnt,
             to_freeboard=bed_gas / self.gas_residence_min,
             flue=freeboard_gas / self.gas_residence_min,
         )

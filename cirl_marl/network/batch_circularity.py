@@ -35,7 +35,7 @@ def staged_circularity(
 
     References: Zocco, Corti, Malvezzi, CiRL (arXiv 2505.21536), network N_s.
 
-    >>> staged_circularity([0.0, 1.0, 5.0, 9.0], mass=10, success=80, left=0.5, trucked=4, used=8)
+    >>> staged_circularity([0.0, 1.0, 5.0, 9.0], mass=10, success=80, departure=0.5, truck_arrival=4, use_end=8)
     array([ -0., -10., -12., -20.])
     """
     _check_percentage(success)
@@ -78,7 +78,7 @@ def time_window_circularity(
     References: released code of CIRO7.2 (``compute_lambda.py``), by Zocco et al.
 
     >>> day, month = 86_400.0, 2_592_000.0
-    >>> times = {"use": month, "sorting": day, "truck": 3_600.0, "incineration": day}
+    >>> times = {"use": month, "sorting_time": day, "truck": 3_600.0, "incineration": day}
     >>> round(time_window_circularity([5, 2], [0.1, 0.95], success=0, **times), 3)
     -7.197
     """

@@ -42,7 +42,7 @@ def year(moment: YearOrDate) -> float:
 def elapsed_time(moment: YearOrDate, start: YearOrDate, unit: str) -> float:
     """Return the time from ``start`` to ``moment``, in ``unit``; negative if it lies before.
 
-    >>> elapsed(2001.5, 2000, "year"), elapsed(date(2020, 3, 1), 2020, "day")
+    >>> elapsed_time(2001.5, 2000, "year"), elapsed_time(date(2020, 3, 1), 2020, "day")
     (1.5, 60.0)
     """
     if isinstance(moment, date) and not in_years(unit):
