@@ -111,10 +111,8 @@ def _departures(network: Network) -> Iterator[str]:
             if round(time / interval) >= horizon:
                 yield f"{at}: {end}, so that it never leaves"
             if batch_kg is not None and not is_whole(mass * factor(network.mass_unit, "kg") / batch_kg):
-                batch_size = (
-                    f"batches of {batch_kg:g} kg, as '{recipient.id}' makes them, so that a part of it waits there"
-                )
-                yield f"{at}: {mass:g} {network.mass_unit} are no whole number of {batch_size}"
+                sizes = f"batches of {batch_kg:g} kg, as '{recipient.id}' makes them, so that a part of it waits there"
+                yield f"{at}: {mass:g} {network.mass_unit} are no whole number of {sizes}"
 
 
 def _coarse(network: Network) -> Iterator[str]:
@@ -134,10 +132,8 @@ def _coarse(network: Network) -> Iterator[str]:
     apart = np.abs(trajectories[0] - trajectories[1]).max(axis=0) / size
     if apart[worst := int(apart.argmax())] > COARSE:
         name = MultiAgentVectorEnv(network, num_envs=1).state_names[worst]
-        difference = (
-            f"neutral control gives another {name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
-        )
-        yield f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, {difference}"
+        change = f"neutral control gives another {name}, by {apart[worst]:.0%} of its largest value; take a shorter one"
+        yield f"episode.solver_step {step:g} {network.time_unit} is long: with half of it, {change}"
 
 
 def _lives(network: Network) -> Iterator[str]:
@@ -158,20 +154,16 @@ def _states(network: Network, action: float | None, intervals: int) -> Floats:
     env.reset(seed=0)
     controls = env.dynamics.neutral.copy()
     if action is not None:
-        rows_of_agents = [
-            row for agent in env.agents for row in range(*network.control_rows[agent].indices(len(controls)))
-        ]
-        controls[rows_of_agents] = (env.dynamics.control_low if action < 0 else env.dynamics.control_high)[
-            rows_of_agents
-        ]
-    state, rows = env.physical, []
+        rows = [row for agent in env.agents for row in range(len(controls))[network.control_rows[agent]]]
+        controls[rows] = (env.dynamics.control_low if action < 0 else env.dynamics.control_high)[rows]
+    state, trajectory = env.physical, []
     with np.errstate(all="ignore"):
         for step in range(min(network.episode.horizon, intervals)):
             after = env.dynamics.advance(state.stock, state.inner, controls[:, [step]], np.array([step]))
             state = replace(state, stock=after.stock, inner=after.inner)
             whole = env.rows.start_of(after.stock, after.inner)
-            rows.append(np.concatenate([whole[:, 0], after.stock[env.rows.batches, 0]]))
-    return np.array(rows)
+            trajectory.append(np.concatenate([whole[:, 0], after.stock[env.rows.batches, 0]]))
+    return np.array(trajectory)
 
 
 def _free(network: Network) -> Iterator[str]:
@@ -195,15 +187,11 @@ def _short_flows(network: Network) -> Iterator[str]:
     recipients = {arc.recipient for arc in network.arcs}
     sources = {id_ for arc, donor in scheduled_donors.items() if donor not in recipients for id_ in (arc, donor)}
     highest = Constant({agent: 1.0 for agent in network.agents if agent in sources and _scales(network, agent)})
-    env, reported = (
-        MultiAgentVectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS)),
-        set[str](),
-    )
+    env = MultiAgentVectorEnv(network, num_envs=1, horizon=min(network.episode.horizon, INTERVALS))
+    reported: set[str] = set()
     origin = episode_start(env)
-    for control, controller, looked_at in (
-        ("neutral", Neutral(), set(scheduled_donors)),
-        ("the highest", highest, sources),
-    ):
+    checks = (("neutral", Neutral(), set(scheduled_donors)), ("the highest", highest, sources))
+    for control, controller, looked_at in checks:
         try:
             run = rollout(env, controller, seed=origin.seed, start=origin.initial_state)
         except CirlError as error:

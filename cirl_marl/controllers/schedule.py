@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from cirl_marl.controllers.basic import Arrays, Controller, Neutral
+from cirl_marl.controllers.basic import Controller, Neutral
 from cirl_marl.controllers.outcome import outcome_lines
 from cirl_marl.controllers.rollout import EpisodeStart, Rollout, episode_start, interval_ends, rollout
-from cirl_marl.environments.actuators import Actuators
 from cirl_marl.environments.vector import MultiAgentVectorEnv
 from cirl_marl.errors import CirlError
 from cirl_marl.network import Floats, Network
@@ -61,23 +60,6 @@ class Schedule:
         write_atomically(path, lambda partial: write_table(partial, header, list(rows)))
 
 
-@dataclass
-class _ActionRecorder(Controller):
-    """A controller whose actions are kept."""
-
-    controller: Controller
-    env: MultiAgentVectorEnv
-    actions: list[Floats] = field(default_factory=list)
-
-    def start(self, env: MultiAgentVectorEnv, seed: int) -> None:
-        self.controller.start(env, seed)
-
-    def act(self, observations: Arrays) -> Arrays:
-        actions = self.controller.act(observations)
-        self.actions.append(self.env.stack(actions)[:, 0])
-        return actions
-
-
 def schedule(
     env: MultiAgentVectorEnv,
     controller: Controller,
@@ -98,13 +80,12 @@ def schedule(
     network = env.network
     if env.num_envs != 1 or not env.agents:
         raise CirlError(f"network '{network.name}': a plan is of one copy in which somebody acts")
-    recorder, origin = _ActionRecorder(controller, env), episode_start(env, seed)
+    origin = episode_start(env, seed)
     origin.reset(env)
     start = env.rows.stocks(env.physical.stock)[:, 0].copy()
     usual = rollout(env, Neutral(), seed=origin.seed, start=origin.initial_state)
-    run = rollout(env, recorder, seed=origin.seed, start=origin.initial_state, progress=progress)
-    actuators = Actuators(env.network, env.agents, len(recorder.actions))
-    values = actuators.controls(np.array(recorder.actions).T, np.arange(len(recorder.actions)))[actuators.control_rows]
+    run = rollout(env, controller, seed=origin.seed, start=origin.initial_state, progress=progress)
+    values = run.controls[:, np.r_[tuple(network.control_rows[agent] for agent in env.agents)]].T
     ends = interval_ends(network)
     columns = [
         (f"from ({network.time_unit})", ends - network.episode.control_interval),
