@@ -20,7 +20,7 @@ from cirl_marl.learners.views import View, unseen_state
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """A model, its normaliser, None if it sees things as they are, and its view of the environment."""
+    """A model, its normaliser, None if observations are taken as they are, and its view of the environment."""
 
     model: BaseAlgorithm
     normaliser: VecNormalize | None
@@ -28,7 +28,7 @@ class Policy:
 
 
 class Policies(Controller):
-    """Every policy acts deterministically; normalisers are not changed, and remember nothing of what they see."""
+    """Trained policies as a controller: all act deterministically, and the moments of normalisers stay as they are."""
 
     def __init__(self, policies: Mapping[str, Policy]) -> None:
         """``policies`` are those of the learners, by name; together they act for every agent once."""
@@ -91,7 +91,7 @@ class DifferentiablePolicy(torch.nn.Module):
 
     @property
     def remembers(self) -> bool:
-        """Whether it acts on what it remembers, too."""
+        """Whether it is recurrent."""
         return isinstance(self._policy, RecurrentActorCriticPolicy)
 
     def forward(self, rows: torch.Tensor, *memory: torch.Tensor) -> torch.Tensor:

@@ -64,7 +64,7 @@ def _begin_from(run: RunDirectory, name: str, learner: Learner, env: MultiAgentV
 
 
 def begin_again(folder: Path, learner: Learner) -> None:
-    """Give a fresh ``learner`` what it had from another run, as a checkpoint of its own keeps it."""
+    """Give a fresh ``learner`` the start that a checkpoint of its own run holds."""
     learner.take(folder)
     if learner.normaliser is not None and learner.normaliser.norm_obs:
         freeze_statistics(learner.normaliser)

@@ -23,16 +23,16 @@ class StackedRollout:
     """T steps of B rows of N learners; shapes are (N, B, T), with entries last where there are some.
 
     Attributes:
-        seen: what was seen, normalised.
+        observations: normalised.
         actions: not clipped.
         rewards: as normalisers scale them.
         log_probabilities: of the actions.
         starts: 1 where an episode began.
-        values: what the critic expected.
-        advantages: how much better it went.
-        returns: both together.
-        cut: steps after which time was up though more is expected to come, in which rows, shape (N, B), and what was
-            seen last, shape (N, B, entries).
+        values: of the critic.
+        advantages: generalised advantage estimates.
+        returns: values plus advantages, the targets of the critic.
+        cut: truncations: the step, the rows, shape (N, B), and the last observations, shape (N, B, entries), whose
+            value is added to the reward.
     """
 
     observations: Tensor
@@ -178,7 +178,7 @@ class Update:
     """One update of all learners by their rollouts; ``acts`` is 1 where a learner has an entry of its action."""
 
     def __init__(self, weights: Weights, rules: Rules, rollout: StackedRollout, acts: Tensor, local: int) -> None:
-        """``local`` is the number of columns of what is seen at which actors look."""
+        """``local`` is the number of columns of the observations at which actors look."""
         self._weights, self._rules, self._rollout = weights, rules, rollout
         self._acts, self._local = acts, local
         self._sums, self._count = np.zeros((len(acts), len(FIGURES))), 0
@@ -255,7 +255,7 @@ class RolloutStack(Stack):
     """PPO or A2C learners."""
 
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
-        """Take over what the learners know."""
+        """Take over parameters, optimisers, counters and streams of the learners."""
         super().__init__(members, device)
         self._models = [_stackable(member) for member in members]
         first = self._models[0]
@@ -337,7 +337,7 @@ class RolloutStack(Stack):
         return noise.to(self._device)
 
     def _values(self, observations: Tensor) -> Tensor:
-        """Return the critics' values, (learners, …), of what is seen, (learners, …, entries), a piece at a time."""
+        """Return the critics' values, (learners, …), of observations, (learners, …, entries), a piece at a time."""
         critic, flat = self._weights.critic, observations.reshape(len(self.members), -1, self._inputs.entries)
         values = torch.empty(flat.shape[:2], device=self._device)
         for learners in pieces(len(self.members), min(AT_ONCE, flat.shape[1]) * critic.width, self._device):
@@ -347,7 +347,7 @@ class RolloutStack(Stack):
         return values.view(observations.shape[:-1])
 
     def _log(self, update: Update) -> None:
-        """Write what Stable-Baselines3 writes of an update, for each learner that is kept."""
+        """Log the figures of an update that Stable-Baselines3 logs, for each learner with a logger."""
         if not any(model.logger.output_formats for model in self._models):
             return
         for model, episodes, figures in zip(self._models, self._episodes, update.figures(), strict=True):

@@ -205,7 +205,7 @@ class Weights:
         critic_columns: Sequence[Integers],
         device: torch.device,
     ) -> None:
-        """Take over the parameters and what the optimisers remember.
+        """Take over the parameters and the states of the optimisers.
 
         ``actor_columns`` and ``critic_columns`` are, by learner, the columns of the padded inputs at which its actor
         and its critic look.
@@ -236,7 +236,7 @@ class Weights:
         self.gradient.mul_((norm / (norms + 1e-6)).clamp(max=1.0))
 
     def give(self) -> None:
-        """Give each policy its parameters, and its optimiser what it remembers."""
+        """Give each policy its parameters, and its optimiser its state."""
         optimiser_state = self.optimiser.state.get(self.matrix, {})
         rate = self.optimiser.param_groups[0]["lr"]
         for learner, policy in enumerate(self._policies):

@@ -31,7 +31,7 @@ class SearchStack(Stack):
     """
 
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
-        """Take over what the learners know."""
+        """Take over parameters, counters and streams of the learners."""
         super().__init__(members, device)
         self._models = [_ars_model(member) for member in members]
         first = self._models[0]
@@ -110,7 +110,7 @@ class SearchStack(Stack):
         return deltas.to(self._device)
 
     def _returns(self, candidates: Tensor, wait: Callable[[], None]) -> Tensor:
-        """Return what the episodes of each candidate brought each learner, shape (learners, candidates)."""
+        """Return the returns of each learner in the episodes of each candidate, shape (learners, candidates)."""
         at_once = self._copies // self._copies_per_candidate
         parts = [
             self._episodes(candidates[:, first : first + at_once], wait)
@@ -145,7 +145,7 @@ class SearchStack(Stack):
         return outputs.tanh() if self._squashes else outputs
 
     def _log(self, returns: Tensor, spread: Tensor, size: Tensor, rate: float, std: float) -> None:
-        """Write what the algorithm writes of an update, for each learner that is kept."""
+        """Log the figures of an update that the algorithm logs, for each learner with a logger."""
         episodes = self._rows // self._copies * self._copies_per_candidate
         for i, model in enumerate(self._models):
             if model.logger.output_formats:

@@ -1,4 +1,8 @@
-"""Learners of the same settings that run as one: what does not depend on their algorithm."""
+"""Learners of the same settings that run as one, whatever their algorithm: inputs, normalisers, noise.
+
+N learners with B rows each become arrays with N as leading axis, so that one batched operation does the work of N small
+ones. Spaces of unequal lengths are padded with zeros, which weights that are zero multiply.
+"""
 
 from __future__ import annotations
 
@@ -128,7 +132,7 @@ class StackedInputs:
             part[i, :, : rows.shape[1]] = rows
 
     def _normalise(self) -> Tensor:
-        """Return what was entered, side by side."""
+        """Return the normalised parts side by side."""
         normaliser, parts = self._members[0].normaliser, list(self._parts.values())
         if normaliser is not None and normaliser.norm_obs:
             for place, (part, moments) in enumerate(zip(parts, self._moments.values(), strict=True)):
@@ -155,7 +159,7 @@ class Stack(ABC):
     """
 
     def __init__(self, members: Sequence[Learner], device: str = "cpu") -> None:
-        """Take over what all learners have."""
+        """Take over the inputs and the torch streams of the learners."""
         self.members = list(members)
         self._device = torch.device(device)
         self._inputs = StackedInputs(members, self._device)
@@ -198,14 +202,14 @@ class Stack(ABC):
 
     @abstractmethod
     def _deterministic_actions(self, observations: Tensor) -> Tensor:
-        """Return actions without noise, shape (learners, rows, entries), for what is seen."""
+        """Return actions without noise, shape (learners, rows, entries), for observations."""
 
     @abstractmethod
     def _give_models(self) -> None:
         """Bring models up to date."""
 
     def _move(self, actions: Tensor, wait: Callable[[], None]) -> Tensor:
-        """Act while learning; return what is seen then."""
+        """Act while learning; return the next observations."""
         self._inputs.hand_in(actions)
         wait()
         self._steps_done += 1
