@@ -12,9 +12,9 @@ demo: $(VENV)/.runtime  ## train copper_net, compare, open the report (within 5 
 
 check: lint types fast  ## lint, types and the fast tests, in under 2 minutes on 2 cores
 
-test: lint types wheel unit  ## everything that continuous integration needs: what roams over the catalogue is sampled
+test: lint types unit wheel  ## everything that continuous integration needs: what roams over the catalogue is sampled
 
-test-all: lint types wheel every adapters  ## every test with every parameter, and three times the random examples
+test-all: lint types every adapters wheel  ## every test with every parameter, and three times the random examples
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -40,10 +40,9 @@ adapters: $(VENV)/.dev  ## contracts and examples of the adapters, each in an en
 
 wheel: $(VENV)/.dev  ## build the wheel and use it from another folder in a clean environment
 	rm -rf dist build/clean
-	$(BIN)/python -m build --wheel --outdir dist . > /dev/null
+	$(BIN)/python -m build --no-isolation --wheel --outdir dist . > /dev/null
 	$(BIN)/check-wheel-contents dist
-	$(PYTHON) -m venv build/clean
-	build/clean/bin/python -m pip install --disable-pip-version-check --quiet --no-compile -c constraints.txt dist/*.whl
+	$(BIN)/python tests/clean.py dist/*.whl build/clean
 	$(PYTHON) tests/installed.py build/clean
 
 docs: $(VENV)/.docs  ## the documents as a site in build/site; what is broken or stale ends it (some minutes)

@@ -27,7 +27,7 @@ def main(environment: Path) -> None:
         run(cirl, "show", "copper_net")
         run(cirl, "simulate", "carbo_net", "--control", "random", "--html", "page.html")
         run(cirl, "train", "copper_net", "--steps", "6000", "--envs", "32", "--out", "run")
-        run(cirl, "evaluate", "run")
+        run(cirl, "evaluate", "run", "--episodes", "4")
         written = ("copper_net.png", "carbo_net_random.csv", "page.html")
         for name in (*written, "run/evaluation.json", "run/pictures/circularity.png"):
             if not (Path(folder) / name).is_file():
