@@ -289,17 +289,17 @@ class Training:
             for learner in self.learners.values():
                 learner.barrier.folder = self._checkpoint_folder
 
-    def keep(self, how: str) -> None:
-        """Complete the checkpoint for which every learner has written its state; ``how`` is part of its name."""
+    def keep(self, state: str) -> None:
+        """Complete the checkpoint for which every learner has written its state; ``state`` is part of its name."""
         if self.run is None or self._checkpoint_folder is None:
             return
         began = time.perf_counter()
         for learner in self.learners.values():
             learner.write_journal(self._checkpoint_folder)
             learner.barrier.release()
-        state = {"begun": self.first_step, "world": self.world.state_dict(), "best": self.run.status["best"]}
-        write_tree(self._checkpoint_folder, "training", state)
-        self._end_checkpoint(self._checkpoint_folder, how)
+        tree = {"begun": self.first_step, "world": self.world.state_dict(), "best": self.run.status["best"]}
+        write_tree(self._checkpoint_folder, "training", tree)
+        self._end_checkpoint(self._checkpoint_folder, state)
         self._checkpoint_folder, self._due, self._saved_at = None, False, time.monotonic()
         self._checkpoint_seconds += time.perf_counter() - began
         if self._checkpoint_interval is not None:

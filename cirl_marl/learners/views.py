@@ -145,7 +145,7 @@ class SharedPolicy(View):
 
     def rows(self, observations: Arrays) -> NDArray[np.floating]:
         """Return the padded and marked observations, shape (N·B, longest + N)."""
-        rows = self._padded(observations, self._length + len(self.agents))
+        rows = self._pad(observations, self._length + len(self.agents))
         for a in range(len(self.agents)):
             rows[a, :, self._length + a] = 1.0
         return rows.reshape(-1, rows.shape[2])
@@ -158,9 +158,9 @@ class SharedPolicy(View):
     def join(self, actions: Arrays) -> NDArray[np.float32]:
         """Return the padded actions, shape (N·B, longest)."""
         longest = max(self._actions.values())
-        return self._padded(actions, longest).reshape(-1, longest)
+        return self._pad(actions, longest).reshape(-1, longest)
 
-    def _padded(self, arrays: Arrays, length: int) -> NDArray[np.float32]:
+    def _pad(self, arrays: Arrays, length: int) -> NDArray[np.float32]:
         """Return the agents' arrays with zeros after them, shape (N, B, length)."""
         rows = np.zeros((len(self.agents), len(arrays[self.agents[0]]), length), dtype=np.float32)
         for row, agent in zip(rows, self.agents, strict=True):
