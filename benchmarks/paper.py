@@ -145,7 +145,7 @@ def _run_once(results: Results, rows: Sequence[PaperRow], workers: int, episodes
 
         failures = run_jobs([*jobs.values()], results.path / "logs", on="local", workers=workers, watch=watch)
     for failure in failures:
-        say(f"{jobs[failure.name].row}: failed: {failure.said}")
+        say(f"{jobs[failure.name].row}: failed: {failure.message}")
     return [jobs[failure.name].row for failure in failures]
 
 

@@ -132,7 +132,7 @@ def test_a_worker_that_dies_is_named_with_what_it_said(tmp_path: Path) -> None:
     said: list[str] = []
     failures = run_jobs(jobs, tmp_path / "jobs", on="local", workers=2, say=said.append)
     assert said == ["2 at a time on this machine"]
-    found = {each.name: each.said for each in failures}
+    found = {each.name: each.message for each in failures}
     assert found == {"a": "killed by SIGKILL: the pen breaks", "b": "ValueError: paper is out"}
     assert 'raise ValueError("paper is out")' in (tmp_path / "jobs" / "b.log").read_text()
     assert jobs[2].is_done()
@@ -256,7 +256,7 @@ from cirl_marl.jobs import run_jobs
 folder = Path(sys.argv[1])
 failures = run_jobs(written(folder, a="die", b="raise"), folder / "jobs", on="ray", say=print)
 for each in sorted(failures, key=lambda each: each.name):
-    print(f"{each.name}: {each.said.rpartition(': ')[2] if each.name == 'a' else each.said}")
+    print(f"{each.name}: {each.message.rpartition(': ')[2] if each.name == 'a' else each.message}")
 print(run_jobs(written(folder), folder / "jobs", on="ray"), flush=True)
 """
 

@@ -65,7 +65,7 @@ def test_jobs_in_the_queue(tmp_path: Path, fake: Path) -> None:
     words: list[str] = []
     failures = run_jobs(written(tmp_path, a="raise")[:2], jobs, on="slurm", workers=3, say=words.append)
     assert words == ["3 at a time in the queue of Slurm"]
-    assert {failure.name: failure.said for failure in failures} == {"a": "ValueError: paper is out"}
+    assert {failure.name: failure.message for failure in failures} == {"a": "ValueError: paper is out"}
     assert (tmp_path / "b.txt").is_file()
     assert [path.name for path in jobs.glob(".slurm-*")] == [".slurm-abc"]
     assert not (tmp_path / "exploded").exists()
@@ -91,7 +91,7 @@ def test_who_ends_without_being_done_is_noticed(
         (fake / "state").write_text(state)
         (fake / "code").write_text("0")
     failures = run_jobs(written(tmp_path)[:1], tmp_path / "jobs", on="slurm")
-    assert [failure.said for failure in failures] == [f"{said}: it said nothing"]
+    assert [failure.message for failure in failures] == [f"{said}: it said nothing"]
 
 
 @pytest.mark.medium
@@ -113,7 +113,7 @@ def test_what_is_cut_off_goes_on(state: str, tmp_path: Path, fake: Path) -> None
     (fake / "state").write_text(state)
     (fake / "sbatch").write_text("#!/bin/sh\necho 7\n")
     (failure,) = run_jobs([job], tmp_path / "jobs", on="slurm")
-    assert failure.said.startswith(f"came no further in a whole job ({state})")
+    assert failure.message.startswith(f"came no further in a whole job ({state})")
 
 
 def test_work_that_was_exchanged_is_not_read(tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def test_a_real_slurm(node: str, tmp_path: Path) -> None:
     """Failures and deaths are named, and the same jobs are done at last."""
     failures = run_jobs(written(tmp_path, a="die", b="raise"), tmp_path / "jobs", on="slurm", workers=3)
-    said = {failure.name: failure.said for failure in failures}
+    said = {failure.name: failure.message for failure in failures}
     assert said["b"] == "ValueError: paper is out"
     assert "FAILED by signal 9" in said["a"] and said["a"].endswith(": the pen breaks")
     settings = {"timeout_min": "5", "slurm_partition": "all"}
@@ -227,7 +227,7 @@ def test_a_cancelled_job_is_noticed(node: str, tmp_path: Path) -> None:
             subprocess.run(["scancel", "--me"], check=True)
 
     (failure,) = run_jobs(written(tmp_path, a="wait")[:1], tmp_path / "jobs", on="slurm", watch=watch)
-    assert "CANCELLED" in failure.said
+    assert "CANCELLED" in failure.message
 
 
 @pytest.mark.slow
@@ -239,4 +239,4 @@ def test_a_job_at_its_time_limit_goes_on(node: str, tmp_path: Path) -> None:
     began = time.monotonic()
     assert run_jobs([job], tmp_path / "jobs", on="slurm", settings={"timeout_min": "1"}) == []
     assert len(job.file.with_suffix(".begun").read_text().splitlines()) >= 2, time.monotonic() - began
-    assert json.loads(JobFiles(tmp_path / "jobs", "a").told.read_text())["what"] == "done"
+    assert json.loads(JobFiles(tmp_path / "jobs", "a").progress_file.read_text())["what"] == "done"

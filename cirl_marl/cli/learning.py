@@ -238,7 +238,7 @@ def _run_rows(rows: Sequence[PaperRow], results: Results, episodes: int | None, 
 
         failures = run_jobs([*jobs.values()], results.path / "logs", on=on, workers=workers, watch=watch)
     for failure in failures:
-        message = failure.error if isinstance(failure.error, CirlError) else failure.said
+        message = failure.error if isinstance(failure.error, CirlError) else failure.message
         say(f"{jobs[failure.name].row}: failed: {message}")
     return bool(failures)
 

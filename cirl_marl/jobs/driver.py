@@ -31,13 +31,13 @@ class Failure:
     """A job that was not done: its name, in words why, and the exception if it was raised in this process."""
 
     name: str
-    said: str
+    message: str
     log: Path
     error: Exception | None = None
 
     def __str__(self) -> str:
         """Say all of it in a line."""
-        return f"{self.name}: {self.said}" + (f" (log: {self.log})" if self.log.is_file() else "")
+        return f"{self.name}: {self.message}" + (f" (log: {self.log})" if self.log.is_file() else "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ def run_jobs(
     place = place_of(on, folder, workers, settings or {})
     folder.mkdir(parents=True, exist_ok=True)
     if place is not None:
-        say(place.said)
+        say(place.description)
     driver = _Driver(jobs, folder, watch)
     try:
         while driver.goes_on(place):
@@ -143,7 +143,7 @@ class _Driver:
     def goes_on(self, place: Workplace | None) -> bool:
         """Look after those at work, start others, and return whether anything is left to be done."""
         for job, worker in list(self._at_work.values()):
-            if (state := worker.ended()) is not None:
+            if (state := worker.end_state()) is not None:
                 self._take_back(job, state)
         for job in list(self._queue):
             if place is not None and len(self._at_work) >= place.workers:
@@ -168,7 +168,7 @@ class _Driver:
         for _, worker in self._at_work.values():
             worker.stop()
         late = time.monotonic() + PATIENCE
-        while any(worker.ended() is None for _, worker in self._at_work.values()) and time.monotonic() < late:
+        while any(worker.end_state() is None for _, worker in self._at_work.values()) and time.monotonic() < late:
             time.sleep(POLL)
 
     def _take_back(self, job: Job, state: str) -> None:

@@ -24,7 +24,7 @@ EXTRAS = {"ray": "ray"}
 class Worker(Protocol):
     """Somebody who works on a job."""
 
-    def ended(self) -> str | None:
+    def end_state(self) -> str | None:
         """Return None while at work, an empty text after an orderly end, and how it ended if it did otherwise."""
 
     def stop(self) -> None:
@@ -32,10 +32,10 @@ class Worker(Protocol):
 
 
 class Workplace(Protocol):
-    """Where jobs are done. ``workers`` work at a time, and ``said`` tells the user where that is."""
+    """Where jobs are done. ``workers`` work at a time, and ``description`` tells the user where that is."""
 
     workers: int
-    said: str
+    description: str
 
     def start(self, work: Work) -> Worker:
         """Have a job done."""
@@ -58,7 +58,7 @@ class LocalProcess:
         with _one_thread():
             self._process.start()
 
-    def ended(self) -> str | None:
+    def end_state(self) -> str | None:
         """Say how the process ended."""
         code = self._process.exitcode
         if code is None or code == 0:
@@ -76,7 +76,7 @@ class Local:
     def __init__(self, workers: int | None) -> None:
         """Take all cores if no number of ``workers`` is given."""
         self.workers = workers or cores()
-        self.said = f"{self.workers} at a time on this machine"
+        self.description = f"{self.workers} at a time on this machine"
 
     def start(self, work: Work) -> LocalProcess:
         """Start a process."""
@@ -120,7 +120,7 @@ class RayTask:
         """Follow a task."""
         self._ray, self._reference = ray, reference
 
-    def ended(self) -> str | None:
+    def end_state(self) -> str | None:
         """Say how the task ended, by what Ray knows of it."""
         ready, _ = self._ray.wait([self._reference], timeout=0)
         if not ready:
@@ -154,7 +154,7 @@ class Ray:
                 raise CirlError(f"no Ray at RAY_ADDRESS={_address()}: {_last_line(error)}") from error
         module = int(self._ray.cluster_resources().get("CPU", 1))
         self.workers = workers or module
-        self.said = f"{self.workers} at a time on the Ray cluster, which has {module} processors"
+        self.description = f"{self.workers} at a time on the Ray cluster, which has {module} processors"
         self._do = self._ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_in_task)
 
     def start(self, work: Work) -> RayTask:

@@ -71,7 +71,7 @@ class Slurm:
         self._options = options
         self._queue = Queue()
         self.workers = workers or 2**31
-        self.said = f"{'all' if workers is None else workers} at a time in the queue of Slurm"
+        self.description = f"{'all' if workers is None else workers} at a time in the queue of Slurm"
 
     def start(self, work: Work) -> SlurmJob:
         """Put a job into the queue."""
@@ -99,7 +99,7 @@ class SlurmJob:
         self._progress = progress
         queue.follow(number)
 
-    def ended(self) -> str | None:
+    def end_state(self) -> str | None:
         """Say how the job ended, by what Slurm knows of it; what it cut off has ended orderly, and goes on."""
         state = self._queue.state(self._number)
         if state in LIVE:

@@ -63,7 +63,7 @@ class JobFiles:
         return self.folder / f"{self.name}.log"
 
     @property
-    def told(self) -> Path:
+    def progress_file(self) -> Path:
         """How far it is."""
         return self.folder / f"{self.name}.json"
 
@@ -86,14 +86,14 @@ class JobFiles:
             RunError: if the file is something else than what a job tells.
         """
         try:
-            content = json.loads(self.told.read_text())
+            content = json.loads(self.progress_file.read_text())
         except FileNotFoundError:
             return {}
         except ValueError as error:
-            raise RunError(f"{self.told}: is not what a job told: {error}") from error
+            raise RunError(f"{self.progress_file}: is not what a job told: {error}") from error
         numbers = ("done", "total", "cpu_seconds")
         if not isinstance(content, dict) or any(type(content.get(name, 0)) not in (int, float) for name in numbers):
-            raise RunError(f"{self.told}: is not what a job told: {content!r:.80}")
+            raise RunError(f"{self.progress_file}: is not what a job told: {content!r:.80}")
         return content
 
     def last_words(self) -> str:
@@ -149,7 +149,7 @@ def do(job: Job, files: JobFiles, listen: Callable[[], None]) -> None:
         last = time.monotonic()
         now = {"what": activity, "done": done, "total": total, "said": "", "host": platform.node(), "pid": os.getpid()}
         progress = {**progress, **figures(), **now, "cpu_seconds": earlier + time.process_time() - began}
-        write_json(files.told, progress)
+        write_json(files.progress_file, progress)
         listen()
 
     try:
@@ -160,7 +160,7 @@ def do(job: Job, files: JobFiles, listen: Callable[[], None]) -> None:
             raise RunError(f"{job.name}: came to its end without being done")
         tell("done", 1, 1)
     except Exception as error:
-        write_json(files.told, progress | {"said": f"{type(error).__name__}: {error}"})
+        write_json(files.progress_file, progress | {"said": f"{type(error).__name__}: {error}"})
         raise
 
 
