@@ -81,7 +81,7 @@ def test_nobody_is_sent_for_what_is_claimed(tmp_path: Path, monkeypatch: pytest.
     lock.acquire()
 
     class Nowhere:
-        workers, said = 1, "nowhere"
+        workers, description = 1, "nowhere"
 
         def start(self, work: object) -> object:
             raise AssertionError("somebody was sent")
@@ -266,7 +266,7 @@ def test_the_leave_to_import_goes_along(tmp_path: Path, monkeypatch: pytest.Monk
     sent = []
 
     class Post:
-        workers, said = 1, "by post"
+        workers, description = 1, "by post"
 
         def start(self, work: object) -> object:
             sent.append(work)

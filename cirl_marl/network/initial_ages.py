@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 
@@ -60,10 +61,11 @@ def age_shares(node: Node, interval: float) -> Floats:
     return whole
 
 
+@lru_cache(maxsize=256)  # commodities and scenarios share lifetimes, and a matrix exponential takes milliseconds
 def propagator(chain: Chain, time: float) -> tuple[Floats, Floats]:
     """Return what e^(A·t) does to the stages, shape (K, K), and what they get of an inflow of 1 in that time, (K,).
 
-    Time is in units of the chain's ``mean``, and so is that of the inflow.
+    Time is in units of the chain's ``mean``, and so is that of the inflow. Both arrays are read-only.
     """
     from scipy.linalg import expm
 
@@ -71,6 +73,7 @@ def propagator(chain: Chain, time: float) -> tuple[Floats, Floats]:
     system = np.zeros((size + 1, size + 1))
     system[:size, :size], system[:size, size] = chain.matrix, chain.inflow_shares
     exponential = expm(system * time)
+    exponential.flags.writeable = False
     return exponential[:size, :size], exponential[:size, size]
 
 
