@@ -137,6 +137,7 @@ class EliminatedShares:
         self._inverse = np.empty((order.nodes, values.shape[1]))
         for round_ in order.rounds:
             out, into, exits = values.take(round_.out, 0), values.take(round_.into, 0), values.take(round_.nodes, 0)
+            # the pivot 1 − P_ii as the sum of what goes elsewhere, so that nothing cancels
             inverse = 1.0 / round_.out_sum.add_to(exits.copy(), out)
             out *= inverse.take(round_.giver, 0)
             exits *= inverse
@@ -149,6 +150,7 @@ class EliminatedShares:
 
     def throughput(self, inflow: Floats) -> Floats:
         """Return q in place of what enters from elsewhere, shape (nodes, B)."""
+        # forward substitution in the order of elimination, then backward: (I − Pᵀ)⁻¹ = L⁻¹ D⁻¹ U⁻¹
         for round_, out, _ in self._steps:
             round_.forward.add_to(inflow, inflow.take(round_.donors, 0) * out)
         inflow *= self._inverse

@@ -60,6 +60,7 @@ class Routing:
         self.nodes = len(network.nodes) - stores
         self.arcs: Integers = np.flatnonzero(network.donors >= stores)
         self.donors: Integers = network.donors[self.arcs] - stores
+        # nodes without stock stand after those with one: stockless node j is end j, store s is end nodes + s
         ends = network.recipients[self.arcs] - stores
         self.ends: Integers = np.where(ends < 0, ends + stores + self.nodes, ends)
         self.is_fixed = arc_is_fixed[self.arcs]
@@ -100,6 +101,7 @@ class Routing:
         self.throughput_rows: Integers = np.where(self.places < early, early - 1 - self.places, self.places)[
             self.donors
         ]
+        # arcs from kept nodes back to eliminated ones: their flow is known only after the kept throughputs are
         on = np.flatnonzero((self.places[self.donors] >= early) & (self.ends < self.nodes))
         on = on[self.places[self.ends[on]] < early]
         self._on, self._on_from = self.arcs[on], self.places[self.donors[on]] - early
@@ -167,5 +169,6 @@ class Routing:
         """
         passes = VisitBounds(self._network, splits(self._network))
         total = np.max([passes.total(step) for step in passes.kinds], axis=0)
+        # every unit that enters node i passes through nodes at most total_i times
         inflow = self._inflow_sum(flow[:, None])[self.places, 0]
         return np.full(self.nodes, float(inflow @ total))

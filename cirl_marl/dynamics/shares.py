@@ -93,6 +93,7 @@ class Shares:
         shares -= low
         np.maximum(shares, 0.0, out=shares)  # rounding may ask for a little less than the lowest
         demand = self._total(shares)
+        # s_k = low_k + (a_k − low_k)·min(1, (1 − Σ low)/Σ(a − low)), the rule of ``split_fractions``
         shares *= np.divide(room, demand, out=np.ones_like(demand), where=demand > room).take(self._of, 0)
         shares += low
         remainder = np.maximum(1.0 - self._total(shares), 0.0).take(self._of_others, 0)

@@ -115,6 +115,7 @@ class StaticElimination:
     def _without(self, i: int) -> set[int]:
         """Eliminate node i and return its neighbours."""
         out, sources = self._gives.pop(i), self._gets.pop(i)
+        # P_jk gains P_ji·P_ik/(Σ_k P_ik), the Kron reduction of node i
         inverse = 1.0 / sum(out.values())
         parts = {end: share * inverse for end, share in out.items()}
         into: SparseRow = {}

@@ -28,6 +28,7 @@ class Taylor:
         """Find how many terms substeps of this length take."""
         self._laws, self._substep = laws, substep
         self.terms = self._number()
+        # Horner from the innermost term: h/K, …, h/3, h/2
         factors = [substep / k for k in range(self.terms, 1, -1)]
         self._pulls = any(arc.law is Law.RECIPIENT for arc in laws.staged_network.arcs)
         self._horner = [laws.incidence.scaled_by(factor) for factor in factors]
@@ -51,6 +52,7 @@ class Taylor:
         reach, term, k = np.ones(stores), 1.0, 0
         while term > TRUNCATION or k < 2:
             k += 1
+            # one factor |A| of ‖|A|^k‖₁, by its columns: what leaves a stock counts at its donor and at its recipient
             ends = np.append(reach, reach.max(initial=0.0))[laws.driven_to]
             transfers = laws.driven_rate * (reach[donors] + ends) * self._substep
             reach = np.bincount(laws.driver[laws.driven_arcs], weights=transfers, minlength=stores) / (k + 1)

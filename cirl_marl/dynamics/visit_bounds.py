@@ -60,6 +60,7 @@ class _Alike:
         gains = np.concatenate([gains, (rest_gains * proportions).sum(axis=1, keepdims=True)], axis=1)
         room = np.ones_like(gains)
         room[:, :-1] = high - low
+        # a fractional knapsack: the best arcs get all the room that they have, one after the other
         order = np.argsort(-gains, axis=1, kind="stable")
         sorted_room = np.take_along_axis(room, order, axis=1)
         before = np.cumsum(sorted_room, axis=1) - sorted_room

@@ -70,6 +70,7 @@ def propagator(chain: Chain, time: float) -> tuple[Floats, Floats]:
     from scipy.linalg import expm
 
     size = chain.stages
+    # the inflow as a constant last state: one exponential gives e^(At) and ∫e^(As)b ds (Van Loan 1978)
     system = np.zeros((size + 1, size + 1))
     system[:size, :size], system[:size, size] = chain.matrix, chain.inflow_shares
     exponential = expm(system * time)
