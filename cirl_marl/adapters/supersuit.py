@@ -71,8 +71,8 @@ class SharedPolicyEnv(VecEnv):
         """Step; what is truncated is not terminated, so that a value is expected after it."""
         observations, rewards, terminated, truncated, infos = self._bridge.step(self._actions)
         ends = np.asarray(terminated, dtype=bool) | np.asarray(truncated, dtype=bool)
-        for info, ended, at_the_end in zip(infos, ends, terminated, strict=True):
-            info["TimeLimit.truncated"] = bool(ended and not at_the_end)
+        for info, done, termination in zip(infos, ends, terminated, strict=True):
+            info["TimeLimit.truncated"] = bool(done and not termination)
         return observations, rewards, ends, infos
 
     def close(self) -> None:

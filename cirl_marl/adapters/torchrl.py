@@ -62,47 +62,49 @@ class TorchRLEnv(EnvBase):  # type: ignore[misc]
         observations = [self.vector_env.observation_spaces[agent] for agent in self.vector_env.agents]
         actions = [self.vector_env.action_spaces[agent] for agent in self.vector_env.agents]
         # entry j of agent i is entry i * longest + j of the flat, padded arrays
-        self._observed, seen = _padding([space.shape[0] for space in observations])
-        self._acting, acts = _padding([space.shape[0] for space in actions])
+        self._observation_places, entries = _padding([space.shape[0] for space in observations])
+        self._action_places, action_entries = _padding([space.shape[0] for space in actions])
         agents = (num_envs, len(observations))
-        self._shape_of_observations, self._shape_of_actions = (*agents, seen), (*agents, acts)
-        ends = np.zeros((2, len(observations) * seen), dtype=np.float32)
-        ends[:, self._observed] = np.concatenate([[space.low, space.high] for space in observations], axis=1)
-        low, high = (torch.from_numpy(end).reshape(agents[1], seen).expand(*agents, seen) for end in ends)
+        self._shape_of_observations, self._shape_of_actions = (*agents, entries), (*agents, action_entries)
+        ends = np.zeros((2, len(observations) * entries), dtype=np.float32)
+        ends[:, self._observation_places] = np.concatenate([[space.low, space.high] for space in observations], axis=1)
+        low, high = (torch.from_numpy(end).reshape(agents[1], entries).expand(*agents, entries) for end in ends)
         flag = Binary(n=1, shape=(num_envs, 1), dtype=torch.bool)
         self.observation_spec = _in_group("observation", Bounded(low, high, dtype=torch.float32), agents)
-        self.action_spec = _in_group("action", Bounded(-1.0, 1.0, (*agents, acts), dtype=torch.float32), agents)
+        self.action_spec = _in_group(
+            "action", Bounded(-1.0, 1.0, (*agents, action_entries), dtype=torch.float32), agents
+        )
         self.reward_spec = _in_group("reward", Unbounded((*agents, 1)), agents)
         flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
         self.done_spec = Composite(**flags, shape=(num_envs,))
 
     def _reset(self, tensordict: Any = None, **_: Any) -> Any:
-        ended = None if tensordict is None else tensordict.get("_reset", None)
-        if ended is not None and not ended.all():
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is not None and not mask.all():
             raise ControlError("all copies begin an episode together, as all are of one length: reset all of them")
-        self.vector_env.reset(self._next_seed)
+        observations = self.vector_env.reset(self._next_seed)
         self._next_seed = None  # the streams go on
-        stacked = np.concatenate([self.vector_env.observations()[agent] for agent in self.vector_env.agents], axis=1)
-        return self._outcome(stacked.T, np.zeros(self.vector_env.num_envs, dtype=bool))
+        observation = np.concatenate(list(observations.values()), axis=1)
+        return self._outcome(observation.T, np.zeros(self.vector_env.num_envs, dtype=bool))
 
     def _step(self, tensordict: Any) -> Any:
         actions = tensordict[GROUP, "action"].detach().numpy()
         if actions.shape != self._shape_of_actions:
             raise ControlError(f"actions must have shape {self._shape_of_actions}, got {actions.shape}")
-        stacked = actions.reshape(len(actions), -1).T[self._acting]
-        outcome = self.vector_env.advance(stacked.astype(float))
-        told = self._outcome(outcome.observation, outcome.truncated)
+        action_rows = actions.reshape(len(actions), -1).T[self._action_places]
+        outcome = self.vector_env.advance(action_rows.astype(float))
+        outcome_tensors = self._outcome(outcome.observation, outcome.truncated)
         rewards = torch.from_numpy(outcome.reward.T.astype(np.float32))
-        told[GROUP].set("reward", rewards.unsqueeze(-1))
-        return told
+        outcome_tensors[GROUP].set("reward", rewards.unsqueeze(-1))
+        return outcome_tensors
 
-    def _outcome(self, observation: NDArray[np.float32], ended: NDArray[np.bool_]) -> Any:
+    def _outcome(self, observation: NDArray[np.float32], truncation: NDArray[np.bool_]) -> Any:
         """Return padded observations, of those stacked in shape (entries of all agents, B), and who is at the end."""
         shape = self._shape_of_observations
-        padded = np.zeros((shape[0], shape[1] * shape[2]), dtype=np.float32)
-        padded[:, self._observed] = observation.T
-        group = TensorDict({"observation": torch.from_numpy(padded).view(shape)}, batch_size=shape[:2])
-        done, never = torch.from_numpy(ended.copy()).unsqueeze(-1), torch.zeros(shape[0], 1, dtype=torch.bool)
+        rows = np.zeros((shape[0], shape[1] * shape[2]), dtype=np.float32)
+        rows[:, self._observation_places] = observation.T
+        group = TensorDict({"observation": torch.from_numpy(rows).view(shape)}, batch_size=shape[:2])
+        done, never = torch.from_numpy(truncation.copy()).unsqueeze(-1), torch.zeros(shape[0], 1, dtype=torch.bool)
         flags = (done, never) if self._bootstrap else (never, done)
         return TensorDict(
             {GROUP: group, "done": done.clone(), "truncated": flags[0], "terminated": flags[1]}, batch_size=shape[:1]
