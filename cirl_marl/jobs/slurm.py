@@ -1,6 +1,6 @@
 """Jobs in the queue of Slurm, by its own commands: ``sbatch`` puts them in, ``squeue`` and ``scontrol`` tell of them.
 
-What is to be done goes to the node as a pickle in a private folder (mode 700) of this driver's, with its hash in the
+What is to be done goes to the node as a file in a private folder (mode 700) of this driver's, with its hash in the
 script; what came of it is read from JSON alone. Nothing else of Slurm's is trusted to be there: accounting
 (``sacct``) is asked only for a job that the controller has forgotten.
 """

@@ -22,7 +22,8 @@ def main(file: Path, sha256: str) -> None:
     payload = file.read_bytes()
     if hashlib.sha256(payload).hexdigest() != sha256:
         raise RunError(f"{file}: is not what was put into the queue")
-    work: Work = pickle.loads(payload)  # written by the driver, as the hash in its script says
+    # written by the driver, as the hash in its script says
+    work: Work = pickle.loads(payload)
     signal.signal(signal.SIGTERM, _stop)
     try:
         work()
